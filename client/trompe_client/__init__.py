@@ -1,0 +1,1 @@
+"""client/trompe_client"""

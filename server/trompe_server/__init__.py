@@ -1,0 +1,1 @@
+"""server/trompe_server"""
