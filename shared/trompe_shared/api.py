@@ -68,24 +68,32 @@ class JobSpec(_Schema):
     judges: list[str] = Field(default_factory=list, description="other classifiers that judge the result")
     epsilon: Annotated[float, Field(gt=0, le=1)] = 0.05
     alpha: Annotated[float, Field(gt=0, le=1)] = 0.01
-    tau: Annotated[float, Field(ge=0, lt=1)] | None = Field(None, description="saliency threshold; null attacks all texels")
+    tau: Annotated[float, Field(ge=0, lt=1)] | None = Field(
+        None, description="saliency threshold; null attacks all texels"
+    )
     surrogate: SurrogateModel = "auto"
-    steps: Annotated[int, Field(ge=1, le=10_000)] = 15
+    steps: Annotated[int, Field(ge=1, le=10_000)] = 20
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-    distance: Annotated[float, Field(gt=0, le=1000)] | None = Field(None, description="metres; null frames the object")
-    elevation: tuple[float, float] = Field((0.0, 50.0), description="range of camera elevations, degrees")
-    background: str = Field("white", description="'white', 'black' or '#rrggbb'")
+    distance: Annotated[float, Field(gt=0, le=1000)] | None = Field(
+        None, description="metres; null is the shipped object's own, else it fills the frame"
+    )
+    elevation: tuple[float, float] | None = Field(
+        None, description="range of camera elevations, degrees; null is the shipped object's own, else 0 to 50"
+    )
+    background: str = Field("white", description="'white', 'black', '#rrggbb' or the id of an uploaded picture")
     azimuths: Annotated[int, Field(ge=1, le=360)] = 6
     elevations: Annotated[int, Field(ge=1, le=180)] = 10
     held_out: Annotated[int, Field(ge=0, le=1000)] = Field(60, description="held-out views the result is judged on")
 
     @model_validator(mode="after")
     def _consistent(self) -> "JobSpec":
-        low, high = self.elevation
+        low, high = self.elevation or (0.0, 0.0)
         if not -90 <= low <= high <= 90:
             raise ValueError(f"elevation must be a range within -90..90 degrees, low end first; got {low} {high}")
         if self.alpha > self.epsilon:
-            raise ValueError(f"alpha ({self.alpha}) is the step within the budget epsilon ({self.epsilon}); make it smaller")
+            raise ValueError(
+                f"alpha ({self.alpha}) is the step within the budget epsilon ({self.epsilon}); make it smaller"
+            )
         return self
 
 
@@ -106,7 +114,7 @@ class JobState(StrEnum):
 
 
 class Progress(_Schema):
-    """Where a job is. ``fraction`` in [0, 1] is over the whole job, ``fooled`` the surrogate's share of fooled views."""
+    """Where a job is. ``fraction`` in [0, 1] is over the whole job, ``fooled`` is of the surrogate's views."""
 
     phase: str = "queued"
     fraction: float = 0.0
@@ -150,14 +158,17 @@ class Event(_Schema):
 
 
 class Accuracy(_Schema):
-    """Share of views classified as the object's class, before and after; intervals are Wilson's at 95 %."""
+    """Share of views classified as the object's class, before and after; intervals are Wilson's at 95 %.
+
+    What stands after the attack is null where there was none.
+    """
 
     views: int
     a_before: float
-    a_after: float
+    a_after: float | None
     a_drop: float | None = Field(description="(a_before - a_after) / a_before; null (n.a.) when a_before is 0")
     a_before_interval: tuple[float, float]
-    a_after_interval: tuple[float, float]
+    a_after_interval: tuple[float, float] | None
 
 
 class ViewPrediction(_Schema):
@@ -207,7 +218,9 @@ class Result(_Schema):
     texels_altered: float | None = Field(description="share of texels the attack altered (N%)")
     mean_texel_change: float | None = Field(description="mean |change| over altered texels and channels, [0, 1] units")
     max_view_change: float | None = Field(description="largest |change| of a pixel of a target view, [0, 1] units")
-    fidelity: dict[str, float] = Field(default_factory=dict, description="surrogate against target; see docs/glossary.md")
+    fidelity: dict[str, float] = Field(
+        default_factory=dict, description="surrogate against target; see docs/glossary.md"
+    )
     warnings: list[str] = Field(default_factory=list)
     seconds: dict[str, float]
     probe_renders: int

@@ -111,7 +111,8 @@ def euler_to_matrix(degrees: Matrix) -> Matrix:
 def unity_to_opengl_rotation(degrees: Matrix) -> Matrix:
     """Camera-to-world rotation (3, 3) of an OpenGL camera that stands in for Unity's at Euler angles ``degrees``.
 
-    Unity looks along +z in a left-handed world. The right-handed picture with this rotation is Unity's, mirrored left-right.
+    Unity looks along +z in a left-handed world. The right-handed picture with this rotation is Unity's, mirrored left-
+    right.
     """
     rotation = euler_to_matrix(degrees)
     return np.stack([-rotation[:, 0], rotation[:, 1], -rotation[:, 2]], axis=1)

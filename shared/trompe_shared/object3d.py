@@ -1,8 +1,9 @@
 """A 3D object: its meshes, materials and textures, and the archive they came in.
 
 The format is SAILenv's: a flat zip with ``<name>.obj``, ``<name>_mat_def.json`` (per material the file names of
-``albedo``, ``normal`` and ``metallic``) and the PNGs. A zip or folder with a plain OBJ and MTL is read as well. Every file
-of the archive is kept byte for byte; an attack replaces albedo images only, so that what comes out is what went in.
+``albedo``, ``normal`` and ``metallic``) and the PNGs. A zip or folder with a plain OBJ and MTL is read as well. Every
+file of the archive is kept byte for byte; an attack replaces albedo images only, so that what comes out is what went
+in.
 """
 
 import io
@@ -111,7 +112,9 @@ def decode_rgb(data: bytes, name: str) -> Texture:
     try:
         with Image.open(io.BytesIO(data)) as image:
             if max(image.size) > MAX_TEXTURE_SIDE:
-                raise ObjectError(f"Texture {name!r} is {image.size} pixels; at most {MAX_TEXTURE_SIDE} a side are read.")
+                raise ObjectError(
+                    f"Texture {name!r} is {image.size} pixels; at most {MAX_TEXTURE_SIDE} a side are read."
+                )
             return np.array(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
         raise ObjectError(f"Texture {name!r} cannot be read as an image ({error}). Save it again as a PNG.") from error
@@ -223,7 +226,11 @@ def _materials_from_json(data: bytes, file: str) -> dict[str, Material]:
     try:
         table = json.loads(data)
         return {
-            str(name): Material(str(name), _base(maps["albedo"]), *(_base(maps[k]) if maps.get(k) else None for k in ("normal", "metallic")))
+            str(name): Material(
+                str(name),
+                _base(maps["albedo"]),
+                *(_base(maps[k]) if maps.get(k) else None for k in ("normal", "metallic")),
+            )
             for name, maps in table.items()
         }
     except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -48,7 +48,9 @@ class _Reader:
             try:
                 self._statement(words, line)
             except (ValueError, IndexError) as error:
-                raise ObjectError(f"{self.file}, line {number}: {line.strip()[:80]!r} cannot be read ({error}).") from error
+                raise ObjectError(
+                    f"{self.file}, line {number}: {line.strip()[:80]!r} cannot be read ({error})."
+                ) from error
 
     def _statement(self, words: list[str], line: str) -> None:
         if words[0] == "f":
@@ -68,7 +70,7 @@ class _Reader:
             self.material = line.split(maxsplit=1)[1].strip()
 
     def _corner(self, word: str) -> tuple[int, int, int]:
-        fields = (word.split("/") + ["", ""])[:3]
+        fields = [*word.split("/"), "", ""][:3]
         return (self._index(fields[0], "v"), self._index(fields[1], "vt"), self._index(fields[2], "vn"))
 
     def _index(self, field: str, kind: str) -> int:
@@ -104,7 +106,9 @@ def _part(
 ) -> Part:
     unique, inverse = np.unique(np.asarray(corners, dtype=np.int64), axis=0, return_inverse=True)
     if unique[:, 1].min() < 0:
-        raise ObjectError(f"{file!r}, material {material!r}: faces without texture coordinates (vt); unwrap the mesh first.")
+        raise ObjectError(
+            f"{file!r}, material {material!r}: faces without texture coordinates (vt); unwrap the mesh first."
+        )
     faces = inverse.reshape(-1, 3).astype(np.int32)
     vertices = arrays["v"][unique[:, 0]]
     given = unique[:, 2]
@@ -131,7 +135,7 @@ def _normalised(vectors: NDArray[np.floating], *, fallback: NDArray[np.floating]
 
 
 def parse_mtl(text: str) -> dict[str, dict[str, str]]:
-    """Maps of each material of an MTL text: ``{name: {"albedo": file, "normal": file}}``, file names without folders."""
+    """Maps of each material of an MTL text: ``{name: {"albedo": file, "normal": file}}``, files without folders."""
     keys = {"map_kd": "albedo", "map_bump": "normal", "bump": "normal", "norm": "normal"}
     materials: dict[str, dict[str, str]] = {}
     current: dict[str, str] = {}

@@ -1,0 +1,110 @@
+"""Every error as problem details (RFC 9457, application/problem+json)."""
+
+import logging
+from collections.abc import Sequence
+from http import HTTPStatus
+from typing import Any, Final
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from trompe_server.errors import ConflictError, NotFoundError, ServiceError
+from trompe_shared.api import Problem
+from trompe_shared.errors import TrompeError
+
+__all__ = ["PROBLEMS", "REQUEST_ID", "answer_with_problems", "problem_response"]
+
+logger = logging.getLogger(__name__)
+
+REQUEST_ID: Final = "X-Request-ID"
+
+_STATUS: Final[dict[type[TrompeError], int]] = {
+    NotFoundError: 404,
+    ConflictError: 409,
+    ServiceError: 503,
+}
+
+_EXAMPLE: Final = {
+    "type": "urn:trompe:unknown-label",
+    "title": "Unprocessable Entity",
+    "status": 422,
+    "detail": "The classifier has no class 'mag'; did you mean 'mug'? An index works too.",
+    "instance": "/v1/jobs",
+    "request_id": "5f0c1e7a9b3d2846",
+}
+
+PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
+    "4XX": {
+        "description": "What was wrong with the request: problem details (RFC 9457)",
+        "content": {"application/problem+json": {"schema": Problem.model_json_schema(), "example": _EXAMPLE}},
+    }
+}
+"""What routes document about their errors."""
+
+
+def answer_with_problems(app: FastAPI) -> None:
+    """Make ``app`` answer every error with problem details."""
+    app.add_exception_handler(TrompeError, _trompe_error)
+    app.add_exception_handler(RequestValidationError, _validation_error)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(Exception, _unexpected_error)
+
+
+def problem_response(
+    request: Request,
+    status: int,
+    *,
+    code: str | None = None,
+    detail: str | None = None,
+    errors: list[dict[str, Any]] | None = None,
+) -> JSONResponse:
+    """A response with problem details; ``code`` is the error's short name, for programs."""
+    problem = Problem(
+        type=f"urn:trompe:{code}" if code else "about:blank",
+        title=HTTPStatus(status).phrase,
+        status=status,
+        detail=detail,
+        instance=request.url.path,
+        request_id=request.scope.get("request_id"),
+        errors=errors,
+    )
+    return JSONResponse(
+        problem.model_dump(mode="json", exclude_none=True),
+        status_code=status,
+        media_type="application/problem+json",
+        headers={REQUEST_ID: problem.request_id} if problem.request_id else None,
+    )
+
+
+async def _trompe_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, TrompeError)
+    status = next((status for kind, status in _STATUS.items() if isinstance(error, kind)), 422)
+    return problem_response(request, status, code=error.code, detail=str(error))
+
+
+async def _validation_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    errors = [{"field": _field(each["loc"]), "message": each["msg"]} for each in error.errors()]
+    detail = "; ".join(f"{each['field']}: {each['message']}" for each in errors)
+    return problem_response(request, 422, code="validation", detail=detail, errors=errors)
+
+
+async def _http_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    response = problem_response(request, error.status_code, detail=error.detail)
+    response.headers.update(error.headers or {})
+    return response
+
+
+async def _unexpected_error(request: Request, error: Exception) -> JSONResponse:
+    logger.error("request %s failed", request.scope.get("request_id"), exc_info=error)
+    detail = "The server made a mistake; its log says more under this request id."
+    return problem_response(request, 500, code="internal", detail=detail)
+
+
+def _field(location: Sequence[int | str]) -> str:
+    """Name of a field without the part of the request it came in: ("body", "epsilon") -> "epsilon"."""
+    inner = location[1:] if location and location[0] in {"body", "query", "path", "header"} else location
+    return ".".join(map(str, inner)) or "body"

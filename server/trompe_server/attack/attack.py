@@ -1,0 +1,133 @@
+"""Projected gradient ascent on the texture, over many views: the paper's algorithm, on one screen.
+
+state = start(textures)
+budget = Budget(epsilon=0.05, alpha=0.01)
+state = attack(state, textures, surrogate, classifier, label, budget=budget, steps=20)
+painted = {name: budget.quantise(delta, ...) for name, delta in state.deltas.items()}
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from trompe_server.array_files import pack_arrays, unpack_arrays
+from trompe_server.attack.budget import Budget
+from trompe_server.attack.goal import fooled, margin_loss
+from trompe_server.classifiers import WhiteBoxClassifier
+from trompe_server.surrogate import Surrogate
+
+__all__ = ["BATCH", "AttackState", "Step", "attack", "load_state", "movable", "save_state", "start"]
+
+BATCH = 10
+"""Views per forward and backward pass: the fastest on CPUs (larger ones miss the caches)."""
+
+Textures = Mapping[str, Float[Tensor, "H W 3"]]
+
+
+@dataclass(frozen=True)
+class AttackState:
+    """The change of each texture after ``step`` steps, sRGB in [0, 1] units: all that a step starts from."""
+
+    step: int
+    deltas: Textures
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one step saw, before it moved: mean loss, and the share of views the surrogate's images fool the classifier
+    on."""
+
+    step: int
+    loss: float
+    fooled: float
+
+
+def start(textures: Textures) -> AttackState:
+    """No change at all."""
+    return AttackState(0, {name: torch.zeros_like(texture) for name, texture in textures.items()})
+
+
+def movable(
+    surrogate: Surrogate, budget: Budget, masks: Bool[Tensor, "views H W"] | None = None
+) -> Mapping[str, Bool[Tensor, "H W"]]:
+    """The texels worth moving: those whose whole budget changes the attack's pixels by half an 8-bit level or more in
+    total.
+
+    Coarse mip levels let a pixel at a grazing angle read a little of every texel. Without this rule a sign step would
+    move them all at full size for an effect nobody can see.
+    """
+    least = 0.5 / 255 / budget.epsilon
+    return {name: weight >= least for name, weight in surrogate.influence(masks).items()}
+
+
+def attack(
+    state: AttackState,
+    textures: Textures,
+    surrogate: Surrogate,
+    classifier: WhiteBoxClassifier,
+    label: int,
+    *,
+    budget: Budget,
+    steps: int,
+    masks: Bool[Tensor, "views H W"] | None = None,
+    texels: Mapping[str, Bool[Tensor, "H W"]] | None = None,
+    on_step: Callable[[Step], None] = lambda _: None,
+) -> AttackState:
+    """``steps`` more steps of projected sign-gradient ascent on the expected margin over the surrogate's views.
+
+    ``textures`` are sRGB in [0, 1]; ``masks`` (saliency) let only those pixels' gradients through, and only ``texels``
+    (by default those that are ``movable``) move. Deterministic.
+    """
+    allowed = movable(surrogate, budget, masks) if texels is None else texels
+    deltas = dict(state.deltas)
+    for step in range(state.step, state.step + steps):
+        gradients, seen = _gradients(deltas, textures, surrogate, classifier, label, masks)
+        on_step(Step(step, *seen))
+        deltas = {
+            name: budget.ascend(delta, gradients[name] * allowed[name][..., None], textures[name])
+            for name, delta in deltas.items()
+        }
+    return AttackState(state.step + steps, deltas)
+
+
+def _gradients(
+    deltas: Textures,
+    textures: Textures,
+    surrogate: Surrogate,
+    classifier: WhiteBoxClassifier,
+    label: int,
+    masks: Bool[Tensor, "views H W"] | None,
+) -> tuple[Textures, tuple[float, float]]:
+    """Gradient of the summed loss by each texture, and (mean loss, share of fooled views)."""
+    leaves = {name: (textures[name] + delta).requires_grad_() for name, delta in deltas.items()}
+    texels = surrogate.texels(leaves)
+    collected = texels.detach().requires_grad_()
+    loss, won = 0.0, 0
+    for first in range(0, surrogate.n_views, BATCH):
+        batch = range(first, min(first + BATCH, surrogate.n_views))
+        logits = classifier.logits(surrogate.render(collected, batch, masks=masks))
+        total = margin_loss(logits, label).sum()
+        total.backward()  # type: ignore[no-untyped-call]
+        loss, won = loss + float(total.detach()), won + int(fooled(logits, label).sum())
+    gradients = torch.autograd.grad(texels, list(leaves.values()), collected.grad)
+    return dict(zip(leaves, gradients, strict=True)), (loss / surrogate.n_views, won / surrogate.n_views)
+
+
+def save_state(state: AttackState) -> bytes:
+    """A state as the bytes of an .npz file; exact."""
+    deltas = {_DELTA + name: delta.cpu().numpy() for name, delta in state.deltas.items()}
+    return pack_arrays({"step": np.array(state.step)} | deltas)
+
+
+def load_state(data: bytes) -> AttackState:
+    """A state from ``save_state``'s bytes. Raises ``ValueError`` or ``OSError`` where they are damaged."""
+    arrays = unpack_arrays(data)
+    names = [name for name in arrays if name.startswith(_DELTA)]
+    return AttackState(int(arrays["step"]), {n.removeprefix(_DELTA): torch.from_numpy(arrays[n]) for n in names})
+
+
+_DELTA = "delta:"

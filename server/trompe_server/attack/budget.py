@@ -1,0 +1,47 @@
+"""How far a texture may move: an L-infinity ball around the original, inside the colours that exist."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from trompe_shared.errors import SpecError
+
+__all__ = ["Budget"]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """``epsilon`` is the largest change of a texel's channel, ``alpha`` the size of one step; sRGB in [0, 1] units.
+
+    Raises ``SpecError`` unless 0 < alpha <= epsilon <= 1.
+    """
+
+    epsilon: float
+    alpha: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.alpha <= self.epsilon <= 1:
+            raise SpecError(
+                "epsilon and alpha must satisfy 0 < alpha <= epsilon <= 1, "
+                f"got alpha={self.alpha}, epsilon={self.epsilon}."
+            )
+
+    def project(self, delta: Float[Tensor, "H W 3"], texture: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+        """The nearest change that keeps ``|delta| <= epsilon`` and ``0 <= texture + delta <= 1``."""
+        return (texture + delta.clamp(-self.epsilon, self.epsilon)).clamp(0, 1) - texture
+
+    def ascend(
+        self, delta: Float[Tensor, "H W 3"], gradient: Float[Tensor, "H W 3"], texture: Float[Tensor, "H W 3"]
+    ) -> Float[Tensor, "H W 3"]:
+        """One projected step up along the sign of ``gradient``; texels without gradient stay where they are (DESIGN:
+        step 3)."""
+        return self.project(delta + self.alpha * gradient.sign(), texture)
+
+    def quantise(self, delta: Float[Tensor, "H W 3"], texture: UInt8[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
+        """The 8-bit texture that is saved: ``texture + delta`` rounded, never further than epsilon off."""
+        reach = math.floor(self.epsilon * 255 + 1e-9)
+        change = (delta * 255).round().clamp(-reach, reach).to(torch.int16)
+        return (texture.to(torch.int16) + change).clamp(0, 255).to(torch.uint8)

@@ -1,0 +1,250 @@
+"""The main job: one object, one classifier, one attack, judged in the target renderer.
+
+prepare     the target's images of the unpainted object, what the classifier says of them, its saliency
+calibrate   probes; how the target samples textures; the cheapest colour model that is good enough
+attack-NNN  some steps of the attack in the surrogate
+judge       the 8-bit texture goes back into the target; report
+"""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from trompe_server.array_files import pack_arrays, unpack_arrays
+from trompe_server.attack import (
+    AttackState,
+    Budget,
+    Step,
+    attack,
+    load_state,
+    movable,
+    saliency,
+    saliency_masks,
+    save_state,
+    start,
+)
+from trompe_server.attack_report import Evidence, public_files
+from trompe_server.library import Library
+from trompe_server.pipeline import Artifacts, OnProgress, PhaseReport
+from trompe_server.scene import Scene, open_scene
+from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
+from trompe_server.surrogate.calibration import Calibration, Fidelity, build_surrogate, calibrate
+from trompe_server.target import TargetRenderer
+from trompe_shared.api import JobSpec, JobState, Progress
+from trompe_shared.geometry import View
+from trompe_shared.object3d import Object3D
+
+__all__ = ["AttackJob", "open_pipeline"]
+
+CHUNK: Final = 5
+"""Attack steps per phase: what is lost at most when a worker dies."""
+
+PROBE_STREAM: Final = 0
+"""Keeps the random numbers of the probes apart from those of the held-out views."""
+
+SHARES: Final = {"prepare": 0.15, "calibrate": 0.25, "attack": 0.45, "judge": 0.15}
+"""Parts of the progress bar."""
+
+Image8 = NDArray[np.uint8]
+
+
+def open_pipeline(spec: JobSpec, *, library: Library, artifacts: Artifacts, target: TargetRenderer) -> "AttackJob":
+    """The phases of the job that ``spec`` describes. Raises ``TrompeError`` for what the user can mend."""
+    return AttackJob(spec, open_scene(spec, library=library, target=target), artifacts)
+
+
+class AttackJob:
+    """One job; see the head of this module. All that a phase leaves for later ones is in ``artifacts``."""
+
+    def __init__(self, spec: JobSpec, scene: Scene, artifacts: Artifacts) -> None:
+        self.spec, self.scene, self.artifacts = spec, scene, artifacts
+        self.budget = Budget(spec.epsilon, spec.alpha)
+
+    def phases(self) -> list[str]:
+        """See ``Pipeline.phases``."""
+        chunks = range(-(-self.spec.steps // CHUNK))
+        return ["prepare", "calibrate", *(f"attack-{chunk:03d}" for chunk in chunks), "judge"]
+
+    def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
+        """See ``Pipeline.run``."""
+        started = time.perf_counter()
+        kind, _, number = phase.partition("-")
+        if kind == "attack":
+            report = self._attack(int(number), on_progress)
+        else:
+            work = {"prepare": self._prepare, "calibrate": self._calibrate, "judge": self._judge}[kind]
+            report = work(on_progress)
+        self._note_seconds(phase, time.perf_counter() - started)
+        return report
+
+    def _prepare(self, on_progress: OnProgress) -> PhaseReport:
+        scene = self.scene
+        total = len(scene.views) + len(scene.held_out)
+        ask = self._asker("prepare", total, on_progress)
+        own = ask(scene.obj, scene.views)
+        self._save("clean", own=own, held_out=ask(scene.obj, scene.held_out))
+        self._save("saliency", maps=saliency(own, scene.classifier, scene.label).numpy().astype(np.float16))
+        if (scene.classifier.predict(own).argmax(axis=1) != scene.label).all():
+            return self._end_without_attack()
+        return PhaseReport(_progress("prepare", 1.0))
+
+    def _end_without_attack(self) -> PhaseReport:
+        name = self.scene.class_name(self.scene.label)
+        note = (
+            f"n.a.: the classifier recognises {name!r} in none of the {len(self.scene.views)} target views "
+            "of the unpainted object, so there is nothing to take away. "
+            "Check --label, --distance, --elevation and --background."
+        )
+        public = public_files(self._evidence(painted=None), self.artifacts, warnings=(note,))
+        return PhaseReport(_progress("judge", 1.0), JobState.not_applicable, note, public)
+
+    def _calibrate(self, on_progress: OnProgress) -> PhaseReport:
+        scene = self.scene
+        # Five greys on every view and some trials; fewer when the cheaper models do.
+        ask = self._asker("calibrate", 5 * len(scene.views) + 4, on_progress)
+        generator = np.random.default_rng([self.spec.seed, PROBE_STREAM])
+        clean = self._load("clean")["own"]
+        found = calibrate(scene.obj, scene.views, clean, ask, wanted=self.spec.surrogate, generator=generator)
+        self._save("probes", probes=found.probes)
+        described = {k: v for k, v in vars(found).items() if k != "probes"}
+        described |= {"sampling": asdict(found.sampling), "fidelity": asdict(found.fidelity)}
+        self.artifacts.write("calibration.json", json.dumps(described, indent=1).encode())
+        return PhaseReport(_progress("calibrate", 1.0))
+
+    def _attack(self, chunk: int, on_progress: OnProgress) -> PhaseReport:
+        before = load_state(self.artifacts.read(_state(chunk))) if chunk else start(self._textures)
+        last = Progress()
+
+        def on_step(step: Step) -> None:
+            nonlocal last
+            share = (step.step + 1) / self.spec.steps
+            last = _progress("attack", share).model_copy(
+                update={"step": step.step + 1, "steps": self.spec.steps, "loss": step.loss, "fooled": step.fooled}
+            )
+            on_progress(last)
+
+        steps = min(CHUNK, self.spec.steps - before.step)
+        self.artifacts.write(_state(chunk + 1), save_state(self._ascend(before, steps, on_step)))
+        return PhaseReport(last)
+
+    def _ascend(self, state: AttackState, steps: int, on_step: Callable[[Step], None]) -> AttackState:
+        scene, masks = self.scene, self._masks
+        return attack(
+            state,
+            self._textures,
+            self._surrogate,
+            scene.classifier,
+            scene.label,
+            budget=self.budget,
+            steps=steps,
+            masks=masks,
+            texels=self._movable,
+            on_step=on_step,
+        )
+
+    def _judge(self, on_progress: OnProgress) -> PhaseReport:
+        scene = self.scene
+        deltas = load_state(self.artifacts.read(_state(len(self.phases()) - 3))).deltas
+        painted = scene.obj.with_textures(
+            {n: self.budget.quantise(d, torch.from_numpy(scene.obj.textures[n])).numpy() for n, d in deltas.items()}
+        )
+        ask = self._asker("judge", len(scene.views) + len(scene.held_out), on_progress)
+        self._save("after", own=ask(painted, scene.views), held_out=ask(painted, scene.held_out))
+        public = public_files(self._evidence(painted), self.artifacts, warnings=())
+        return PhaseReport(_progress("judge", 1.0), JobState.succeeded, None, public)
+
+    def _evidence(self, painted: Object3D | None) -> Evidence:
+        """What the report is written from; ``painted`` is ``None`` when there was no attack."""
+        return Evidence(
+            spec=self.spec,
+            scene=self.scene,
+            before=self._load("clean"),
+            after=self._load("after") if painted is not None else None,
+            painted=painted,
+            maps=self._load("saliency")["maps"].astype(np.float32),
+            surrogate=self._surrogate if painted is not None else None,
+            calibration=self._calibration if painted is not None else None,
+            seconds=self._seconds(),
+        )
+
+    @cached_property
+    def _textures(self) -> dict[str, torch.Tensor]:
+        return textures_of(self.scene.obj)
+
+    @cached_property
+    def _calibration(self) -> Calibration:
+        described = json.loads(self.artifacts.read("calibration.json"))
+        described |= {
+            "sampling": SamplingModel(**described["sampling"]),
+            "fidelity": Fidelity(**{name: tuple(values) for name, values in described["fidelity"].items()}),
+            "greys": tuple(described["greys"]),
+        }
+        return Calibration(**described, probes=self._load("probes")["probes"])
+
+    @cached_property
+    def _surrogate(self) -> Surrogate:
+        return build_surrogate(self._calibration, self.scene.obj, self.scene.views, self._load("clean")["own"])
+
+    @cached_property
+    def _masks(self) -> torch.Tensor | None:
+        if self.spec.tau is None:
+            return None
+        return saliency_masks(torch.from_numpy(self._load("saliency")["maps"].astype(np.float32)), self.spec.tau)
+
+    @cached_property
+    def _movable(self) -> dict[str, torch.Tensor]:
+        return dict(movable(self._surrogate, self.budget, self._masks))
+
+    def _asker(self, phase: str, total: int, on_progress: OnProgress) -> Callable[[Object3D, Sequence[View]], Image8]:
+        """Asks the target for images and tells how far the phase is; ``total`` images are the whole of it."""
+        done = 0
+
+        def on_frame() -> None:
+            nonlocal done
+            done += 1
+            on_progress(_progress(phase, min(1.0, done / total)))
+
+        def ask(obj: Object3D, views: Sequence[View]) -> Image8:
+            return self.scene.target.render(obj, views, size=self.scene.size, on_frame=on_frame)
+
+        return ask
+
+    def _save(self, name: str, **arrays: NDArray[Any]) -> None:
+        self.artifacts.write(f"{name}.npz", pack_arrays(arrays))
+
+    def _load(self, name: str) -> dict[str, NDArray[Any]]:
+        return unpack_arrays(self.artifacts.read(f"{name}.npz"))
+
+    def _note_seconds(self, phase: str, seconds: float) -> None:
+        self.artifacts.write(f"seconds-{phase}.json", json.dumps(seconds).encode())
+
+    def _seconds(self) -> dict[str, float]:
+        """Seconds of the phases that are done, those of all attack phases together."""
+        seconds: dict[str, float] = {}
+        for phase in self.phases():
+            if self.artifacts.exists(f"seconds-{phase}.json"):
+                kind = phase.partition("-")[0]
+                seconds[kind] = seconds.get(kind, 0.0) + json.loads(self.artifacts.read(f"seconds-{phase}.json"))
+        return seconds
+
+
+def _state(chunk: int) -> str:
+    """Name of the checkpoint after ``chunk`` chunks."""
+    return f"state-{chunk:03d}.npz"
+
+
+def _progress(phase: str, share: float) -> Progress:
+    """Progress of the whole job when ``share`` of ``phase`` is done."""
+    done = 0.0
+    for name, part in SHARES.items():
+        if name == phase:
+            return Progress(phase=phase, fraction=done + share * part)
+        done += part
+    raise KeyError(phase)

@@ -1,0 +1,42 @@
+"""A white-box classifier around a torch network."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from trompe_server.classifiers.protocol import Images, Logits, fit_images, in_batches
+
+__all__ = ["NetworkClassifier"]
+
+BATCH = 10
+
+
+@dataclass(frozen=True)
+class NetworkClassifier:
+    """A network (N, 3, H, W) in [0, 1] -> logits (N, n_classes) on ``device``; its parameters are frozen here."""
+
+    name: str
+    network: nn.Module
+    image_size: tuple[int, int]
+    n_classes: int
+    classes: tuple[str, ...] | None = None
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        self.network.requires_grad_(False)
+
+    def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
+        """Logits of sRGB images in [0, 1] of size ``image_size``, differentiable in the images."""
+        logits: Tensor = self.network(images)
+        return logits
+
+    @torch.no_grad()
+    def predict(self, images: Images) -> Logits:
+        """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size."""
+        chunks = [np.zeros((0, self.n_classes), np.float32)]
+        for batch in in_batches(images, BATCH):
+            chunks.append(self.logits(fit_images(batch, self.image_size).to(self.device)).cpu().numpy())
+        return np.concatenate(chunks)

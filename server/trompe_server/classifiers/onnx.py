@@ -1,0 +1,102 @@
+"""Classifiers from ``.onnx`` files, run by onnxruntime. They give no gradients: they judge, they cannot be attacked."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import onnxruntime
+import torch
+
+from trompe_server.classifiers.protocol import (
+    Images,
+    Logits,
+    check_classes,
+    fit_images,
+    in_batches,
+    refuse_probabilities,
+)
+from trompe_shared.errors import ClassifierError
+
+__all__ = ["OnnxClassifier", "load_onnx"]
+
+BATCH: Final = 10
+CONTRACT: Final = "input image float32 NCHW in [0, 1], output logits (N, classes)"
+
+
+@dataclass(frozen=True)
+class OnnxClassifier:
+    """An onnxruntime session on the CPU; ``fixed_batch``: how many images it takes at once, if its graph says so."""
+
+    name: str
+    session: Any
+    image_size: tuple[int, int]
+    n_classes: int
+    fixed_batch: int | None
+    classes: tuple[str, ...] | None = None
+
+    def predict(self, images: Images) -> Logits:
+        """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size."""
+        chunks = [np.zeros((0, self.n_classes), np.float32)]
+        for batch in in_batches(images, self.fixed_batch or BATCH):
+            chunks.append(_run(self.session, fit_images(batch, self.image_size).numpy(), self.fixed_batch))
+        return np.concatenate(chunks)
+
+
+def load_onnx(path: Path, *, name: str | None = None, classes: Sequence[str] | None = None) -> OnnxClassifier:
+    """An ``.onnx`` file as a classifier that only judges. Raises ``ClassifierError`` when it breaks the contract."""
+    session = _session(path)
+    fixed_batch, size = _input(session, path.name)
+    noise = np.random.default_rng(0).random((1, 3, *size), np.float32)
+    try:
+        logits = _run(session, noise, fixed_batch)
+    except Exception as error:
+        raise _broken(path.name, f"it does not run on one image ({str(error)[:300]})") from error
+    if logits.ndim != 2 or logits.dtype != np.float32 or len(logits) != 1:
+        raise _broken(path.name, f"its output for one image is {logits.dtype} {logits.shape}")
+    if not np.isfinite(logits).all():
+        raise _broken(path.name, "its output is not finite")
+    refuse_probabilities(logits, path.name)
+    n_classes = logits.shape[1]
+    names = check_classes(classes, n_classes, path.name)
+    return OnnxClassifier(name or path.stem, session, size, n_classes, fixed_batch, names)
+
+
+def _broken(file: str, what: str) -> ClassifierError:
+    return ClassifierError(f"{file!r}: {what}. Expected: {CONTRACT}; export it so, with the normalisation inside.")
+
+
+def _session(path: Path) -> Any:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise _broken(path.name, f"onnxruntime cannot read it ({str(error)[:300]})") from error
+
+
+def _input(session: Any, file: str) -> tuple[int | None, tuple[int, int]]:
+    """The batch, where it is fixed, and (H, W) of the one image input. Raises ``ClassifierError``."""
+    inputs = session.get_inputs()
+    if len(inputs) != 1 or len(session.get_outputs()) != 1:
+        raise _broken(file, f"it has {len(inputs)} inputs and {len(session.get_outputs())} outputs")
+    shape, kind = inputs[0].shape, inputs[0].type
+    if len(shape) != 4 or shape[1] != 3 or kind != "tensor(float)":
+        raise _broken(file, f"its input is {kind} {shape}")
+    batch, _, height, width = shape
+    if not (isinstance(height, int) and isinstance(width, int)):
+        raise _broken(
+            file,
+            f"its input {shape} has no height and width: fix them with onnxruntime.tools.make_dynamic_shape_fixed",
+        )
+    return batch if isinstance(batch, int) else None, (height, width)
+
+
+def _run(session: Any, images: Logits, fixed_batch: int | None) -> Logits:
+    """Logits of images (n, 3, H, W); where the batch is fixed, the last one is filled up with black and cut again."""
+    missing = (fixed_batch or len(images)) - len(images)
+    padded = np.pad(images, ((0, missing), (0, 0), (0, 0), (0, 0)))
+    logits: Logits = session.run(None, {session.get_inputs()[0].name: padded})[0]
+    return logits[: len(images)]

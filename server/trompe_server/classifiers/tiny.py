@@ -1,0 +1,80 @@
+"""The classifier that ships with Trompe: a small, ordinary convolutional network that knows the shipped objects.
+
+It is meant for first attacks and for tests: it is not robust, and nothing was done to make it so.
+``scripts/train_classifier.py`` trains it.
+"""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from trompe_shared.errors import ClassifierError
+
+__all__ = ["CLASSES", "IMAGE_SIZE", "WEIGHTS", "TinyNet", "load_tiny", "save_tiny"]
+
+CLASSES: Final = ("ball", "book", "bottle", "chair", "lamp", "mug", "table", "teapot")
+"""Class names in the order of the logits."""
+IMAGE_SIZE: Final = (128, 128)
+"""(H, W) of the images it was trained on."""
+WEIGHTS: Final = Path(__file__).with_name("tiny.npz")
+
+MEAN: Final = 0.75
+SPREAD: Final = 0.3
+WIDTHS: Final = (24, 48, 96, 160)
+
+
+class TinyNet(nn.Module):
+    """Seven 3x3 convolutions with batch normalisation, 16-fold smaller at the end, averaged, one linear layer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers = [_convolution(3, WIDTHS[0], stride=2)]
+        for before, after in pairwise(WIDTHS):
+            layers += [_convolution(before, after, stride=2), _convolution(after, after, stride=1)]
+        self.features = nn.Sequential(*layers)
+        self.head = nn.Linear(WIDTHS[-1], len(CLASSES))
+
+    def forward(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
+        """Logits of sRGB images in [0, 1]; the normalisation is in here."""
+        features = self.features((images - MEAN) / SPREAD)  # (n, 160, H / 16, W / 16)
+        logits: Tensor = self.head(features.mean(dim=(2, 3)))
+        return logits
+
+
+def _convolution(before: int, after: int, *, stride: int) -> nn.Sequential:
+    convolution = nn.Conv2d(before, after, 3, stride=stride, padding=1, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(after), nn.ReLU(inplace=True))
+
+
+def load_tiny(path: Path = WEIGHTS) -> TinyNet:
+    """The trained network in evaluation mode, its parameters frozen.
+
+    Raises ``ClassifierError`` when the weights that came with the package are missing or do not fit.
+    """
+    network = TinyNet()
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            state = {name: torch.from_numpy(_widened(arrays[name])) for name in arrays.files}
+        network.load_state_dict(state)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise ClassifierError(
+            f"The weights of the shipped classifier ({path.name}) cannot be read: {error}. "
+            "Install trompe again, or train it with scripts/train_classifier.py."
+        ) from error
+    return network.eval().requires_grad_(False)
+
+
+def save_tiny(network: TinyNet, path: Path = WEIGHTS) -> None:
+    """Write the weights; convolutions in half precision, which changes no prediction and halves the file."""
+    state = {name: tensor.cpu().numpy() for name, tensor in network.state_dict().items()}
+    narrow = {name: array.astype(np.float16) if array.ndim > 1 else array for name, array in state.items()}
+    np.savez(path, allow_pickle=False, **narrow)
+
+
+def _widened(array: np.ndarray) -> np.ndarray:
+    return array.astype(np.float32) if array.dtype == np.float16 else array

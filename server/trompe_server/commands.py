@@ -1,0 +1,104 @@
+"""The commands that this package adds to ``trompe``: serve, worker, demo, doctor."""
+
+import functools
+import logging
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+import click
+
+from trompe_server.doctor import check_all
+from trompe_server.settings import Settings
+from trompe_shared.errors import TrompeError
+
+__all__ = ["demo", "doctor", "serve", "worker"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_data = click.option(
+    "--data", type=click.Path(path_type=Path, file_okay=False), help="Folder of data (or TROMPE_DATA)."
+)
+
+
+def _for_people(command: Callable[P, R]) -> Callable[P, R]:
+    """Show errors as one sentence instead of a traceback."""
+
+    @functools.wraps(command)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return command(*args, **kwargs)
+        except TrompeError as error:
+            raise click.ClickException(str(error)) from error
+
+    return run
+
+
+def _settings(data: Path | None) -> Settings:
+    return Settings() if data is None else Settings(data=data.absolute())
+
+
+def _log_to_stderr() -> None:
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    for chatty in ("httpx", "PIL", "OpenGL"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+
+
+def _announce(line: str) -> None:
+    click.echo(line)
+    sys.stdout.flush()
+
+
+@click.command()
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
+@click.option(
+    "--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="Port; 0 takes a free one."
+)
+@_data
+@_for_people
+def serve(host: str, port: int, data: Path | None) -> None:
+    """Run the service: REST API, one attack worker, one renderer worker, one folder of data."""
+    from trompe_server.serving import run_service
+
+    _log_to_stderr()
+    run_service(_settings(data), host=host, port=port, announce=_announce)
+
+
+@click.command()
+@_data
+@click.option("--renderer", required=True, metavar="HOST:PORT", help="The renderer worker that shows the objects.")
+@_for_people
+def worker(data: Path | None, renderer: str) -> None:
+    """Run an attack worker, which takes jobs of a data folder one after the other."""
+    from trompe_server.jobs.worker import run_worker
+
+    _log_to_stderr()
+    run_worker(_settings(data), _address(renderer), announce=_announce)
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal():
+        raise click.BadParameter(f"{text!r} is not HOST:PORT, such as 127.0.0.1:8085", param_hint="--renderer")
+    return host, int(port)
+
+
+@click.command()
+@click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder of the result.")
+def demo(out: Path) -> None:
+    """Attack the shipped mug against the shipped classifier, from object to result."""
+    attack = ["attack", "mug", "--label", "mug", "--classifier", "tiny", "--out", str(out)]
+    sys.exit(subprocess.run([sys.executable, "-m", "trompe_client.cli", *attack], check=False).returncode)
+
+
+@click.command()
+@_data
+def doctor(data: Path | None) -> None:
+    """Check that this machine can do the work, and say how to mend what it cannot."""
+    findings = check_all(_settings(data))
+    for finding in findings:
+        click.echo(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.words}")
+    sys.exit(0 if all(finding.ok for finding in findings) else 1)

@@ -1,0 +1,164 @@
+"""Looks after the children of ``trompe serve``, renderer and worker: starts them, again and again, and stops them."""
+
+import logging
+import re
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Final, Self
+
+from trompe_server.errors import ServiceError
+from trompe_server.jobs.worker import READY
+from trompe_server.settings import Settings
+
+__all__ = ["Child", "Supervisor"]
+
+logger = logging.getLogger(__name__)
+
+BACKOFF: Final = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+"""Seconds to wait before a child that died is started again, by how often in a row it died soon."""
+STEADY: Final = 30.0
+"""A child that ran for so many seconds starts again with the shortest wait."""
+STOP_PATIENCE: Final = 10.0
+GIVE_UP: Final = 3
+"""A child that died so often before it was ever ready will not come up."""
+
+
+class Child:
+    """One supervised process. ``command`` is asked for its arguments at each start.
+
+    ``ready`` matches the line that it prints once it is up; its other lines are ours to pass on.
+    """
+
+    def __init__(self, name: str, command: Callable[[], list[str]], ready: re.Pattern[str]) -> None:
+        self.name, self._command, self._ready = name, command, ready
+        self.match: re.Match[str] | None = None
+        self.failures = 0
+        self.pid: int | None = None
+        self._process: subprocess.Popen[str] | None = None
+        self._stopping = threading.Event()
+        self._up = threading.Event()
+        self._thread = threading.Thread(target=self._look_after, name=f"supervise-{name}", daemon=True)
+
+    @property
+    def up(self) -> bool:
+        """Whether the process runs and has said that it is ready."""
+        return self._up.is_set()
+
+    def start(self) -> None:
+        """Start the process, and again whenever it dies, until ``stop``."""
+        self._thread.start()
+
+    def wait_ready(self, deadline: float) -> re.Match[str]:
+        """The match of the ready line. Raises ``ServiceError`` at ``deadline`` (monotonic) or when it keeps dying."""
+        while not self._up.wait(0.1):
+            if time.monotonic() > deadline or (self.match is None and self.failures >= GIVE_UP):
+                raise ServiceError(
+                    f"The {self.name} does not come up (it died {self.failures} times); its last words are above. "
+                    "`trompe doctor` looks for the cause."
+                )
+        assert self.match is not None
+        return self.match
+
+    def stop(self) -> None:
+        """End the process: SIGTERM, and SIGKILL where that does not help."""
+        self._stopping.set()
+        process = self._process
+        if process is not None and process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(STOP_PATIENCE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def _look_after(self) -> None:
+        while not self._stopping.is_set():
+            started = time.monotonic()
+            status = self._run_once()
+            if self._stopping.is_set():
+                return
+            self.failures = 1 if time.monotonic() - started > STEADY else self.failures + 1
+            wait = BACKOFF[min(self.failures, len(BACKOFF)) - 1]
+            logger.warning("the %s ended (status %s) and is started again in %.1f s", self.name, status, wait)
+            self._stopping.wait(wait)
+
+    def _run_once(self) -> int:
+        """Run the process to its end and return its exit status; its standard output is read all the while."""
+        command = [sys.executable, "-m", "trompe_server.jobs.leash", *self._command()]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+            self._process, self.pid = process, process.pid
+            if self._stopping.is_set():
+                process.terminate()
+            assert process.stdout is not None
+            for line in process.stdout:
+                self._hear(line.rstrip())
+            status = process.wait()
+        self._up.clear()
+        return status
+
+    def _hear(self, line: str) -> None:
+        match = self._ready.search(line)
+        if match:
+            self.match = match
+            self._up.set()
+        elif line:
+            logger.info("%s: %s", self.name, line)
+
+
+class Supervisor:
+    """The two children of ``trompe serve``; a context manager. The renderer keeps its port when it is started again."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._port = 0
+        listening = re.compile(r"^trompe renderer listening on (\S+):(\d+)$")
+        self.renderer = Child("renderer worker", self._render, listening)
+        self.worker = Child("attack worker", self._work, re.compile(f"^{re.escape(READY)}$"))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def start(self, *, timeout: float = 90.0) -> None:
+        """Start both; return once they are up. Raises ``ServiceError`` where one is not up in ``timeout`` seconds."""
+        deadline = time.monotonic() + timeout
+        self.renderer.start()
+        self._port = int(self.renderer.wait_ready(deadline)[2])
+        self.worker.start()
+        self.worker.wait_ready(deadline)
+
+    def stop(self) -> None:
+        """End both, the worker first."""
+        self.worker.stop()
+        self.renderer.stop()
+
+    def missing(self) -> list[str]:
+        """What is not up right now, in words; empty when all is well."""
+        words = [f"the {child.name} is not up" for child in (self.worker, self.renderer) if not child.up]
+        if not words and not _accepts("127.0.0.1", self._port):
+            words.append("the renderer worker does not answer")
+        return words
+
+    def _render(self) -> list[str]:
+        return ["render", "--host", "127.0.0.1", "--port", str(self._port)]
+
+    def _work(self) -> list[str]:
+        return ["worker", "--data", str(self._settings.data), "--renderer", f"127.0.0.1:{self._port}"]
+
+
+def _accepts(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), timeout=1.0).close()
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,113 @@
+"""From a job's options to what it works on: the object, the networks, the views and the renderer."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from trompe_server.attack import framing_distance, grid_views, held_out_views
+from trompe_server.classifiers import Classifier, WhiteBoxClassifier, load_classifier
+from trompe_server.labels import resolve_label
+from trompe_server.library import Library
+from trompe_server.target import BackdropTarget, TargetRenderer
+from trompe_shared.api import JobSpec
+from trompe_shared.errors import ClassifierError
+from trompe_shared.geometry import View
+from trompe_shared.object3d import Object3D, decode_rgb, load_object
+from trompe_shared.shipped import shipped_objects
+
+__all__ = ["Scene", "open_scene"]
+
+DEFAULT_ELEVATION: Final = (0.0, 50.0)
+COLOURS: Final = {"white": (255, 255, 255), "black": (0, 0, 0)}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a job works on. ``label`` is the object's class index, ``views`` are attacked, ``held_out`` only judged."""
+
+    obj: Object3D
+    object_name: str
+    label: int
+    classifier: WhiteBoxClassifier
+    judges: tuple[Classifier, ...]
+    views: tuple[View, ...]
+    held_out: tuple[View, ...]
+    target: TargetRenderer
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) of every image: what the attacked classifier takes."""
+        return self.classifier.image_size
+
+    def class_name(self, index: int) -> str:
+        """Name of a class, or its number where the classifier has no names."""
+        classes = self.classifier.classes
+        return classes[index] if classes is not None else f"class {index}"
+
+
+def open_scene(spec: JobSpec, *, library: Library, target: TargetRenderer) -> Scene:
+    """Load what ``spec`` names. Raises ``TrompeError`` for what does not exist or does not fit together."""
+    obj = load_object(library.object_bytes(spec.object))
+    info = library.object(spec.object)
+    classifier = _stored_classifier(spec.classifier, library)
+    if not isinstance(classifier, WhiteBoxClassifier):
+        raise ClassifierError(
+            f"{classifier.name!r} gives scores but no gradients (.onnx), so it can judge, but not be attacked. "
+            "Attack a .pt2 file and name this one as a judge (--judge)."
+        )
+    distance, elevation = _framing(spec, obj, info.name if info.shipped else None)
+    backdrop = COLOURS.get(spec.background) or _hex_colour(spec.background)
+    if backdrop is None:
+        picture = decode_rgb(library.background_bytes(spec.background), spec.background)
+        target, backdrop = BackdropTarget(target, picture), COLOURS["black"]
+    return Scene(
+        obj,
+        info.name,
+        resolve_label(spec.label, classifier.classes, classifier.n_classes),
+        classifier,
+        tuple(_stored_classifier(judge, library) for judge in spec.judges),
+        *_views(spec, distance, elevation, backdrop),
+        target,
+    )
+
+
+def _stored_classifier(reference: str, library: Library) -> Classifier:
+    info = library.classifier(reference)
+    return load_classifier(library.classifier_path(reference), name=info.name, classes=info.classes)
+
+
+def _framing(spec: JobSpec, obj: Object3D, shipped: str | None) -> tuple[float, tuple[float, float]]:
+    """(distance, elevation range): the job's, else a shipped object's own, else what shows the object well."""
+    own = shipped_objects()[shipped] if shipped is not None else None
+    distance = spec.distance or (own.distance if own is not None else framing_distance(obj))
+    elevation = spec.elevation or (own.elevation if own is not None else DEFAULT_ELEVATION)
+    return distance, elevation
+
+
+def _hex_colour(text: str) -> tuple[int, int, int] | None:
+    if len(text) != 7 or text[0] != "#":
+        return None
+    red, green, blue = bytes.fromhex(text[1:])
+    return red, green, blue
+
+
+def _views(
+    spec: JobSpec, distance: float, elevation: tuple[float, float], background: tuple[int, int, int]
+) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    own = grid_views(
+        distance=distance,
+        elevation=elevation,
+        azimuths=spec.azimuths,
+        elevations=spec.elevations,
+        background=background,
+    )
+    generator = np.random.default_rng([spec.seed, HELD_OUT_STREAM])
+    fresh = held_out_views(
+        spec.held_out, distance=distance, elevation=elevation, background=background, generator=generator
+    )
+    return tuple(own), tuple(fresh)
+
+
+HELD_OUT_STREAM: Final = 1
+"""Keeps the random numbers of the held-out views apart from those of the probes."""

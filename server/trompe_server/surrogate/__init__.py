@@ -1,0 +1,21 @@
+"""The surrogate renderer: rasterise once, then gather. Usable without any server."""
+
+from trompe_server.surrogate.sampling import SamplingModel
+from trompe_server.surrogate.surrogate import (
+    Geometry,
+    Surrogate,
+    curve_surrogate,
+    diffuse_surrogate,
+    prepare_geometry,
+    textures_of,
+)
+
+__all__ = [
+    "Geometry",
+    "SamplingModel",
+    "Surrogate",
+    "curve_surrogate",
+    "diffuse_surrogate",
+    "prepare_geometry",
+    "textures_of",
+]

@@ -1,0 +1,294 @@
+"""Finding out, by images alone, how the target samples textures and how little of a colour model the scene needs.
+
+The target stays a black box: it is shown the object painted in greys and in random noise, and every hypothesis is
+judged by how well it predicts what the noise changes in the target's images.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from trompe_server.surrogate.sampling import SamplingModel
+from trompe_server.surrogate.surrogate import (
+    Surrogate,
+    curve_surrogate,
+    diffuse_surrogate,
+    prepare_geometry,
+    textures_of,
+)
+from trompe_shared.api import SurrogateModel
+from trompe_shared.geometry import View
+from trompe_shared.object3d import Object3D
+
+__all__ = [
+    "CALIBRATED_GREYS",
+    "CURVE_GREYS",
+    "MAX_ERROR",
+    "MIN_EXPLAINED",
+    "Calibration",
+    "Fidelity",
+    "build_surrogate",
+    "calibrate",
+    "find_sampling",
+    "measure_fidelity",
+    "painted_grey",
+    "painted_noise",
+]
+
+CALIBRATED_GREYS: Final = (0, 255)
+CURVE_GREYS: Final = (0, 64, 128, 191, 255)
+"""Encoded greys of the probes of the ``calibrated`` and the ``curve`` model."""
+
+MAX_ERROR: Final = 2.0 / 255
+"""A colour model is good enough when its mean error on the unpainted object's pixels is at most this, sRGB in [0, 1]
+units."""
+
+MIN_EXPLAINED: Final = 0.8
+"""... and it explains at least this share of the variance of what a random repaint changes."""
+
+NOISE_AMPLITUDE: Final = 0.1
+
+TRIAL_VIEWS: Final = 4
+"""Views on which hypotheses and colour models are tried."""
+
+Image8 = NDArray[np.uint8]
+Ask = Callable[[Object3D, Sequence[View]], Image8]
+"""Asks the target for images: (views, H, W, 3) uint8."""
+
+
+def painted_grey(obj: Object3D, grey: int) -> Object3D:
+    """``obj`` with every albedo texture replaced by one uniform grey (encoded, 0..255)."""
+    return obj.with_textures({name: np.full((4, 4, 3), grey, dtype=np.uint8) for name in obj.textures})
+
+
+def painted_noise(obj: Object3D, generator: np.random.Generator) -> Object3D:
+    """``obj`` with +-0.1 (sRGB) added at random to every channel of every texel."""
+    reach = round(NOISE_AMPLITUDE * 255)
+    return obj.with_textures(
+        {
+            name: np.clip(image + generator.choice([-reach, reach], image.shape), 0, 255).astype(np.uint8)
+            for name, image in obj.textures.items()
+        }
+    )
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """How well a surrogate predicts the target, per view.
+
+    error: mean |predicted - true| of the unpainted object's pixels, without anchoring, sRGB in [0, 1] units.
+    correlation, slope: of predicted against true change of the image under a random repaint.
+    explained: share of the variance of the true change that the prediction explains; 1 is perfect, 0 is as good as
+    predicting no change.
+    """
+
+    error: tuple[float, ...]
+    correlation: tuple[float, ...]
+    slope: tuple[float, ...]
+    explained: tuple[float, ...]
+
+    def mean(self) -> dict[str, float]:
+        """Means over the views."""
+        return {name: float(np.mean(values)) for name, values in asdict(self).items()}
+
+    @property
+    def good_enough(self) -> bool:
+        """Whether the surrogate is within tolerance on average."""
+        mean = self.mean()
+        return mean["error"] <= MAX_ERROR and mean["explained"] >= MIN_EXPLAINED
+
+
+def measure_fidelity(
+    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8
+) -> Fidelity:
+    """Compare ``surrogate`` with the target's images (views, H, W, 3) of ``obj`` (clean) and of ``repainted``."""
+    device = surrogate.base.device
+    with torch.no_grad():
+        after = surrogate.texels(textures_of(repainted, device=device))
+        before = surrogate.texels(textures_of(obj, device=device))
+        plain = replace(surrogate, anchors=None)
+        rows = [
+            _compare(
+                surrogate.colours(after, index)[0] - surrogate.colours(before, index)[0],
+                plain.colours(before, index)[0],
+                _object_pixels(clean[index], view.pixel),
+                _object_pixels(images[index], view.pixel),
+            )
+            for index, view in enumerate(surrogate.geometry.views)
+            if len(view.pixel)
+        ]
+    return Fidelity(*(tuple(column) for column in zip(*rows, strict=True)))
+
+
+def _object_pixels(image: Image8, pixel: Tensor) -> Float[Tensor, "pixels 3"]:
+    return torch.from_numpy(image).to(pixel.device).flatten(0, 1)[pixel].float() / 255
+
+
+def _compare(
+    predicted_change: Tensor, predicted: Tensor, clean: Tensor, after: Tensor
+) -> tuple[float, float, float, float]:
+    """(error, correlation, slope, explained) of one view."""
+    change, guess = (after - clean).flatten().double(), predicted_change.flatten().double()
+    variance, power = float(change.square().mean()), float(guess.square().mean())
+    product = float((change * guess).mean())
+    correlation = product / max((variance * power) ** 0.5, 1e-12)
+    explained = 1 - float((change - guess).square().mean()) / max(variance, 1e-12)
+    return float((predicted - clean).abs().mean()), correlation, product / max(power, 1e-12), explained
+
+
+def find_sampling(explained: Callable[[SamplingModel], float]) -> SamplingModel:
+    """The sampling hypothesis that explains most of what a random repaint changed in the target.
+
+    ``explained`` is the share of the variance that a hypothesis explains. One member is varied at a time, the most
+    telling first; a change must explain 0.2 % more to be believed.
+    """
+    best = SamplingModel()
+    score = explained(best)
+    for alternatives in _alternatives():
+        for alternative in alternatives(best):
+            trial = explained(alternative)
+            if trial > score + 0.002:
+                best, score = alternative, trial
+    return best
+
+
+def _alternatives() -> Iterator[Callable[[SamplingModel], Sequence[SamplingModel]]]:
+    """The members to vary, each as the other values it could have."""
+    yield lambda best: [best.but(filtered="linear")]
+    yield lambda best: [best.but(lod="area")]
+    yield lambda best: [best.but(samples="centre"), best.but(shade_at="centroid")]
+    yield lambda best: [best.but(cull=False)]
+    yield lambda best: [best.but(bias=bias) for bias in (-0.25, 0.25, -0.5, 0.5, -1.0, 1.0)]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was found out about the target for one object and its views: all that the surrogate is built from.
+
+    greys and probes as ``curve_surrogate`` takes them (empty for ``diffuse``). fidelity: measured on the trial views.
+    renders: how many images the target was asked for.
+    """
+
+    model: str
+    reason: str
+    sampling: SamplingModel
+    greys: tuple[int, ...]
+    probes: Image8
+    fidelity: Fidelity
+    renders: int
+
+
+def build_surrogate(
+    calibration: Calibration, obj: Object3D, views: Sequence[View], clean: Image8, *, device: torch.device | str = "cpu"
+) -> Surrogate:
+    """The surrogate for ``views``, whose target images are ``clean``."""
+    size = (clean.shape[1], clean.shape[2])
+    geometry = prepare_geometry(obj, views, size=size, sampling=calibration.sampling, device=device)
+    if calibration.model == "diffuse":
+        return diffuse_surrogate(geometry, views)
+    return curve_surrogate(geometry, obj, clean, calibration.greys, calibration.probes)
+
+
+def calibrate(
+    obj: Object3D,
+    views: Sequence[View],
+    clean: Image8,
+    ask: Ask,
+    *,
+    wanted: SurrogateModel,
+    generator: np.random.Generator,
+) -> Calibration:
+    """Probe the target as little as the ``wanted`` colour model needs; ``auto`` takes the cheapest that is good enough.
+
+    ``clean`` are the target's images of ``obj``, (views, H, W, 3) uint8. A few trial views decide; only then are all of
+    them probed.
+    """
+    trial = _Trial.of(obj, views, clean, ask, generator)
+    if wanted in {"auto", "diffuse"}:
+        fidelity = trial.fidelity("diffuse", SamplingModel(), ())
+        if wanted == "diffuse" or fidelity.good_enough:
+            reason = "asked for" if wanted == "diffuse" else f"good enough without probes: {_said(fidelity)}"
+            nothing = np.zeros((0, *clean.shape), np.uint8)
+            return Calibration("diffuse", reason, SamplingModel(), (), nothing, fidelity, trial.renders)
+    trial = trial.with_probes(ask)
+    sampling = find_sampling(lambda model: trial.fidelity("curve", model, CURVE_GREYS).mean()["explained"])
+    model, reason, fidelity = _cheapest(trial, sampling, wanted)
+    greys = CALIBRATED_GREYS if model == "calibrated" else CURVE_GREYS
+    probes, renders = _probe_all(trial, obj, views, greys, ask)
+    return Calibration(model, reason, sampling, greys, probes, fidelity, trial.renders + renders)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """The trial views, and what the target showed there: unpainted, repainted at random, and in each grey."""
+
+    obj: Object3D
+    index: tuple[int, ...]
+    views: tuple[View, ...]
+    clean: Image8
+    repainted: Object3D
+    images: Image8
+    probes: Image8 | None = None
+
+    @classmethod
+    def of(
+        cls, obj: Object3D, views: Sequence[View], clean: Image8, ask: Ask, generator: np.random.Generator
+    ) -> "_Trial":
+        index = tuple(sorted({round(k) for k in np.linspace(0, len(views) - 1, TRIAL_VIEWS + 2)[1:-1]}))
+        few = tuple(views[k] for k in index)
+        repainted = painted_noise(obj, generator)
+        return cls(obj, index, few, clean[list(index)], repainted, ask(repainted, few))
+
+    @property
+    def renders(self) -> int:
+        return len(self.views) * (1 + (0 if self.probes is None else len(self.probes)))
+
+    def with_probes(self, ask: Ask) -> "_Trial":
+        return replace(self, probes=np.stack([ask(painted_grey(self.obj, grey), self.views) for grey in CURVE_GREYS]))
+
+    def fidelity(self, model: str, sampling: SamplingModel, greys: tuple[int, ...]) -> Fidelity:
+        """Fidelity of a colour model under a sampling hypothesis, on the trial views."""
+        rows = [CURVE_GREYS.index(grey) for grey in greys]
+        probes = np.zeros((0, *self.clean.shape), np.uint8) if self.probes is None else self.probes[rows]
+        nothing = Fidelity((), (), (), ())
+        calibration = Calibration(model, "", sampling, greys, probes, nothing, 0)
+        surrogate = build_surrogate(calibration, self.obj, self.views, self.clean)
+        return measure_fidelity(surrogate, self.obj, self.clean, self.repainted, self.images)
+
+
+def _cheapest(trial: _Trial, sampling: SamplingModel, wanted: SurrogateModel) -> tuple[str, str, Fidelity]:
+    """(model, why, its fidelity): the wanted one, or with ``auto`` the cheaper of the two if it is good enough."""
+    if wanted == "auto":
+        fidelity = trial.fidelity("calibrated", sampling, CALIBRATED_GREYS)
+        if fidelity.good_enough:
+            return "calibrated", f"good enough with two probes a view: {_said(fidelity)}", fidelity
+        missed = f"two probes a view are not enough ({_said(fidelity)}); with five: "
+        fidelity = trial.fidelity("curve", sampling, CURVE_GREYS)
+        return "curve", missed + _said(fidelity), fidelity
+    greys = CALIBRATED_GREYS if wanted == "calibrated" else CURVE_GREYS
+    return wanted, "asked for", trial.fidelity(wanted, sampling, greys)
+
+
+def _said(fidelity: Fidelity) -> str:
+    mean = fidelity.mean()
+    return f"error {mean['error'] * 255:.1f}/255, {mean['explained']:.0%} of a random repaint's effect explained"
+
+
+def _probe_all(
+    trial: _Trial, obj: Object3D, views: Sequence[View], greys: tuple[int, ...], ask: Ask
+) -> tuple[Image8, int]:
+    """Probes (greys, views, H, W, 3) of all views and how many had to be asked for; the trial's are used again."""
+    assert trial.probes is not None
+    others = [k for k in range(len(views)) if k not in trial.index]
+    probes = np.zeros((len(greys), len(views), *trial.clean.shape[1:]), np.uint8)
+    for row, grey in enumerate(greys):
+        probes[row, list(trial.index)] = trial.probes[CURVE_GREYS.index(grey)]
+        if others:
+            probes[row, others] = ask(painted_grey(obj, grey), [views[k] for k in others])
+    return probes, len(greys) * len(others)

@@ -1,0 +1,185 @@
+"""Which triangle does each sub-sample of each pixel see, and where on it? Computed once per view, never again.
+
+Triangles are rasterised in homogeneous coordinates (Olano and Greer, 1997): the perspective-correct barycentrics
+divided by depth are *linear* functions of the pixel position, so no clipping is needed, a camera may stand inside the
+object, and UVs and their screen-space derivatives are exact anywhere on (and beyond) a triangle.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from trompe_shared.geometry import FIELD_OF_VIEW, Camera
+from trompe_shared.object3d import Object3D
+
+__all__ = ["CENTRE", "MSAA4", "Mesh", "Planes", "Visibility", "mesh_of", "project", "rasterize"]
+
+CENTRE = ((0.5, 0.5),)
+"""One sample in the middle of a pixel."""
+
+MSAA4 = ((0.375, 0.125), (0.875, 0.375), (0.125, 0.625), (0.625, 0.875))
+"""The standard sample positions of 4x MSAA (x right, y down, in pixels), common to Direct3D, Vulkan and OpenGL drivers.
+"""
+
+NEAR = 1e-3
+"""Nothing nearer to the camera than this is seen, metres."""
+
+MAX_CANDIDATES = 2_000_000
+"""Pixel-triangle pairs that are tested at once: bounds the memory of the rasteriser (about 200 bytes each)."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """All triangles of an object.
+
+    positions: metres. uvs: v = 0 is the bottom row. normals: unit length. texture: index into ``textures``, the albedo
+    file names.
+    """
+
+    positions: Float[Tensor, "faces 3 3"]
+    uvs: Float[Tensor, "faces 3 2"]
+    normals: Float[Tensor, "faces 3 3"]
+    texture: Int[Tensor, " faces"]
+    textures: tuple[str, ...]
+
+
+def mesh_of(obj: Object3D, *, device: torch.device | str = "cpu") -> Mesh:
+    """The triangles of ``obj``, in the order of its parts."""
+    names = tuple(sorted(obj.textures))
+    gathered: dict[str, list[Tensor]] = {"positions": [], "uvs": [], "normals": [], "texture": []}
+    for part in obj.parts:
+        faces = torch.from_numpy(part.faces).long()
+        gathered["positions"].append(torch.from_numpy(part.vertices)[faces])
+        gathered["uvs"].append(torch.from_numpy(part.uvs)[faces])
+        gathered["normals"].append(torch.from_numpy(part.normals)[faces])
+        gathered["texture"].append(torch.full((len(faces),), names.index(obj.albedo_of(part))))
+    return Mesh(**{key: torch.cat(value).to(device) for key, value in gathered.items()}, textures=names)
+
+
+@dataclass(frozen=True)
+class Planes:
+    """The triangles that can be seen in one view, as linear functions ``a x + b y + c`` of the pixel position.
+
+    face: index into the mesh. edges: barycentric of each corner over depth. box: first and last pixel column and row.
+    """
+
+    face: Int[Tensor, " n"]
+    edges: Float[Tensor, "n 3 3"]  # (triangle, coefficient a/b/c, corner)
+    box: Int[Tensor, "n 4"]  # x0, y0, x1, y1, inclusive
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """What the sub-samples of one view see: ``planes`` row per (pixel, sample), -1 where they see nothing.
+
+    Only pixels with a sample that sees something are kept; ``pixel`` is row * W + column.
+    """
+
+    planes: Planes
+    pixel: Int[Tensor, " p"]
+    row: Int[Tensor, "p samples"]
+
+
+def project(mesh: Mesh, camera: Camera, size: tuple[int, int], *, cull: bool) -> Planes:
+    """Set up the triangles of ``mesh`` for ``camera`` and an image of ``size`` (H, W).
+
+    With ``cull`` triangles seen from behind (clockwise) are dropped. Degenerate ones always are.
+    """
+    height, width = size
+    matrix = torch.from_numpy(camera.world_to_camera()).to(mesh.positions.device)
+    eye = mesh.positions.double() @ matrix[:3, :3].T + matrix[:3, 3]
+    focal = height / 2 / math.tan(math.radians(FIELD_OF_VIEW) / 2)
+    depth = -eye[..., 2]
+    corners = torch.stack(
+        [width / 2 * depth + focal * eye[..., 0], height / 2 * depth - focal * eye[..., 1], depth], -1
+    )
+    first, second, third = corners.unbind(1)
+    cofactors = torch.stack([second.cross(third, -1), third.cross(first, -1), first.cross(second, -1)], -1)
+    determinant = (first * cofactors[..., 0]).sum(-1)
+    box, touches = _pixel_box(corners, size)
+    scale = corners.abs().amax((1, 2)) ** 3
+    facing = -determinant if cull else determinant.abs()
+    keep = (touches & (facing > 1e-14 * scale) & torch.isfinite(determinant)).nonzero()[:, 0]
+    edges = cofactors[keep] / determinant[keep, None, None]
+    return Planes(keep, edges.float(), box[keep])
+
+
+def _pixel_box(
+    corners: Float[Tensor, "faces 3 3"], size: tuple[int, int]
+) -> tuple[Int[Tensor, "faces 4"], Bool[Tensor, " faces"]]:
+    """Pixels that each triangle can touch, and whether there are any; the whole image where it reaches behind the
+    camera."""
+    height, width = size
+    depth = corners[..., 2]
+    points = corners[..., :2] / depth.clamp(min=NEAR)[..., None]
+    limit = torch.tensor([width, height], device=corners.device)
+    low, high = points.amin(1), points.amax(1)
+    behind = (depth < NEAR).any(1)
+    low = torch.where(behind[:, None], torch.zeros_like(low), low.clamp(min=0))
+    high = torch.where(behind[:, None], limit - 1.0, torch.minimum(high, limit - 1.0))
+    touches = (high >= low).all(1) & (depth >= NEAR).any(1)
+    return torch.cat([low.floor(), high.floor()], 1).nan_to_num(0.0).long(), touches
+
+
+def rasterize(planes: Planes, size: tuple[int, int], samples: tuple[tuple[float, float], ...]) -> Visibility:
+    """The nearest triangle at each of ``samples`` (x, y in pixels) of every pixel. The first one drawn wins ties."""
+    height, width = size
+    nearest = torch.full((height * width * len(samples),), -1, dtype=torch.int64, device=planes.face.device)
+    extent = planes.box[:, 2:] - planes.box[:, :2] + 1
+    counts = extent[:, 0] * extent[:, 1]
+    for start, stop in _chunks(counts):
+        _draw(planes, start, stop, counts, width, samples, nearest)
+    nearest = nearest.view(-1, len(samples))
+    pixel = (nearest >= 0).any(1).nonzero()[:, 0]
+    keys = nearest[pixel]
+    row = torch.where(keys >= 0, 0xFFFFFFFF - (keys & 0xFFFFFFFF), -1)
+    return Visibility(planes, pixel, row)
+
+
+def _chunks(counts: Int[Tensor, " n"]) -> list[tuple[int, int]]:
+    """Runs of triangles whose candidates fit into ``MAX_CANDIDATES`` (a single larger triangle is a run of its own)."""
+    if not len(counts):
+        return []
+    total = counts.cumsum(0)
+    bounds = [0]
+    while bounds[-1] < len(counts):
+        done = int(total[bounds[-1] - 1]) if bounds[-1] else 0
+        end = int(torch.searchsorted(total, done + MAX_CANDIDATES, right=True))
+        bounds.append(max(end, bounds[-1] + 1))
+    return list(itertools.pairwise(bounds))
+
+
+def _draw(
+    planes: Planes,
+    start: int,
+    stop: int,
+    counts: Int[Tensor, " n"],
+    width: int,
+    samples: tuple[tuple[float, float], ...],
+    nearest: Int[Tensor, " pixels_samples"],
+) -> None:
+    """Test triangles ``start:stop`` against the pixels of their boxes and keep the nearest per sample, in ``nearest``.
+
+    A key is the float bits of 1/depth (monotone, as it is positive) above the inverted triangle number.
+    """
+    row = torch.arange(start, stop, device=counts.device).repeat_interleave(counts[start:stop])
+    within = (
+        torch.arange(len(row), device=row.device) - (counts[start:stop].cumsum(0) - counts[start:stop])[row - start]
+    )
+    box = planes.box[row]
+    columns = box[:, 2] - box[:, 0] + 1
+    x, y = box[:, 0] + within % columns, box[:, 1] + within // columns
+    edges = planes.edges[row]
+    at_corner = edges[:, 0] * x[:, None] + edges[:, 1] * y[:, None] + edges[:, 2]
+    base = (y * width + x) * len(samples)
+    for index, (sx, sy) in enumerate(samples):
+        value = at_corner + edges[:, 0] * sx + edges[:, 1] * sy
+        inverse_depth = value.sum(1)
+        seen = ((value >= 0).all(1) & (inverse_depth > 0) & (inverse_depth < 1 / NEAR)).nonzero()[:, 0]
+        bits = inverse_depth[seen].contiguous().view(torch.int32).long()
+        keys = (bits << 32) | (0xFFFFFFFF - row[seen])
+        nearest.scatter_reduce_(0, base[seen] + index, keys, "amax")

@@ -1,0 +1,262 @@
+"""What a renderer reads from a texture for a pixel, as one sparse linear operator.
+
+All mip levels of all textures lie in one flat array of texels. For every pixel the operator holds which texels it reads
+and with which weights (trilinear, per fragment, fragments weighted by the samples they cover), so that a view of a
+repainted object is a single gather, and the gradient its transpose.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, embedding_bag
+
+from trompe_server.surrogate.rasterize import CENTRE, MSAA4, Mesh, Planes, Visibility
+
+__all__ = [
+    "Fragments",
+    "Gather",
+    "MipLayout",
+    "SamplingModel",
+    "fragments_of",
+    "gather_of",
+    "mip_layout",
+    "mip_pyramid",
+]
+
+
+@dataclass(frozen=True)
+class SamplingModel:
+    """A hypothesis on how a renderer samples textures. All members are common practice of engines.
+
+    samples: where a pixel looks: 4x MSAA positions, or its centre alone.
+    shade_at: where the texture coordinates of a fragment are taken: at the pixel's centre (even if the fragment does
+        not cover it: the default of OpenGL and Direct3D) or at the mean of the samples it covers (centroid sampling).
+    lod: the level of detail is log2 of the footprint's longer axis, or of the root of its area.
+    filtered: mip levels and texels are averaged on encoded (sRGB) values or in linear light.
+    bias: added to the level of detail.
+    cull: triangles seen from behind are invisible.
+    """
+
+    samples: Literal["msaa4", "centre"] = "msaa4"
+    shade_at: Literal["centre", "centroid"] = "centre"
+    lod: Literal["longer", "area"] = "longer"
+    filtered: Literal["encoded", "linear"] = "encoded"
+    bias: float = 0.0
+    cull: bool = True
+
+    @property
+    def positions(self) -> tuple[tuple[float, float], ...]:
+        """Sample positions in a pixel, x right and y down."""
+        return MSAA4 if self.samples == "msaa4" else CENTRE
+
+    def but(self, **changes: object) -> "SamplingModel":
+        """This hypothesis with some members changed."""
+        return replace(self, **changes)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class MipLayout:
+    """Where each mip level of each texture lies in the flat array. ``sizes[t][l]`` is (H, W), ``starts[t][l]`` its
+    first texel."""
+
+    sizes: tuple[tuple[tuple[int, int], ...], ...]
+    starts: tuple[tuple[int, ...], ...]
+    total: int
+
+
+def mip_layout(sizes: Sequence[tuple[int, int]]) -> MipLayout:
+    """Layout of the full mip pyramids (halved and rounded down until 1 x 1) of textures of ``sizes`` (H, W)."""
+    levels, starts, position = [], [], 0
+    for height, width in sizes:
+        chain = [(height, width)]
+        while chain[-1] != (1, 1):
+            chain.append((max(1, chain[-1][0] // 2), max(1, chain[-1][1] // 2)))
+        first = []
+        for h, w in chain:
+            first.append(position)
+            position += h * w
+        levels.append(tuple(chain))
+        starts.append(tuple(first))
+    return MipLayout(tuple(levels), tuple(starts), position)
+
+
+def mip_pyramid(textures: Sequence[Float[Tensor, "H W 3"]], layout: MipLayout) -> Float[Tensor, "texels 3"]:
+    """All mip levels of ``textures`` (row 0 on top), box filtered, as one flat array. Differentiable."""
+    levels = []
+    for texture, sizes in zip(textures, layout.sizes, strict=True):
+        level = texture
+        levels.append(level.reshape(-1, 3))
+        for size in sizes[1:]:
+            level = _halve(level, size)
+            levels.append(level.reshape(-1, 3))
+    return torch.cat(levels)
+
+
+def _halve(level: Float[Tensor, "H W 3"], size: tuple[int, int]) -> Float[Tensor, "h w 3"]:
+    height, width = size
+    if level.shape[:2] == (2 * height, 2 * width):
+        return level.view(height, 2, width, 2, 3).mean((1, 3))
+    return adaptive_avg_pool2d(level.permute(2, 0, 1), size).permute(1, 2, 0)
+
+
+@dataclass(frozen=True)
+class Fragments:
+    """The (pixel, triangle) pairs of one view.
+
+    entry: which pixel of the visibility each belongs to, ascending. weight: share of the pixel's samples, so that the
+    weights of a pixel sum to its coverage. uv: texture coordinates. duv: their derivatives, [..., 0] per pixel to the
+    right, [..., 1] per pixel down.
+    barycentric: weights of the triangle's corners (outside [0, 1] where the triangle does not cover the shading point).
+    """
+
+    face: Int[Tensor, " n"]
+    entry: Int[Tensor, " n"]
+    weight: Float[Tensor, " n"]
+    uv: Float[Tensor, "n 2"]
+    duv: Float[Tensor, "n 2 2"]
+    barycentric: Float[Tensor, "n 3"]
+
+
+def fragments_of(
+    visibility: Visibility, mesh: Mesh, width: int, *, samples: tuple[tuple[float, float], ...], shade_at: str
+) -> Fragments:
+    """The distinct triangles that the samples of each pixel see, with their exact texture coordinates."""
+    rows, n_samples = visibility.row, visibility.row.shape[1]
+    same = rows[:, :, None] == rows[:, None, :]
+    earlier = torch.ones(n_samples, n_samples, device=rows.device).tril(-1).bool()
+    first = (rows >= 0) & ~(same & earlier).any(2)
+    entry, sample = first.nonzero(as_tuple=True)
+    covered = same[entry, sample].float()
+    row = rows[entry, sample]
+    position = torch.tensor(samples, device=rows.device)
+    centre = torch.tensor(CENTRE, device=rows.device)
+    offset = (covered @ position) / covered.sum(1, keepdim=True) if shade_at == "centroid" else centre
+    pixel = visibility.pixel[entry]
+    point = torch.stack([pixel % width, pixel // width], 1) + offset
+    uv, duv, barycentric = _texture_coordinates(visibility.planes, mesh, row, point)
+    return Fragments(visibility.planes.face[row], entry, covered.sum(1) / n_samples, uv, duv, barycentric)
+
+
+def _texture_coordinates(
+    planes: Planes, mesh: Mesh, row: Int[Tensor, " n"], point: Float[Tensor, "n 2"]
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, "n 3"]]:
+    """UV, its derivatives by the pixel position, and the barycentrics, at ``point`` of triangle ``row``."""
+    edges = planes.edges[row]  # (n, abc, corner)
+    over_depth = edges[:, 0] * point[:, :1] + edges[:, 1] * point[:, 1:] + edges[:, 2]
+    inverse_depth = over_depth.sum(1, keepdim=True)
+    barycentric = over_depth / inverse_depth
+    uvs = mesh.uvs[planes.face[row]]
+    uv = (barycentric[..., None] * uvs).sum(1)
+    slope = torch.einsum("nic,ncu->nui", edges[:, :2], uvs) - uv[..., None] * edges[:, :2].sum(2)[:, None, :]
+    return uv, slope / inverse_depth[..., None], barycentric
+
+
+@dataclass(frozen=True)
+class Gather:
+    """A sparse matrix (pixels x texels) in both directions: ``pixels = forward(texels)`` and its transpose."""
+
+    index: Int[Tensor, " taps"]
+    weight: Float[Tensor, " taps"]
+    offsets: Int[Tensor, " pixels"]
+    touched: Int[Tensor, " texels_read"]
+    pixel: Int[Tensor, " taps"]
+    transposed_weight: Float[Tensor, " taps"]
+    transposed_offsets: Int[Tensor, " texels_read"]
+
+    def forward(self, texels: Float[Tensor, "texels 3"]) -> Float[Tensor, "pixels 3"]:
+        """Weighted sums of the texels that each pixel reads."""
+        return embedding_bag(self.index, texels, self.offsets, mode="sum", per_sample_weights=self.weight)
+
+    def add_transpose(self, pixels: Float[Tensor, "pixels 3"], texels: Float[Tensor, "texels 3"]) -> None:
+        """Add to ``texels`` what each of them gets from the ``pixels`` that read it: the transpose of ``forward``."""
+        offsets, weight = self.transposed_offsets, self.transposed_weight
+        texels.index_add_(
+            0, self.touched, embedding_bag(self.pixel, pixels, offsets, mode="sum", per_sample_weights=weight)
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory it takes."""
+        return sum(t.nbytes for t in vars(self).values())
+
+
+def gather_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout, model: SamplingModel) -> Gather:
+    """The operator of one view (or several, with ``entry`` counted on) under the hypothesis ``model``.
+
+    Weights of a pixel sum to one: the share of it that the object covers belongs to the colour model.
+    """
+    entries, indices, weights = [], [], []
+    share = (
+        fragments.weight
+        / torch.zeros(n_pixels, device=fragments.weight.device).index_add_(0, fragments.entry, fragments.weight)[
+            fragments.entry
+        ]
+    )
+    for texture, (sizes, starts) in enumerate(zip(layout.sizes, layout.starts, strict=True)):
+        mine = (mesh.texture[fragments.face] == texture).nonzero()[:, 0]
+        uv, duv, entry, part = fragments.uv[mine], fragments.duv[mine], fragments.entry[mine], share[mine]
+        level = level_of_detail(duv, sizes[0], model).clamp(0, len(sizes) - 1)
+        lower = level.floor().clamp(max=max(len(sizes) - 2, 0))
+        for step in (0, 1):
+            blend = (level - lower) if step else 1 - (level - lower)
+            used = (blend > 0).nonzero()[:, 0]
+            index, weight = _bilinear(uv[used], lower[used].long() + step, sizes, starts)
+            entries.append(entry[used, None].expand(-1, 4).reshape(-1))
+            indices.append(index.reshape(-1))
+            weights.append((weight * (blend * part)[used, None]).reshape(-1))
+    return _compress(torch.cat(entries), torch.cat(indices), torch.cat(weights), n_pixels)
+
+
+def level_of_detail(duv: Float[Tensor, "n 2 2"], size: tuple[int, int], model: SamplingModel) -> Float[Tensor, " n"]:
+    """Mip level (unclamped) for a footprint, by the rule of ``model``; ``size`` is (H, W) of level 0."""
+    texels = duv * torch.tensor([size[1], size[0]], device=duv.device)[:, None]
+    extent: Tensor = texels.norm(dim=1).amax(1) if model.lod == "longer" else torch.linalg.det(texels).abs().sqrt()
+    return extent.nan_to_num(0.0).clamp(min=1e-8).log2() + model.bias
+
+
+def _bilinear(
+    uv: Float[Tensor, "n 2"],
+    level: Int[Tensor, " n"],
+    sizes: tuple[tuple[int, int], ...],
+    starts: tuple[int, ...],
+) -> tuple[Int[Tensor, "n 4"], Float[Tensor, "n 4"]]:
+    """Flat indices and weights of the four texels around ``uv`` at a mip level; textures repeat."""
+    size = torch.tensor(sizes, device=uv.device)[level]
+    start = torch.tensor(starts, device=uv.device)[level]
+    height, width = size[:, 0], size[:, 1]
+    u = uv[:, 0].nan_to_num(0.0).remainder(1.0)
+    v = (1 - uv[:, 1].nan_to_num(0.0)).remainder(1.0)
+    x, y = u * width - 0.5, v * height - 0.5
+    x0, y0 = x.floor(), y.floor()
+    fx, fy = x - x0, y - y0
+    columns = [(x0.long() + k) % width for k in (0, 1)]
+    rows = [(y0.long() + k) % height for k in (0, 1)]
+    index = torch.stack([start + r * width + c for r in rows for c in columns], 1)
+    weight = torch.stack([wy * wx for wy in (1 - fy, fy) for wx in (1 - fx, fx)], 1)
+    return index, weight
+
+
+def _compress(
+    entry: Int[Tensor, " taps"], index: Int[Tensor, " taps"], weight: Float[Tensor, " taps"], n_pixels: int
+) -> Gather:
+    """Order the taps by pixel for the forward pass and by texel for the backward pass."""
+    used = (weight > 1e-6).nonzero()[:, 0]
+    entry, index, weight = entry[used], index[used], weight[used].float()
+    by_pixel = entry.argsort(stable=True)
+    entry, index, weight = entry[by_pixel], index[by_pixel], weight[by_pixel]
+    by_texel = index.argsort(stable=True)
+    touched, counts = torch.unique_consecutive(index[by_texel], return_counts=True)
+    per_pixel = torch.bincount(entry, minlength=n_pixels)
+    return Gather(
+        index.int(),
+        weight,
+        (per_pixel.cumsum(0) - per_pixel).int(),
+        touched,
+        entry[by_texel].int(),
+        weight[by_texel],
+        (counts.cumsum(0) - counts).int(),
+    )

@@ -1,0 +1,374 @@
+"""SAILenv's wire protocol as a table of commands, and the codec that server and client share. No sockets here.
+
+A connection starts with ``REGISTER``; then the client sends one command at a time (a code byte and the fields of its
+row in ``COMMANDS``) and waits for the reply of that row. Nothing frames a message: whoever misreads one field has lost
+the stream, so every length is checked, and after a ``ProtocolError`` the connection must be closed.
+
+Both directions are little-endian, but strings differ: a client counts code points, a server counts bytes.
+Readers are callables: ``read(n)`` returns exactly n bytes, or raises (``EOFError``, ``OSError``) when the stream ends.
+"""
+
+import codecs
+import gzip
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Final, Protocol
+
+from trompe_shared.errors import ProtocolError, RendererError
+
+__all__ = [
+    "COMMANDS",
+    "LIGHT_NOT_FOUND",
+    "MAIN_LIGHT",
+    "MAX_SIDE",
+    "REGISTER",
+    "RIM_LIGHT",
+    "VIEW_FLAGS",
+    "Command",
+    "Reader",
+    "Request",
+    "decode_frame",
+    "decode_request",
+    "encode_frame",
+    "views_of",
+]
+
+MAX_TEXT: Final = 64 * 2**10
+MAX_JSON: Final = 2**20
+MAX_FILE: Final = 256 * 2**20
+MAX_VIEW: Final = 256 * 2**20
+MAX_LIST: Final = 4096
+_GZIP_WINDOW: Final = 31  # zlib's word for gzip data
+MAX_SIDE: Final = 4096
+"""Largest width or height of an image, pixels."""
+
+MAIN_LIGHT: Final = "Main Light"
+RIM_LIGHT: Final = "Rim Light"
+LIGHT_NOT_FOUND: Final = "light_not_found"
+
+VIEW_FLAGS: Final[Mapping[str, int]] = MappingProxyType(
+    {"main": 1, "category": 4, "object": 8, "optical": 16, "depth": 32}
+)
+"""Bit of each view in FRAME's flags, in the order in which a reply holds them."""
+
+Reader = Callable[[int], bytes]
+
+
+class Kind(Protocol):
+    """How one field travels."""
+
+    def pack(self, value: Any) -> bytes:
+        """Bytes of ``value``; raises ``ProtocolError`` for a value that the protocol cannot carry."""
+        ...
+
+    def take(self, read: Reader) -> Any:
+        """The value that ``read`` stands at; raises ``ProtocolError`` for bytes that the protocol does not allow."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """``count`` numbers of one struct format; a single one is a scalar, more are a tuple."""
+
+    format: str
+    count: int = 1
+
+    def pack(self, value: Any) -> bytes:
+        values = (value,) if self.count == 1 else tuple(value)
+        try:
+            return struct.pack(f"<{self.count}{self.format}", *values)
+        except (struct.error, OverflowError, TypeError) as error:
+            raise ProtocolError(f"{value!r} cannot be sent as {self.count} x '{self.format}': {error}.") from error
+
+    def take(self, read: Reader) -> Any:
+        pattern = f"<{self.count}{self.format}"
+        values = struct.unpack(pattern, read(struct.calcsize(pattern)))
+        return values[0] if self.count == 1 else values
+
+
+@dataclass(frozen=True)
+class _ClientText:
+    """Text from a client: an int with the number of CODE POINTS (SAILenv's client counts so), then UTF-8."""
+
+    limit: int = MAX_TEXT
+
+    def pack(self, value: str) -> bytes:
+        return _INT.pack(_within(len(value), self.limit, "text")) + _utf8(value)
+
+    def take(self, read: Reader) -> str:
+        count = _within(_INT.take(read), self.limit, "text")
+        decoder = codecs.getincrementaldecoder("utf-8")()
+        text = ""
+        try:
+            while len(text) < count:
+                # What is missing takes at least one byte a code point, so this never reads past the text.
+                text += decoder.decode(read(count - len(text)))
+        except UnicodeDecodeError as error:
+            raise ProtocolError(f"A text of {count} code points is not UTF-8 ({error}).") from error
+        return text
+
+
+@dataclass(frozen=True)
+class _ServerText:
+    """Text from a server: an int with the number of BYTES, then UTF-8."""
+
+    limit: int = MAX_TEXT
+
+    def pack(self, value: str) -> bytes:
+        data = _utf8(value)
+        return _INT.pack(_within(len(data), self.limit, "text")) + data
+
+    def take(self, read: Reader) -> str:
+        count = _within(_INT.take(read), self.limit, "text")
+        try:
+            return read(count).decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise ProtocolError(f"A text of {count} bytes is not UTF-8 ({error}).") from error
+
+
+@dataclass(frozen=True)
+class _File:
+    """A file from a client: its name, an int with its size, its bytes. The value is ``(name, bytes)``."""
+
+    limit: int = MAX_FILE
+
+    def pack(self, value: tuple[str, bytes]) -> bytes:
+        name, data = value
+        return _CLIENT_TEXT.pack(name) + _INT.pack(_within(len(data), self.limit, "file")) + data
+
+    def take(self, read: Reader) -> tuple[str, bytes]:
+        name = _CLIENT_TEXT.take(read)
+        return name, read(_within(_INT.take(read), self.limit, "file"))
+
+
+@dataclass(frozen=True)
+class _List:
+    """An int with the number of items, then the items; an item of one kind is the value itself, of more a tuple."""
+
+    kinds: tuple[Kind, ...]
+
+    def pack(self, value: Sequence[Any]) -> bytes:
+        rows = [(item,) if len(self.kinds) == 1 else item for item in value]
+        body = b"".join(kind.pack(cell) for row in rows for kind, cell in zip(self.kinds, row, strict=True))
+        return _INT.pack(_within(len(rows), MAX_LIST, "list")) + body
+
+    def take(self, read: Reader) -> list[Any]:
+        count = _within(_INT.take(read), MAX_LIST, "list")
+        rows = [tuple(kind.take(read) for kind in self.kinds) for _ in range(count)]
+        return [row[0] for row in rows] if len(self.kinds) == 1 else rows
+
+
+@dataclass(frozen=True)
+class _Dynamic:
+    """An optional movement: a bool, and if true its type and its description as JSON text. ``None`` or a pair."""
+
+    def pack(self, value: tuple[str, str] | None) -> bytes:
+        if value is None:
+            return _BOOL.pack(False)
+        return _BOOL.pack(True) + _CLIENT_TEXT.pack(value[0]) + _JSON.pack(value[1])
+
+    def take(self, read: Reader) -> tuple[str, str] | None:
+        return (_CLIENT_TEXT.take(read), _JSON.take(read)) if _BOOL.take(read) else None
+
+
+def _within(length: int, limit: int, what: str) -> int:
+    if not 0 <= length <= limit:
+        raise ProtocolError(f"A {what} of length {length}; allowed are 0 to {limit}.")
+    return length
+
+
+def _utf8(text: str) -> bytes:
+    try:
+        return text.encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise ProtocolError(f"{text!r} cannot be sent as UTF-8 ({error}).") from error
+
+
+_BYTE: Final = _Numbers("B")
+_BOOL: Final = _Numbers("?")
+_INT: Final = _Numbers("i")
+_UNSIGNED: Final = _Numbers("I")  # ints of a reply: the client reads them without sign
+_FLOAT: Final = _Numbers("f")
+_VEC3: Final = _Numbers("f", 3)
+_COLOR: Final = _Numbers("i", 3)
+_REPLY_COLOR: Final = _Numbers("I", 3)
+_CLIENT_TEXT: Final = _ClientText()
+_JSON: Final = _ClientText(MAX_JSON)
+_SERVER_TEXT: Final = _ServerText()
+
+
+def _nothing() -> Mapping[str, Kind]:
+    return MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Command:
+    """One row of the protocol.
+
+    ``request`` names the fields the client sends after the code byte; ``tail`` those that only the longer dialect
+    (v0.6) adds. ``reply`` holds the kinds of the answer's values. With ``status`` a text "ok" stands before them, and
+    any other text is the reason of a refusal, after which nothing follows; else the values ``refused`` stand for one.
+    """
+
+    code: int | None
+    name: str
+    request: Mapping[str, Kind] = field(default_factory=_nothing)
+    reply: tuple[Kind, ...] = ()
+    status: bool = False
+    refused: tuple[Any, ...] | None = None
+    tail: Mapping[str, Kind] = field(default_factory=_nothing)
+
+    def encode_request(self, **values: Any) -> bytes:
+        """Bytes a client sends. The fields of ``tail`` go out if they are among ``values``: all of them or none."""
+        head = b"" if self.code is None else _BYTE.pack(self.code)
+        kinds = dict(self.request) | (dict(self.tail) if set(values) & set(self.tail) else {})
+        if set(values) != set(kinds):
+            raise ProtocolError(f"{self.name} takes {sorted(kinds)}, got {sorted(values)}.")
+        return head + b"".join(kind.pack(values[name]) for name, kind in kinds.items())
+
+    def decode_fields(self, read: Reader, *, long: bool = False) -> dict[str, Any]:
+        """The request's fields after the code byte, by name; with ``long`` those of ``tail`` too."""
+        kinds = dict(self.request) | (dict(self.tail) if long else {})
+        return {name: kind.take(read) for name, kind in kinds.items()}
+
+    def encode_reply(self, *values: Any) -> bytes:
+        """Bytes a server answers when it did what was asked."""
+        status = _SERVER_TEXT.pack("ok") if self.status else b""
+        return status + b"".join(kind.pack(value) for kind, value in zip(self.reply, values, strict=True))
+
+    def encode_refusal(self, reason: str) -> bytes:
+        """Bytes a server answers when it refuses: ``reason`` where the protocol has room for one."""
+        if self.status:
+            shortened = reason.encode("utf-8", "replace")[: MAX_TEXT // 2].decode("utf-8", "ignore")
+            return _SERVER_TEXT.pack("refused" if shortened in {"", "ok"} else shortened)
+        return b"".join(kind.pack(value) for kind, value in zip(self.reply, self.refused or (), strict=True))
+
+    def decode_reply(self, read: Reader) -> tuple[Any, ...]:
+        """The values of an answer. Raises ``RendererError`` with the server's reason for a refusal by status."""
+        if self.status and (status := _SERVER_TEXT.take(read)) != "ok":
+            raise RendererError(f"The renderer refused {self.name}: {status}")
+        return tuple(kind.take(read) for kind in self.reply)
+
+
+@dataclass(frozen=True)
+class Request:
+    """A decoded command with its fields by name."""
+
+    command: Command
+    values: Mapping[str, Any]
+
+
+def _status(code: int, name: str, request: Mapping[str, Kind], *reply: Kind) -> Command:
+    return Command(code, name, request, reply, status=True)
+
+
+def _getter(code: int, name: str, request: Mapping[str, Kind], reply: Kind, *refused: Any) -> Command:
+    return Command(code, name, request, (reply,), refused=refused)
+
+
+_LIGHT: Final[Mapping[str, Kind]] = {"light": _CLIENT_TEXT}
+_COLOR_FIELD: Final[Mapping[str, Kind]] = {"color": _COLOR}
+_SPAWN: Final[Mapping[str, Kind]] = {
+    "name": _CLIENT_TEXT,
+    "position": _VEC3,
+    "rotation": _VEC3,
+    "remove_dynamics": _BOOL,
+    "scale": _VEC3,
+    "use_parent": _BOOL,
+}
+_SPAWN_TAIL: Final[Mapping[str, Kind]] = {"frustum_limited": _BOOL, "dynamic": _Dynamic()}
+_NAMES: Final = _List((_SERVER_TEXT,))
+
+REGISTER: Final = Command(None, "register", {"width": _INT, "height": _INT, "gzip": _BOOL}, (_UNSIGNED, _NAMES))
+"""The handshake: what a client sends first, and the answer (agent id, scene names)."""
+
+_ROWS: Final = (
+    Command(0x00, "frame", {"flags": _BYTE}),  # its reply depends on the flags: encode_frame, decode_frame
+    Command(0x01, "delete"),
+    _status(0x02, "change_scene", {"scene": _CLIENT_TEXT}),
+    _getter(0x03, "get_categories", {}, _List((_UNSIGNED, _SERVER_TEXT)), []),
+    _getter(0x04, "get_position", {}, _VEC3, (0.0, 0.0, 0.0)),
+    _status(0x05, "set_position", {"position": _VEC3}),
+    _getter(0x06, "get_rotation", {}, _VEC3, (0.0, 0.0, 0.0)),
+    _status(0x07, "set_rotation", {"rotation": _VEC3}),
+    _status(0x08, "toggle_follow", {}),
+    Command(0x09, "spawn_object", _SPAWN, (_SERVER_TEXT,), refused=("",), tail=_SPAWN_TAIL),
+    _status(0x0A, "despawn_object", {"instance": _INT}),
+    _getter(0x0B, "get_spawnable_objects_names", {}, _NAMES, []),
+    _getter(0x0C, "send_obj_zip", {"file": _File()}, _SERVER_TEXT, ""),
+    _status(0x0D, "set_clear_color", _COLOR_FIELD),
+    _status(0x0E, "get_light_color", _LIGHT, _REPLY_COLOR),
+    _status(0x0F, "set_light_color", {**_LIGHT, **_COLOR_FIELD}),
+    _status(0x10, "get_light_intensity", _LIGHT, _FLOAT),
+    _status(0x11, "set_light_intensity", {**_LIGHT, "intensity": _FLOAT}),
+    _status(0x12, "get_light_indirect_multiplier", _LIGHT, _FLOAT),
+    _status(0x13, "set_light_indirect_multiplier", {**_LIGHT, "multiplier": _FLOAT}),
+    _status(0x14, "get_light_position", _LIGHT, _VEC3),
+    _status(0x15, "set_light_position", {**_LIGHT, "position": _VEC3}),
+    _status(0x16, "get_light_direction", _LIGHT, _VEC3),
+    _status(0x17, "set_light_direction", {**_LIGHT, "direction": _VEC3}),
+    _getter(0x18, "get_light_type", _LIGHT, _SERVER_TEXT, LIGHT_NOT_FOUND),
+    _getter(0x19, "get_lights_names", {}, _NAMES, []),
+    _status(0x1A, "get_ambient_light_color", {}, _REPLY_COLOR),
+    _status(0x1B, "set_ambient_light_color", _COLOR_FIELD),
+    Command(0x1C, "spawn_view_frustum"),
+    _status(0x1E, "move_object", {"instance": _INT, "position": _VEC3, "rotation": _VEC3}),
+    # Trompe's own, far from SAILenv's codes: why the last command of this agent was refused; "" if none was.
+    _getter(0xE0, "last_error", {}, _SERVER_TEXT, ""),
+)
+
+COMMANDS: Final[Mapping[str, Command]] = MappingProxyType({row.name: row for row in _ROWS})
+"""All commands by name."""
+
+_BY_CODE: Final = {row.code: row for row in _ROWS}
+
+
+def decode_request(read: Reader, *, is_long: Callable[[], bool]) -> Request:
+    """Read one command of a client.
+
+    ``is_long`` is asked, once the short form of a command that also has a longer dialect is read, whether this client
+    speaks the longer one; nothing on the wire tells. Raises ``ProtocolError`` for an unknown code or a bad field.
+    """
+    code = _BYTE.take(read)
+    command = _BY_CODE.get(code)
+    if command is None:
+        raise ProtocolError(f"There is no command {code:#04x}; its length is unknown, so the stream is lost.")
+    values = command.decode_fields(read)
+    if command.tail and is_long():
+        values |= {name: kind.take(read) for name, kind in command.tail.items()}
+    return Request(command, values)
+
+
+def encode_frame(views: Sequence[bytes], *, delta_time: float, compress: bool) -> list[bytes]:
+    """FRAME's reply, as pieces each of which starts with a view's length (if there is a view).
+
+    A client reads a length with one ``recv``, so a piece must be sent whole and apart from the one before. ``views``
+    are the payloads in the order of ``VIEW_FLAGS``; ``delta_time`` in seconds, NaN when the rendering failed.
+    """
+    payloads = [gzip.compress(view, 1) for view in views] if compress else views
+    pieces = [_INT.pack(_within(len(payload), MAX_VIEW, "view")) + payload for payload in payloads]
+    return [*pieces[:-1], b"".join(pieces[-1:]) + _FLOAT.pack(delta_time)]
+
+
+def decode_frame(read: Reader, *, flags: int, compressed: bool) -> tuple[dict[str, bytes], float]:
+    """FRAME's reply: payloads by view name, uncompressed, and the delta time in seconds."""
+    views = {name: _take_view(read, compressed) for name in views_of(flags)}
+    return views, _FLOAT.take(read)
+
+
+def views_of(flags: int) -> Iterator[str]:
+    """Names of the views that ``flags`` asks for, in the order of the reply."""
+    return (name for name, bit in VIEW_FLAGS.items() if flags & bit)
+
+
+def _take_view(read: Reader, compressed: bool) -> bytes:
+    payload = read(_within(_INT.take(read), MAX_VIEW, "view"))
+    if not compressed:
+        return payload
+    try:
+        return zlib.decompressobj(_GZIP_WINDOW).decompress(payload, MAX_VIEW)
+    except zlib.error as error:
+        raise ProtocolError(f"A view of {len(payload)} bytes is not gzip data ({error}).") from error
