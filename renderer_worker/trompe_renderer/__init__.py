@@ -1,1 +1,1 @@
-"""renderer_worker/trompe_renderer"""
+"""The renderer worker: SAILenv's socket protocol outside, physically based rendering with pyrender inside."""

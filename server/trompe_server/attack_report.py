@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from trompe_server.attack.metrics import (
     accuracy,
-    accuracy_before,
     max_view_change,
     mean_texel_change,
     softmax,
@@ -118,10 +117,8 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
 
 
 def _accuracy(evidence: Evidence, views: str) -> Accuracy:
-    before, after = evidence.logits_before[views], evidence.logits_after
-    if after is None:
-        return accuracy_before(before, evidence.scene.label)
-    return accuracy(before, after[views], evidence.scene.label)
+    after = None if evidence.logits_after is None else evidence.logits_after[views]
+    return accuracy(evidence.logits_before[views], after, evidence.scene.label)
 
 
 def _surrogate_accuracy(evidence: Evidence) -> Accuracy | None:
@@ -149,11 +146,8 @@ def _surrogate_images(surrogate: Surrogate, obj: Object3D) -> NDArray[np.uint8]:
 
 def _judgement(judge: Classifier, evidence: Evidence) -> Judgement:
     def judged(views: str) -> Accuracy:
-        before = judge.predict(evidence.before[views])
-        label = evidence.scene.label
-        if evidence.after is None:
-            return accuracy_before(before, label)
-        return accuracy(before, judge.predict(evidence.after[views]), label)
+        after = None if evidence.after is None else judge.predict(evidence.after[views])
+        return accuracy(judge.predict(evidence.before[views]), after, evidence.scene.label)
 
     held_out = judged("held_out") if evidence.scene.held_out else None
     return Judgement(classifier=judge.name, target=judged("own"), held_out=held_out)

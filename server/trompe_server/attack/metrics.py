@@ -12,7 +12,6 @@ from trompe_shared.geometry import View
 
 __all__ = [
     "accuracy",
-    "accuracy_before",
     "max_view_change",
     "mean_texel_change",
     "softmax",
@@ -71,13 +70,6 @@ def _hits(logits: Logits, label: int) -> int:
     if not len(logits):
         raise ValueError("accuracy needs at least one view")
     return int((logits.argmax(axis=1) == label).sum())
-
-
-def accuracy_before(logits: Logits, label: int) -> Accuracy:
-    """The share of the views classified as ``label`` where there was no attack; the rest is ``None``."""
-    return accuracy(logits, logits, label).model_copy(
-        update={"a_after": None, "a_drop": None, "a_after_interval": None}
-    )
 
 
 def transfer_gap(surrogate: Accuracy | None, target: Accuracy) -> float | None:

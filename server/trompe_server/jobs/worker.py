@@ -63,6 +63,7 @@ def run_worker(settings: Settings, renderer: tuple[str, int], *, announce: Calla
         runner = JobRunner(store, _job_opener(settings, renderer))
         DbosWorker(settings.database, runner).start()
         announce(READY)
+        _preload(settings.pipeline)
         while not stop.wait(1.0):
             _end_if_stalled(runner, settings.stall_timeout)
         _leave(runner)
@@ -113,6 +114,14 @@ def _named(path: str) -> Any:
     """What ``module:name`` names. Imported late: it brings torch."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)
+
+
+def _preload(pipeline: str) -> None:
+    """Import torch and all that ahead of the first job. Where that fails, each job says so."""
+    try:
+        _named(pipeline)
+    except Exception:
+        logger.exception("%s cannot be imported; every job will fail", pipeline)
 
 
 def _end_if_stalled(runner: JobRunner, timeout: float) -> None:

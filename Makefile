@@ -1,0 +1,54 @@
+# Everything on a fresh machine with git, make and Python 3.11+: `make demo`, `make test`, `make check`.
+# Choose the Python by `make PYTHON=python3.12 ...`; the virtual environment is .venv.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: help demo test check format clean egl
+
+help:
+	@echo "make demo    attack an object that comes with Trompe; results in trompe-demo/"
+	@echo "make test    run the tests (those with real objects too, if TROMPE_ASSETS names their folder)"
+	@echo "make check   format, lint, types, import rules"
+	@echo "make format  put the code into its form"
+	@echo "make clean   remove .venv, caches and trompe-demo/"
+
+demo: $(VENV)/.installed-server egl
+	$(BIN)/trompe demo --out trompe-demo
+
+test: $(VENV)/.installed-dev egl
+	$(BIN)/python -m pytest
+
+check: $(VENV)/.installed-dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(VENV)/.installed-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache trompe-demo
+
+# One environment; the stamp of an extra is renewed when the requirements change.
+$(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/pip
+	$(BIN)/pip install -c constraints.txt -e '.[$*]'
+	touch $@
+
+$(BIN)/pip:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "Trompe needs Python 3.11 or newer as $(PYTHON); choose another by make PYTHON=..."; exit 1; }
+	@$(PYTHON) -m venv $(VENV) \
+	  || { rm -rf $(VENV); echo "Python's venv module is missing: sudo apt-get install python3-venv"; exit 1; }
+
+# The renderer draws through EGL, in software where there is no GPU.
+EGL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
+SUDO = $(if $(filter 0,$(shell id -u)),,sudo -n)
+
+egl:
+	@$(PYTHON) -c 'import ctypes; ctypes.CDLL("libEGL.so.1"), ctypes.CDLL("libGL.so.1")' 2>/dev/null \
+	  || { $(SUDO) apt-get update && $(SUDO) apt-get install -y --no-install-recommends $(EGL_PACKAGES); } \
+	  || { echo "The renderer needs EGL. On Debian: sudo apt-get install $(EGL_PACKAGES)"; exit 1; }

@@ -1,0 +1,139 @@
+"""The errors of the client; those about inputs (``ObjectError``, ``SpecError``...) are shared with the server.
+
+    TrompeError                      trompe_shared.errors
+    └── ClientError                  has the ids it knows: request_id, job_id
+        ├── ServerUnreachable        nothing answers at the server's address, or the connection broke
+        ├── EmbeddedServerError      the service that a command starts for itself did not come up, or died
+        ├── ContractError            an answer that this client cannot read: another version, or no Trompe server
+        ├── APIError                 the server said no: has status, problem
+        │   ├── BadRequest           400, 413, 415, 422: what was sent is wrong
+        │   ├── NotFound             404: no such job, object, classifier or file
+        │   ├── Conflict             409: not possible in the present state
+        │   └── ServerFault          5xx: the server's own fault
+        └── JobError                 has job, as last seen
+            ├── JobFailed            the job ended in an error
+            ├── JobCancelled         somebody cancelled the job
+            └── WaitTimeout          the job was still going on when the time was up; it goes on
+
+A job that ends as n.a. (nothing was recognised before the attack) is a result, not an error.
+"""
+
+from trompe_shared.api import Job, Problem
+from trompe_shared.errors import TrompeError
+
+__all__ = [
+    "APIError",
+    "BadRequest",
+    "ClientError",
+    "Conflict",
+    "ContractError",
+    "EmbeddedServerError",
+    "JobCancelled",
+    "JobError",
+    "JobFailed",
+    "NotFound",
+    "ServerFault",
+    "ServerUnreachable",
+    "WaitTimeout",
+]
+
+
+class ClientError(TrompeError):
+    """Base of the client's own errors. ``request_id`` finds the request in the server's log."""
+
+    code = "client"
+
+    def __init__(self, message: str, *, request_id: str | None = None, job_id: str | None = None) -> None:
+        super().__init__(message)
+        self.request_id = request_id
+        self.job_id = job_id
+
+
+class ServerUnreachable(ClientError):  # noqa: N818
+    """Nothing answers at the server's address, or the connection broke."""
+
+    code = "unreachable"
+
+
+class EmbeddedServerError(ClientError):
+    """The service that a command starts for itself did not come up, or died."""
+
+    code = "embedded-server"
+
+
+class ContractError(ClientError):
+    """An answer that this client cannot read."""
+
+    code = "contract"
+
+
+class APIError(ClientError):
+    """The server refused a request. ``problem`` is its answer (RFC 9457), ``status`` the HTTP status."""
+
+    code = "api"
+
+    def __init__(self, problem: Problem, *, request_id: str | None = None, job_id: str | None = None) -> None:
+        super().__init__(_explain(problem), request_id=request_id or problem.request_id, job_id=job_id)
+        self.problem = problem
+        self.status = problem.status
+
+
+class BadRequest(APIError):  # noqa: N818
+    """What was sent is wrong; the message says what."""
+
+    code = "bad-request"
+
+
+class NotFound(APIError):  # noqa: N818
+    """There is no such job, object, classifier or file."""
+
+    code = "not-found"
+
+
+class Conflict(APIError):  # noqa: N818
+    """Not possible in the present state."""
+
+    code = "conflict"
+
+
+class ServerFault(APIError):  # noqa: N818
+    """The server's own fault; its log has the request id."""
+
+    code = "server-fault"
+
+
+class JobError(ClientError):
+    """A job did not come to a result. ``job`` is the job as last seen."""
+
+    code = "job"
+
+    def __init__(self, message: str, *, job: Job) -> None:
+        super().__init__(message, job_id=job.id)
+        self.job = job
+
+
+class JobFailed(JobError):  # noqa: N818
+    """The job ended in an error."""
+
+    code = "job-failed"
+
+
+class JobCancelled(JobError):  # noqa: N818
+    """Somebody cancelled the job."""
+
+    code = "job-cancelled"
+
+
+class WaitTimeout(JobError):  # noqa: N818
+    """The job was still going on when the time was up; it goes on."""
+
+    code = "wait-timeout"
+
+
+def _explain(problem: Problem) -> str:
+    """One paragraph: title, detail, and the fields that are wrong."""
+    parts = [problem.title.rstrip("."), *([problem.detail.rstrip(".")] if problem.detail else [])]
+    for error in problem.errors or []:
+        place = ".".join(str(step) for step in error.get("loc", []) if step != "body")
+        parts.append(f"{place}: {error.get('msg', error)}" if place else str(error.get("msg", error)))
+    return ". ".join(parts) + "."

@@ -1,0 +1,128 @@
+"""A result as a table for people."""
+
+from collections.abc import Iterator, Sequence
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from trompe_client._job import JobHandle
+from trompe_shared.api import Accuracy, ClassifierInfo, ObjectInfo, Result
+
+__all__ = ["classifiers_table", "jobs_table", "objects_table", "result_report"]
+
+
+def result_report(result: Result, *, note: str | None = None) -> RenderableType:
+    """Accuracies before and after, then how large the change is and how the figures came about."""
+    table = _table("", "views", "A_before", "A_after", "A_drop", right=4)
+    for name, accuracy in _rows(result):
+        table.add_row(name, str(accuracy.views), *_cells(accuracy))
+    facts = Table.grid(padding=(0, 2))
+    for name, value in _facts(result):
+        facts.add_row(name, value)
+    notes = [Text(f"n.a.: {note}", style="yellow")] if note else []
+    warnings = [Text(f"warning: {warning}", style="yellow") for warning in result.warnings]
+    return Group(Text(_headline(result), style="bold"), table, Text("[..] intervals at 95 %"), facts, *notes, *warnings)
+
+
+def jobs_table(jobs: Sequence[JobHandle]) -> Table:
+    """One line per job."""
+    table = _table("job", "state", "object", "label", "classifier", "epsilon", "done", "created")
+    for job in jobs:
+        spec, progress = job.status.spec, job.status.progress
+        what = [_short(spec.object), str(spec.label), _short(spec.classifier), f"{spec.epsilon:g}"]
+        table.add_row(
+            job.id, job.state.value, *what, f"{progress.fraction:.0%}", f"{job.status.created:%Y-%m-%d %H:%M}"
+        )
+    return table
+
+
+def objects_table(objects: Sequence[ObjectInfo]) -> Table:
+    """One line per stored object."""
+    table = _table("name", "id", "triangles", "textures", "radius", "origin")
+    for obj in objects:
+        textures = ", ".join(f"{file} {width}x{height}" for file, (height, width) in obj.textures.items())
+        table.add_row(
+            obj.name, _short(obj.id), str(obj.triangles), textures, f"{obj.radius:.3g} m", _origin(obj.shipped)
+        )
+    return table
+
+
+def classifiers_table(classifiers: Sequence[ClassifierInfo]) -> Table:
+    """One line per stored classifier."""
+    table = _table("name", "id", "use", "input", "classes", "origin")
+    for one in classifiers:
+        use = "attack, judge" if one.white_box else "judge"
+        height, width = one.image_size
+        table.add_row(one.name, _short(one.id), use, f"{width}x{height}", str(one.n_classes), _origin(one.shipped))
+    return table
+
+
+def _table(*columns: str, right: int = 0) -> Table:
+    """A table; the last ``right`` columns are aligned to the right."""
+    table = Table()
+    for index, name in enumerate(columns):
+        table.add_column(name, justify="right" if index >= len(columns) - right else "left", overflow="fold")
+    return table
+
+
+def _headline(result: Result) -> str:
+    label = f"{result.label_name} ({result.label})" if result.label_name else str(result.label)
+    tau = "none" if result.tau is None else f"{result.tau:g}"
+    numbers = f"epsilon {result.epsilon:g}, alpha {result.alpha:g}, tau {tau}, {result.steps} steps, seed {result.seed}"
+    return f"{result.object}, class {label}, attacked through {result.classifier}: {numbers}"
+
+
+def _rows(result: Result) -> Iterator[tuple[str, Accuracy]]:
+    rows = [
+        ("surrogate (own views)", result.surrogate),
+        ("target (own views)", result.target),
+        ("target (held-out views)", result.held_out),
+    ]
+    for judge in result.judges:
+        rows += [
+            (f"judge {judge.classifier} (own views)", judge.target),
+            (f"judge {judge.classifier} (held-out views)", judge.held_out),
+        ]
+    return ((name, accuracy) for name, accuracy in rows if accuracy is not None)
+
+
+def _cells(accuracy: Accuracy) -> list[str]:
+    before = _with_interval(accuracy.a_before, accuracy.a_before_interval)
+    after = _with_interval(accuracy.a_after, accuracy.a_after_interval)
+    return [before, after, _number(accuracy.a_drop)]
+
+
+def _with_interval(share: float | None, interval: tuple[float, float] | None) -> str:
+    return _number(share) + (f" [{interval[0]:.2f}, {interval[1]:.2f}]" if interval else "")
+
+
+def _facts(result: Result) -> Iterator[tuple[str, str]]:
+    yield "N% (texels altered)", _percent(result.texels_altered)
+    yield "mean texel change", _levels(result.mean_texel_change)
+    yield "max view change", _levels(result.max_view_change)
+    yield "surrogate model", f"{result.surrogate_model}: {result.surrogate_reason}"
+    yield "transfer gap", _number(result.transfer_gap)
+    yield "seconds", ", ".join(f"{phase} {seconds:.1f}" for phase, seconds in result.seconds.items())
+    yield "probe renders", str(result.probe_renders)
+
+
+def _number(value: float | None) -> str:
+    return "n.a." if value is None else f"{value:.2f}"
+
+
+def _percent(share: float | None) -> str:
+    return "n.a." if share is None else f"{share:.1%}"
+
+
+def _levels(change: float | None) -> str:
+    return "n.a." if change is None else f"{change:.4f} ({change * 255:.1f}/255)"
+
+
+def _short(reference: str) -> str:
+    """A name as it is; of an id, which is a long hash, the beginning, which the server takes as well."""
+    return reference if len(reference) < 32 else reference[:12]
+
+
+def _origin(shipped: bool) -> str:
+    return "shipped" if shipped else "uploaded"
