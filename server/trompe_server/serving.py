@@ -1,10 +1,8 @@
 """``trompe serve``: children, database and HTTP server, put up in order and taken down in order."""
 
 import ipaddress
-import logging
 import signal
 import socket
-import threading
 from collections.abc import Callable
 from types import FrameType
 from typing import NoReturn
@@ -21,11 +19,8 @@ from trompe_server.jobs.supervisor import Supervisor
 from trompe_server.jobs.worker import prepare_data
 from trompe_server.library import Library
 from trompe_server.settings import Settings
-from trompe_shared.errors import TrompeError
 
 __all__ = ["run_service"]
-
-logger = logging.getLogger(__name__)
 
 
 def run_service(settings: Settings, *, host: str, port: int, announce: Callable[[str], None]) -> None:
@@ -50,7 +45,6 @@ def _serve_http(
     settings: Settings, supervisor: Supervisor, listener: socket.socket, announce: Callable[[str], None]
 ) -> None:
     store, queue, library = JobStore(settings.database), DbosQueue(settings.database), Library(settings.library)
-    threading.Thread(target=_look_at_shipped, args=[library], daemon=True).start()
     app = create_app(Services(settings, library, store, queue, supervisor.missing))
     config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=5)
     try:
@@ -58,15 +52,6 @@ def _serve_http(
     finally:
         queue.close()
         store.close()
-
-
-def _look_at_shipped(library: Library) -> None:
-    """Read what is shipped ahead of the first request for it; that takes seconds."""
-    try:
-        library.objects()
-        library.classifiers()
-    except TrompeError as error:
-        logger.error("%s", error)
 
 
 class _Server(uvicorn.Server):
