@@ -1,6 +1,8 @@
 """Arrays as the bytes of .npz files: how a job's images travel between its phases."""
 
 import io
+import zipfile
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,5 +21,10 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 def unpack_arrays(data: bytes) -> dict[str, NDArray[Any]]:
     """What ``pack_arrays`` packed. Raises ``ValueError`` or ``OSError`` for damaged bytes."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise ValueError(
+            f"These are not the bytes of an .npz file ({error}); they were cut short or changed."
+        ) from error

@@ -111,7 +111,15 @@ class AttackJob:
         ask = self._asker("calibrate", 5 * len(scene.views) + 4, on_progress)
         generator = np.random.default_rng([self.spec.seed, PROBE_STREAM])
         clean = self._load("clean")["own"]
-        found = calibrate(scene.obj, scene.views, clean, ask, wanted=self.spec.surrogate, generator=generator)
+        found = calibrate(
+            scene.obj,
+            scene.views,
+            clean,
+            ask,
+            wanted=self.spec.surrogate,
+            generator=generator,
+            backdrop=scene.backdrop,
+        )
         self._save("probes", probes=found.probes)
         described = {k: v for k, v in vars(found).items() if k != "probes"}
         described |= {"sampling": asdict(found.sampling), "fidelity": asdict(found.fidelity)}
@@ -190,7 +198,8 @@ class AttackJob:
 
     @cached_property
     def _surrogate(self) -> Surrogate:
-        return build_surrogate(self._calibration, self.scene.obj, self.scene.views, self._load("clean")["own"])
+        scene, clean = self.scene, self._load("clean")["own"]
+        return build_surrogate(self._calibration, scene.obj, scene.views, clean, backdrop=scene.backdrop)
 
     @cached_property
     def _masks(self) -> torch.Tensor | None:

@@ -1,9 +1,11 @@
 """From a job's options to what it works on: the object, the networks, the views and the renderer."""
 
+import re
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trompe_server.attack import framing_distance, grid_views, held_out_views
 from trompe_server.classifiers import Classifier, WhiteBoxClassifier, load_classifier
@@ -34,6 +36,8 @@ class Scene:
     views: tuple[View, ...]
     held_out: tuple[View, ...]
     target: TargetRenderer
+    backdrop: NDArray[np.uint8] | None
+    """(H, W, 3), what stands behind the object in place of the views' uniform backgrounds."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -57,18 +61,20 @@ def open_scene(spec: JobSpec, *, library: Library, target: TargetRenderer) -> Sc
             "Attack a .pt2 file and name this one as a judge (--judge)."
         )
     distance, elevation = _framing(spec, obj, info.name if info.shipped else None)
-    backdrop = COLOURS.get(spec.background) or _hex_colour(spec.background)
-    if backdrop is None:
+    colour, backdrop = COLOURS.get(spec.background) or _hex_colour(spec.background), None
+    if colour is None:
         picture = decode_rgb(library.background_bytes(spec.background), spec.background)
-        target, backdrop = BackdropTarget(target, picture), COLOURS["black"]
+        target = BackdropTarget(target, picture)
+        colour, backdrop = COLOURS["black"], target.backdrop(classifier.image_size)
     return Scene(
         obj,
         info.name,
         resolve_label(spec.label, classifier.classes, classifier.n_classes),
         classifier,
         tuple(_stored_classifier(judge, library) for judge in spec.judges),
-        *_views(spec, distance, elevation, backdrop),
+        *_views(spec, distance, elevation, colour),
         target,
+        backdrop,
     )
 
 
@@ -86,7 +92,7 @@ def _framing(spec: JobSpec, obj: Object3D, shipped: str | None) -> tuple[float, 
 
 
 def _hex_colour(text: str) -> tuple[int, int, int] | None:
-    if len(text) != 7 or text[0] != "#":
+    if not re.fullmatch("#[0-9a-fA-F]{6}", text):
         return None
     red, green, blue = bytes.fromhex(text[1:])
     return red, green, blue

@@ -8,8 +8,10 @@ in.
 
 import io
 import json
+import lzma
 import re
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -28,6 +30,9 @@ MAX_ARCHIVE_BYTES: Final = 512 * 2**20
 MAX_MEMBERS: Final = 256
 MAX_TEXTURE_SIDE: Final = 8192
 MAX_FACES: Final = 2_000_000
+
+_DAMAGED: Final = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError, EOFError, ValueError, OSError)
+"""What ``zipfile`` raises for bytes that it cannot unpack."""
 
 Texture = NDArray[np.uint8]
 
@@ -116,6 +121,8 @@ def decode_rgb(data: bytes, name: str) -> Texture:
                     f"Texture {name!r} is {image.size} pixels; at most {MAX_TEXTURE_SIDE} a side are read."
                 )
             return np.array(image.convert("RGB"))
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise ObjectError(f"Texture {name!r} is too large ({error}); {MAX_TEXTURE_SIDE} a side are read.") from error
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
         raise ObjectError(f"Texture {name!r} cannot be read as an image ({error}). Save it again as a PNG.") from error
 
@@ -151,9 +158,10 @@ def _unzip(data: bytes) -> dict[str, bytes]:
     """Members of a flat zip (one common folder is allowed and removed), within the limits above."""
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
-    except zipfile.BadZipFile as error:
+    except _DAMAGED as error:
         raise ObjectError(f"The object is not a zip archive ({error}). Zip the folder that holds the .obj.") from error
-    members = [info for info in archive.infolist() if not info.is_dir() and "__MACOSX" not in info.filename]
+    named = [info for info in archive.infolist() if info.filename]
+    members = [info for info in named if not info.is_dir() and "__MACOSX" not in info.filename]
     if len(members) > MAX_MEMBERS:
         raise ObjectError(f"The archive has {len(members)} files; at most {MAX_MEMBERS} are read.")
     if sum(info.file_size for info in members) > MAX_ARCHIVE_BYTES:
@@ -163,7 +171,7 @@ def _unzip(data: bytes) -> dict[str, bytes]:
         raise ObjectError("The archive must be flat: an .obj, its materials and its textures in one folder.")
     try:
         return {PurePosixPath(info.filename).name: _read_member(archive, info) for info in members}
-    except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError, NotImplementedError, OSError) as error:
+    except _DAMAGED as error:
         raise ObjectError(f"The archive is damaged or encrypted ({error}). Zip the folder again.") from error
 
 
@@ -233,7 +241,7 @@ def _materials_from_json(data: bytes, file: str) -> dict[str, Material]:
             )
             for name, maps in table.items()
         }
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ObjectError(
             f"{file!r} is not a material definition ({type(error).__name__}: {error}); expected "
             '{"material": {"albedo": "file.png", "normal": "file.png", "metallic": "file.png"}}.'

@@ -94,7 +94,8 @@ def parse_obj(text: str, file: str) -> tuple[Part, ...]:
     reader.read(text)
     if not reader.corners:
         raise ObjectError(f"{file!r} has no faces.")
-    arrays = {kind: np.asarray(rows, dtype=np.float32) for kind, rows in reader.numbers.items()}
+    with np.errstate(over="ignore"):  # too large for single precision is not finite, and refused as such
+        arrays = {kind: np.asarray(rows, dtype=np.float32) for kind, rows in reader.numbers.items()}
     for kind, values in arrays.items():
         if not np.isfinite(values).all():
             raise ObjectError(f"{file!r} has a {kind!r} statement with a number that is not finite.")

@@ -126,6 +126,8 @@ def save_state(state: AttackState) -> bytes:
 def load_state(data: bytes) -> AttackState:
     """A state from ``save_state``'s bytes. Raises ``ValueError`` or ``OSError`` where they are damaged."""
     arrays = unpack_arrays(data)
+    if "step" not in arrays:
+        raise ValueError(f"These arrays are no attack state: there is no 'step' among {sorted(arrays)}.")
     names = [name for name in arrays if name.startswith(_DELTA)]
     return AttackState(int(arrays["step"]), {n.removeprefix(_DELTA): torch.from_numpy(arrays[n]) for n in names})
 

@@ -63,7 +63,7 @@ def load_tiny(path: Path = WEIGHTS) -> TinyNet:
         network.load_state_dict(state)
     except (OSError, ValueError, RuntimeError) as error:
         raise ClassifierError(
-            f"The weights of the shipped classifier ({path.name}) cannot be read: {error}. "
+            f"The weights of the shipped classifier ({path.name}) cannot be read ({str(error).splitlines()[0]}). "
             "Install trompe again, or train it with scripts/train_classifier.py."
         ) from error
     return network.eval().requires_grad_(False)

@@ -38,7 +38,6 @@ class Child:
         self.name, self._command, self._ready = name, command, ready
         self.match: re.Match[str] | None = None
         self.failures = 0
-        self.pid: int | None = None
         self._process: subprocess.Popen[str] | None = None
         self._stopping = threading.Event()
         self._up = threading.Event()
@@ -89,10 +88,14 @@ class Child:
             self._stopping.wait(wait)
 
     def _run_once(self) -> int:
-        """Run the process to its end and return its exit status; its standard output is read all the while."""
+        """Run the process to its end and return its exit status; its standard output is read all the while.
+
+        It has a process group of its own, so that Ctrl-C reaches us alone and we end it in order.
+        """
         command = [sys.executable, "-m", "trompe_server.jobs.leash", *self._command()]
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-            self._process, self.pid = process, process.pid
+        pipe = subprocess.PIPE
+        with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, process_group=0) as process:
+            self._process = process
             if self._stopping.is_set():
                 process.terminate()
             assert process.stdout is not None

@@ -4,8 +4,8 @@ The target stays a black box: it is shown the object painted in greys and in ran
 judged by how well it predicts what the noise changes in the target's images.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from trompe_server.surrogate.sampling import SamplingModel
 from trompe_server.surrogate.surrogate import (
+    Geometry,
     Surrogate,
     curve_surrogate,
     diffuse_surrogate,
@@ -41,11 +42,11 @@ __all__ = [
     "painted_noise",
 ]
 
-CALIBRATED_GREYS: Final = (0, 255)
+CALIBRATED_GREYS: Final = (0, 128)
 CURVE_GREYS: Final = (0, 64, 128, 191, 255)
-"""Encoded greys of the probes of the ``calibrated`` and the ``curve`` model."""
+"""Encoded greys of the probes of the ``calibrated`` and the ``curve`` model. White would saturate and tell little."""
 
-MAX_ERROR: Final = 2.0 / 255
+MAX_ERROR: Final = 1.5 / 255
 """A colour model is good enough when its mean error on the unpainted object's pixels is at most this, sRGB in [0, 1]
 units."""
 
@@ -98,6 +99,12 @@ class Fidelity:
         return {name: float(np.mean(values)) for name, values in asdict(self).items()}
 
     @property
+    def score(self) -> float:
+        """What hypotheses are compared by: explained variance, less 1 % for each 0.5/255 of error."""
+        mean = self.mean()
+        return mean["explained"] - 5 * mean["error"]
+
+    @property
     def good_enough(self) -> bool:
         """Whether the surrogate is within tolerance on average."""
         mean = self.mean()
@@ -142,29 +149,45 @@ def _compare(
     return float((predicted - clean).abs().mean()), correlation, product / max(power, 1e-12), explained
 
 
-def find_sampling(explained: Callable[[SamplingModel], float]) -> SamplingModel:
-    """The sampling hypothesis that explains most of what a random repaint changed in the target.
+def find_sampling(score: Callable[[SamplingModel], float]) -> SamplingModel:
+    """The sampling hypothesis with the highest ``score`` (``Fidelity.score``).
 
-    ``explained`` is the share of the variance that a hypothesis explains. One member is varied at a time, the most
-    telling first; a change must explain 0.2 % more to be believed.
+    One member is varied at a time, the most telling first; a change must gain 0.002 to be believed. The bias of the
+    level of detail, the one continuous member, is read off a parabola.
     """
     best = SamplingModel()
-    score = explained(best)
-    for alternatives in _alternatives():
-        for alternative in alternatives(best):
-            trial = explained(alternative)
-            if trial > score + 0.002:
-                best, score = alternative, trial
-    return best
+    reached = score(best)
+    for member, values in ALTERNATIVES:
+        for value in values:
+            trial = best.but(**{member: value})
+            gained = score(trial)
+            if gained > reached + 0.002:
+                best, reached = trial, gained
+    low, high = score(best.but(bias=-BIAS_STEP)), score(best.but(bias=BIAS_STEP))
+    trial = best.but(bias=_vertex(low, reached, high))
+    return trial if score(trial) > max(low, reached, high) + 0.0005 else best
 
 
-def _alternatives() -> Iterator[Callable[[SamplingModel], Sequence[SamplingModel]]]:
-    """The members to vary, each as the other values it could have."""
-    yield lambda best: [best.but(filtered="linear")]
-    yield lambda best: [best.but(lod="area")]
-    yield lambda best: [best.but(samples="centre"), best.but(shade_at="centroid")]
-    yield lambda best: [best.but(cull=False)]
-    yield lambda best: [best.but(bias=bias) for bias in (-0.25, 0.25, -0.5, 0.5, -1.0, 1.0)]
+ALTERNATIVES: Final[tuple[tuple[str, tuple[object, ...]], ...]] = (
+    ("encoding", ("power",)),
+    ("filtered", ("linear",)),
+    ("samples", ("msaa4-mirrored", "centre")),
+    ("lod", ("area",)),
+    ("mips", ("rounded",)),
+    ("shade_at", ("centroid",)),
+    ("cull", (False,)),
+)
+"""Members of the hypothesis, and the values they could have other than the default."""
+
+BIAS_STEP: Final = 0.25
+
+
+def _vertex(low: float, middle: float, high: float) -> float:
+    """Where the parabola through the scores at -BIAS_STEP, 0 and BIAS_STEP peaks, at most four steps away."""
+    bend = 2 * middle - low - high
+    if bend <= 1e-9:
+        return 4 * BIAS_STEP if high > low else -4 * BIAS_STEP
+    return round(min(4.0, max(-4.0, (high - low) / (2 * bend))) * BIAS_STEP, 4)
 
 
 @dataclass(frozen=True)
@@ -185,14 +208,39 @@ class Calibration:
 
 
 def build_surrogate(
-    calibration: Calibration, obj: Object3D, views: Sequence[View], clean: Image8, *, device: torch.device | str = "cpu"
+    calibration: Calibration,
+    obj: Object3D,
+    views: Sequence[View],
+    clean: Image8,
+    *,
+    backdrop: Image8 | None = None,
+    device: torch.device | str = "cpu",
 ) -> Surrogate:
-    """The surrogate for ``views``, whose target images are ``clean``."""
+    """The surrogate for ``views``, whose target images are ``clean``.
+
+    ``backdrop`` (H, W, 3) uint8 is what stands behind the object in place of the views' uniform backgrounds.
+    """
     size = (clean.shape[1], clean.shape[2])
     geometry = prepare_geometry(obj, views, size=size, sampling=calibration.sampling, device=device)
+    return _shaded(calibration, geometry, obj, views, clean, backdrop)
+
+
+def _shaded(
+    calibration: Calibration,
+    geometry: Geometry,
+    obj: Object3D,
+    views: Sequence[View],
+    clean: Image8,
+    backdrop: Image8 | None,
+) -> Surrogate:
+    """The surrogate on a geometry that stands already."""
     if calibration.model == "diffuse":
         return diffuse_surrogate(geometry, views)
-    return curve_surrogate(geometry, obj, clean, calibration.greys, calibration.probes)
+    if backdrop is None:
+        behind = np.array([view.background for view in views], np.uint8)[:, None, None, :]
+    else:
+        behind = backdrop[None]
+    return curve_surrogate(geometry, obj, clean, calibration.greys, calibration.probes, behind)
 
 
 def calibrate(
@@ -203,13 +251,14 @@ def calibrate(
     *,
     wanted: SurrogateModel,
     generator: np.random.Generator,
+    backdrop: Image8 | None = None,
 ) -> Calibration:
     """Probe the target as little as the ``wanted`` colour model needs; ``auto`` takes the cheapest that is good enough.
 
     ``clean`` are the target's images of ``obj``, (views, H, W, 3) uint8. A few trial views decide; only then are all of
     them probed.
     """
-    trial = _Trial.of(obj, views, clean, ask, generator)
+    trial = _Trial.of(obj, views, clean, ask, generator, backdrop)
     if wanted in {"auto", "diffuse"}:
         fidelity = trial.fidelity("diffuse", SamplingModel(), ())
         if wanted == "diffuse" or fidelity.good_enough:
@@ -217,7 +266,7 @@ def calibrate(
             nothing = np.zeros((0, *clean.shape), np.uint8)
             return Calibration("diffuse", reason, SamplingModel(), (), nothing, fidelity, trial.renders)
     trial = trial.with_probes(ask)
-    sampling = find_sampling(lambda model: trial.fidelity("curve", model, CURVE_GREYS).mean()["explained"])
+    sampling = find_sampling(lambda model: trial.fidelity("curve", model, CURVE_GREYS).score)
     model, reason, fidelity = _cheapest(trial, sampling, wanted)
     greys = CALIBRATED_GREYS if model == "calibrated" else CURVE_GREYS
     probes, renders = _probe_all(trial, obj, views, greys, ask)
@@ -234,16 +283,25 @@ class _Trial:
     clean: Image8
     repainted: Object3D
     images: Image8
+    backdrop: Image8 | None
     probes: Image8 | None = None
+    geometries: dict[SamplingModel, Geometry] = field(default_factory=dict)
+    """Under each hypothesis that was tried; those that differ in colours alone share one."""
 
     @classmethod
     def of(
-        cls, obj: Object3D, views: Sequence[View], clean: Image8, ask: Ask, generator: np.random.Generator
+        cls,
+        obj: Object3D,
+        views: Sequence[View],
+        clean: Image8,
+        ask: Ask,
+        generator: np.random.Generator,
+        backdrop: Image8 | None,
     ) -> "_Trial":
         index = tuple(sorted({round(k) for k in np.linspace(0, len(views) - 1, TRIAL_VIEWS + 2)[1:-1]}))
         few = tuple(views[k] for k in index)
         repainted = painted_noise(obj, generator)
-        return cls(obj, index, few, clean[list(index)], repainted, ask(repainted, few))
+        return cls(obj, index, few, clean[list(index)], repainted, ask(repainted, few), backdrop)
 
     @property
     def renders(self) -> int:
@@ -258,8 +316,16 @@ class _Trial:
         probes = np.zeros((0, *self.clean.shape), np.uint8) if self.probes is None else self.probes[rows]
         nothing = Fidelity((), (), (), ())
         calibration = Calibration(model, "", sampling, greys, probes, nothing, 0)
-        surrogate = build_surrogate(calibration, self.obj, self.views, self.clean)
+        geometry = replace(self._geometry(sampling), sampling=sampling)
+        surrogate = _shaded(calibration, geometry, self.obj, self.views, self.clean, self.backdrop)
         return measure_fidelity(surrogate, self.obj, self.clean, self.repainted, self.images)
+
+    def _geometry(self, sampling: SamplingModel) -> Geometry:
+        key = sampling.but(**{name: getattr(SamplingModel(), name) for name in ("encoding", "filtered", "mips")})
+        if key not in self.geometries:
+            size = (self.clean.shape[1], self.clean.shape[2])
+            self.geometries[key] = prepare_geometry(self.obj, self.views, size=size, sampling=key)
+        return self.geometries[key]
 
 
 def _cheapest(trial: _Trial, sampling: SamplingModel, wanted: SurrogateModel) -> tuple[str, str, Fidelity]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera
 from trompe_shared.object3d import Object3D
 
-__all__ = ["CENTRE", "MSAA4", "Mesh", "Planes", "Visibility", "mesh_of", "project", "rasterize"]
+__all__ = ["CENTRE", "MSAA4", "MSAA4_MIRRORED", "Mesh", "Planes", "Visibility", "mesh_of", "project", "rasterize"]
 
 CENTRE = ((0.5, 0.5),)
 """One sample in the middle of a pixel."""
@@ -24,6 +24,9 @@ CENTRE = ((0.5, 0.5),)
 MSAA4 = ((0.375, 0.125), (0.875, 0.375), (0.125, 0.625), (0.625, 0.875))
 """The standard sample positions of 4x MSAA (x right, y down, in pixels), common to Direct3D, Vulkan and OpenGL drivers.
 """
+
+MSAA4_MIRRORED = tuple((x, 1 - y) for x, y in MSAA4)
+"""The same for renderers that count rows from the bottom (OpenGL): the pattern in the image is upside down."""
 
 NEAR = 1e-3
 """Nothing nearer to the camera than this is seen, metres."""

@@ -5,7 +5,7 @@ and with which weights (trilinear, per fragment, fragments weighted by the sampl
 repainted object is a single gather, and the gradient its transpose.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, embedding_bag
 
-from trompe_server.surrogate.rasterize import CENTRE, MSAA4, Mesh, Planes, Visibility
+from trompe_server.surrogate.rasterize import CENTRE, MSAA4, MSAA4_MIRRORED, Mesh, Planes, Visibility
 
 __all__ = [
     "Fragments",
@@ -30,28 +30,33 @@ __all__ = [
 
 @dataclass(frozen=True)
 class SamplingModel:
-    """A hypothesis on how a renderer samples textures. All members are common practice of engines.
+    """A hypothesis on how a renderer samples textures and encodes images. All members are common practice of engines.
 
-    samples: where a pixel looks: 4x MSAA positions, or its centre alone.
+    samples: where a pixel looks: at the positions of 4x MSAA (rows counted from the top or from the bottom), or at its
+        centre alone.
     shade_at: where the texture coordinates of a fragment are taken: at the pixel's centre (even if the fragment does
         not cover it: the default of OpenGL and Direct3D) or at the mean of the samples it covers (centroid sampling).
     lod: the level of detail is log2 of the footprint's longer axis, or of the root of its area.
     filtered: mip levels and texels are averaged on encoded (sRGB) values or in linear light.
+    mips: encoded mip levels are exact averages, or rounded to 8 bits after averaging columns and again after rows.
+    encoding: linear light becomes an image by the sRGB curve or by the power 1 / 2.2.
     bias: added to the level of detail.
     cull: triangles seen from behind are invisible.
     """
 
-    samples: Literal["msaa4", "centre"] = "msaa4"
+    samples: Literal["msaa4", "msaa4-mirrored", "centre"] = "msaa4"
     shade_at: Literal["centre", "centroid"] = "centre"
     lod: Literal["longer", "area"] = "longer"
     filtered: Literal["encoded", "linear"] = "encoded"
+    mips: Literal["exact", "rounded"] = "exact"
+    encoding: Literal["srgb", "power"] = "srgb"
     bias: float = 0.0
     cull: bool = True
 
     @property
     def positions(self) -> tuple[tuple[float, float], ...]:
         """Sample positions in a pixel, x right and y down."""
-        return MSAA4 if self.samples == "msaa4" else CENTRE
+        return {"msaa4": MSAA4, "msaa4-mirrored": MSAA4_MIRRORED, "centre": CENTRE}[self.samples]
 
     def but(self, **changes: object) -> "SamplingModel":
         """This hypothesis with some members changed."""
@@ -84,23 +89,42 @@ def mip_layout(sizes: Sequence[tuple[int, int]]) -> MipLayout:
     return MipLayout(tuple(levels), tuple(starts), position)
 
 
-def mip_pyramid(textures: Sequence[Float[Tensor, "H W 3"]], layout: MipLayout) -> Float[Tensor, "texels 3"]:
-    """All mip levels of ``textures`` (row 0 on top), box filtered, as one flat array. Differentiable."""
+def mip_pyramid(
+    textures: Sequence[Float[Tensor, "H W 3"]], layout: MipLayout, *, rounded: bool = False
+) -> Float[Tensor, "texels 3"]:
+    """All mip levels of ``textures`` (row 0 on top), box filtered, as one flat array. Differentiable.
+
+    With ``rounded`` levels are rounded to 8 bits as they are made; the gradient passes as if they were not.
+    """
     levels = []
     for texture, sizes in zip(textures, layout.sizes, strict=True):
         level = texture
         levels.append(level.reshape(-1, 3))
         for size in sizes[1:]:
-            level = _halve(level, size)
+            level = _halve(level, size, _round8 if rounded else _same)
             levels.append(level.reshape(-1, 3))
     return torch.cat(levels)
 
 
-def _halve(level: Float[Tensor, "H W 3"], size: tuple[int, int]) -> Float[Tensor, "h w 3"]:
+def _halve(
+    level: Float[Tensor, "H W 3"], size: tuple[int, int], settle: Callable[[Tensor], Tensor]
+) -> Float[Tensor, "h w 3"]:
+    """The next mip level; ``settle`` is applied to the averages of columns, and to those of rows."""
     height, width = size
     if level.shape[:2] == (2 * height, 2 * width):
-        return level.view(height, 2, width, 2, 3).mean((1, 3))
-    return adaptive_avg_pool2d(level.permute(2, 0, 1), size).permute(1, 2, 0)
+        columns = settle((level[:, 0::2] + level[:, 1::2]) / 2)
+        return settle((columns[0::2] + columns[1::2]) / 2)
+    return settle(adaptive_avg_pool2d(level.permute(2, 0, 1), size).permute(1, 2, 0))
+
+
+def _same(values: Tensor) -> Tensor:
+    return values
+
+
+def _round8(values: Tensor) -> Tensor:
+    """Rounded half up to 1/255, with the gradient of the identity."""
+    exact = values.detach()
+    return values + ((exact * 255 + 0.5 + 1e-4).floor() / 255 - exact)
 
 
 @dataclass(frozen=True)

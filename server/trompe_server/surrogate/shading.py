@@ -5,11 +5,16 @@ its value. sRGB encoding follows IEC 61966-2-1.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
+
+Encoding = Literal["srgb", "power"]
+
+POWER = 2.2
+"""Exponent of the plain power-law encoding that some renderers use in place of the sRGB curve."""
 
 __all__ = ["CurveShading", "DiffuseShading", "Shading", "decode", "decode_slope", "encode", "encode_slope", "lambert"]
 
@@ -34,14 +39,24 @@ def encode(linear: Tensor) -> Tensor:
     return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
 
 
-def decode_slope(encoded: Tensor) -> Tensor:
-    """Derivative of ``decode``."""
-    return torch.where(encoded <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((encoded + 0.055) / 1.055).clamp(min=0) ** 1.4)
+def decode_slope(encoded: Tensor, linear: Tensor) -> Tensor:
+    """Derivative of ``decode`` at ``encoded``, whose decoding is ``linear``."""
+    return torch.where(encoded <= 0.04045, 1 / 12.92, 2.4 * linear / (encoded + 0.055))
 
 
-def encode_slope(encoded: Tensor) -> Tensor:
-    """Derivative of ``encode``, at the linear light whose encoding is ``encoded``."""
-    return 1 / decode_slope(encoded)
+def decode_as(encoded: Tensor, encoding: Encoding) -> Tensor:
+    """Encoded image values in [0, 1] to linear light."""
+    return decode(encoded) if encoding == "srgb" else encoded**POWER
+
+
+def encode_as(linear: Tensor, encoding: Encoding) -> Tensor:
+    """Linear light in [0, 1] to encoded image values."""
+    return encode(linear) if encoding == "srgb" else linear ** (1 / POWER)
+
+
+def encode_slope(encoded: Tensor, linear: Tensor, encoding: Encoding) -> Tensor:
+    """Derivative of ``encode_as`` at ``linear`` > 0, whose encoding is ``encoded``."""
+    return 1 / decode_slope(encoded, linear) if encoding == "srgb" else encoded / (POWER * linear)
 
 
 @dataclass(frozen=True)
@@ -74,31 +89,66 @@ def lambert(normals: Float[Tensor, "n 3"], towards_light: Float[Tensor, " 3"]) -
 
 @dataclass(frozen=True)
 class CurveShading:
-    """Per pixel and channel the curve through the target's own images of the object painted in K greys.
+    """What was measured on the target: per pixel and channel the light it shows for any albedo.
 
-    Piecewise linear in linear light between the probes, which is exact where the image is affine in linear albedo and
-    unsaturated; more greys follow saturation and the partly covered pixels, where multi-sampling averages encoded
-    colours. K = 2 is the ``calibrated`` model.
+    The covered share of a pixel shows light that is piecewise linear in linear albedo, clipped at white, and encoded;
+    the rest shows the background. For one shading point under fixed light that is exact physics whatever the material,
+    with two probes; more greys follow what several shading points in one pixel make of saturation.
 
-    greys: encoded, ascending, from 0 to 255. probes: the images' object pixels, encoded, one row per grey.
+    nodes: linear albedo at which segments begin, ascending. light, slope: the line of each segment.
     """
 
-    greys: UInt8[Tensor, " k"]
-    probes: UInt8[Tensor, "k pixels 3"]
+    nodes: Float[Tensor, " segments"]
+    light: Float[Tensor, "segments pixels 3"]
+    slope: Float[Tensor, "segments pixels 3"]
+    coverage: Float[Tensor, "pixels 1"]
+    background: Float[Tensor, "pixels 3"]
+    encoding: Encoding
 
     def __call__(
         self, values: Float[Tensor, "pixels 3"]
     ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"]]:
-        nodes = decode(self.greys.float() / 255)
         linear = decode(values)
-        segment = torch.bucketize(linear, nodes[1:-1].contiguous())
-        low, high = self._light(segment), self._light(segment + 1)
-        start = nodes[segment]
-        slope = (high - low) / (nodes[segment + 1] - start)
-        colour = encode(torch.addcmul(low, slope, linear - start).clamp(0, 1))
-        return colour, slope * decode_slope(values) * encode_slope(colour)
+        start, light, slope = self._segment(linear)
+        exact = torch.addcmul(light, slope, linear - start)
+        shown = exact.clamp(DARKEST, 1)
+        colour = encode_as(shown, self.encoding)
+        steepness = slope * decode_slope(values, linear) * encode_slope(colour, shown, self.encoding)
+        steepness = steepness * ((exact > DARKEST) & (exact < 1))
+        return self.coverage * colour + (1 - self.coverage) * self.background, self.coverage * steepness
 
-    def _light(self, node: Int[Tensor, "pixels 3"]) -> Float[Tensor, "pixels 3"]:
-        """Linear light of each pixel and channel in the probe number ``node``."""
-        table = decode(torch.arange(256, device=self.probes.device) / 255)
-        return table[self.probes.gather(0, node[None])[0].int()]
+    def _segment(self, linear: Float[Tensor, "pixels 3"]) -> tuple[Tensor, Tensor, Tensor]:
+        """(albedo where it begins, light there, slope) of the segment that each value lies in."""
+        if len(self.nodes) == 1:
+            return self.nodes[0], self.light[0].float(), self.slope[0].float()
+        segment = torch.bucketize(linear, self.nodes[1:].contiguous())
+        light, slope = (table.gather(0, segment[None])[0].float() for table in (self.light, self.slope))
+        return self.nodes[segment], light, slope
+
+
+DARKEST = 1e-6
+"""Linear light below which an image shows black: keeps the slope of the encoding finite."""
+
+WHITE = 0.996
+"""Encoded values from here on may be clipped."""
+
+
+def fit_curve(
+    greys: UInt8[Tensor, " k"],
+    probes: UInt8[Tensor, "k pixels 3"],
+    coverage: Float[Tensor, "pixels 1"],
+    background: Float[Tensor, "pixels 3"],
+    encoding: Encoding,
+) -> CurveShading:
+    """The colour model through the target's own images of the object painted in K greys (encoded, ascending, from 0).
+
+    A segment that ends in white may bend on the way there: it takes the slope of the one before it and is clipped.
+    """
+    nodes = decode(greys.float() / 255)
+    shown = ((probes.float() / 255 - (1 - coverage) * background) / coverage).clamp(0, 1)
+    light = decode_as(shown, encoding)
+    slope = light.diff(dim=0) / nodes.diff()[:, None, None]
+    bends = (shown[1:] >= WHITE) & (shown[:-1] < WHITE)
+    for segment in range(1, len(slope)):
+        slope[segment] = torch.where(bends[segment], slope[segment - 1], slope[segment])
+    return CurveShading(nodes[:-1], light[:-1].half(), slope.half(), coverage, background, encoding)

@@ -1,8 +1,8 @@
 """The surrogate renderer: images of a repainted object for fixed views, and their gradients, at the cost of a gather.
 
 geometry = prepare_geometry(obj, views, size=(224, 224), sampling=SamplingModel())
-surrogate = curve_surrogate(geometry, obj, clean, greys, probes)      # or diffuse_surrogate(geometry, views)
-images = surrogate.render(surrogate.texels(textures), batch=[0, 1])   # differentiable in the textures
+surrogate = curve_surrogate(geometry, obj, clean, greys, probes, backgrounds)      # or diffuse_surrogate(geometry,
+views) images = surrogate.render(surrogate.texels(textures), batch=[0, 1])   # differentiable in the textures
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ from trompe_server.surrogate.sampling import (
     mip_layout,
     mip_pyramid,
 )
-from trompe_server.surrogate.shading import CurveShading, DiffuseShading, Shading, decode, decode_slope, encode, lambert
+from trompe_server.surrogate.shading import DiffuseShading, Shading, decode, decode_slope, encode, fit_curve, lambert
 from trompe_shared.geometry import View, spherical
 from trompe_shared.object3d import Object3D
 
@@ -168,7 +168,9 @@ class Surrogate:
         """The flat mip pyramids of ``textures`` (sRGB in [0, 1], row 0 on top). Differentiable; do it once a step."""
         ordered = [textures[name] for name in self.geometry.textures]
         linear = self.geometry.sampling.filtered == "linear"
-        return mip_pyramid([decode(t) for t in ordered] if linear else ordered, self.geometry.layout)
+        if linear:
+            return mip_pyramid([decode(texture) for texture in ordered], self.geometry.layout)
+        return mip_pyramid(ordered, self.geometry.layout, rounded=self.geometry.sampling.mips == "rounded")
 
     def render(
         self,
@@ -208,7 +210,7 @@ class Surrogate:
             values = encode(values.clamp(0, 1))
         colour, slope = self.shadings[view](values.clamp(0, 1))
         if self.geometry.sampling.filtered == "linear":
-            slope = slope / decode_slope(values)
+            slope = slope / decode_slope(values, decode(values)).clamp(min=1e-6)
         if self.anchors is not None:
             colour = colour + self.anchors[view]
             slope = slope * ((colour >= 0) & (colour <= 1))
@@ -228,19 +230,32 @@ def diffuse_surrogate(geometry: Geometry, views: Sequence[View]) -> Surrogate:
 
 
 def curve_surrogate(
-    geometry: Geometry, obj: Object3D, clean: Image8, greys: Sequence[int], probes: Image8
+    geometry: Geometry,
+    obj: Object3D,
+    clean: Image8,
+    greys: Sequence[int],
+    probes: Image8,
+    backgrounds: Image8,
 ) -> Surrogate:
     """A surrogate measured on the target: ``calibrated`` with two greys, ``curve`` with more.
 
-    clean: the target's images of ``obj``, (views, H, W, 3) uint8. greys: encoded values, ascending, the first 0 and the
-    last 255.
-    probes: the target's images of ``obj`` painted in each grey, (greys, views, H, W, 3) uint8.
+    clean: the target's images of ``obj``, (views, H, W, 3) uint8. greys: encoded values, ascending, the first 0.
+    probes: the target's images of ``obj`` painted in each grey, (greys, views, H, W, 3) uint8. backgrounds: what the
+    target shows where there is no object, (views, H or 1, W or 1, 3) uint8.
     """
     device = geometry.views[0].pixel.device
     levels = torch.tensor(list(greys), dtype=torch.uint8, device=device)
-    images = torch.from_numpy(probes).flatten(2, 3)
+    images = torch.from_numpy(probes).to(device).flatten(2, 3)
+    behind = torch.from_numpy(np.broadcast_to(backgrounds, clean.shape).copy()).to(device).flatten(1, 2)
     shadings = tuple(
-        CurveShading(levels, images[:, index, view.pixel.cpu()].to(device)) for index, view in enumerate(geometry.views)
+        fit_curve(
+            levels,
+            images[:, index, view.pixel],
+            view.coverage,
+            behind[index, view.pixel].float() / 255,
+            geometry.sampling.encoding,
+        )
+        for index, view in enumerate(geometry.views)
     )
     base = torch.from_numpy(clean).to(device)
     plain = Surrogate(geometry, "calibrated" if len(greys) == 2 else "curve", base, shadings)

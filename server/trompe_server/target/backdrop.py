@@ -40,9 +40,12 @@ class BackdropTarget:
         dark = self._target.render(obj, black, size=size, on_frame=on_frame).astype(np.float32)
         bright = self._target.render(obj, white, size=size).astype(np.float32)
         through = np.clip((bright - dark).mean(axis=3, keepdims=True) / 255, 0, 1)
-        backdrop = np.asarray(ImageOps.fit(self._picture, (size[1], size[0]), Image.Resampling.LANCZOS), np.float32)
-        blended: Images = np.clip(np.round(dark + through * backdrop), 0, 255).astype(np.uint8)
+        blended: Images = np.clip(np.round(dark + through * self.backdrop(size)), 0, 255).astype(np.uint8)
         return blended
+
+    def backdrop(self, size: tuple[int, int]) -> Images:
+        """What stands behind the object, (H, W, 3) uint8."""
+        return np.asarray(ImageOps.fit(self._picture, (size[1], size[0]), Image.Resampling.LANCZOS))
 
     def close(self) -> None:
         """Close the renderer behind it."""

@@ -1,0 +1,194 @@
+"""What the benches share: the objects, a renderer to compare with, rounds of timing, tables."""
+
+import gc
+import json
+import os
+import platform
+import re
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from trompe_server.attack import grid_views
+from trompe_server.target import SailenvTarget
+from trompe_shared.geometry import View
+from trompe_shared.object3d import Object3D, load_object
+from trompe_shared.shipped import shipped_objects
+
+__all__ = [
+    "BenchObject",
+    "Times",
+    "assets",
+    "bench_objects",
+    "in_rounds",
+    "machine",
+    "markdown_table",
+    "painted_at_random",
+    "rescaled",
+    "running_renderer",
+]
+
+BACKGROUNDS = {"white": (255, 255, 255), "black": (0, 0, 0)}
+
+
+@dataclass(frozen=True)
+class BenchObject:
+    """An object and how the paper (or this project, for the shipped ones) looks at it: metres, degrees, sRGB."""
+
+    name: str
+    obj: Object3D
+    distance: float
+    elevation: tuple[float, float]
+    background: tuple[int, int, int]
+
+    def views(self, *, azimuths: int = 6, elevations: int = 10) -> list[View]:
+        """The paper's grid of views."""
+        return grid_views(
+            distance=self.distance,
+            elevation=self.elevation,
+            azimuths=azimuths,
+            elevations=elevations,
+            background=self.background,
+        )
+
+
+def assets() -> Path | None:
+    """The folder of the real objects and classifiers, by the environment variable TROMPE_ASSETS."""
+    return Path(os.environ["TROMPE_ASSETS"]) if "TROMPE_ASSETS" in os.environ else None
+
+
+def bench_objects(names: Sequence[str] = ()) -> list[BenchObject]:
+    """The objects called ``names``, by default the paper's ten, or the shipped ones without TROMPE_ASSETS."""
+    table = _shipped() | _of_the_paper()
+    wanted = names or list(_of_the_paper()) or list(table)
+    unknown = sorted(set(wanted) - set(table))
+    if unknown:
+        sys.exit(f"There is no object {', '.join(unknown)}; there are {', '.join(table)}. Is TROMPE_ASSETS set?")
+    return [table[name]() for name in wanted]
+
+
+def _shipped() -> dict[str, Callable[[], BenchObject]]:
+    def read(name: str) -> BenchObject:
+        row = shipped_objects()[name]
+        return BenchObject(name, load_object(row.read()), row.distance, row.elevation, BACKGROUNDS["white"])
+
+    return {name: lambda name=name: read(name) for name in shipped_objects()}  # type: ignore[misc]
+
+
+def _of_the_paper() -> dict[str, Callable[[], BenchObject]]:
+    folder = assets()
+    if folder is None:
+        return {}
+    table = json.loads((folder / "objects" / "objects.json").read_text(encoding="utf-8"))
+
+    def read(name: str) -> BenchObject:
+        row = table[name]
+        low, high = row["elevation_range"]
+        obj = load_object(folder / "objects" / name)
+        return BenchObject(name, obj, row["distance"], (low, high), BACKGROUNDS[row["background"]])
+
+    return {name: lambda name=name: read(name) for name in table}  # type: ignore[misc]
+
+
+def rescaled(obj: Object3D, factor: float) -> Object3D:
+    """``obj`` with every albedo texture resized by ``factor`` (the paper used 0.33)."""
+    return obj.with_textures(
+        {
+            name: np.asarray(
+                Image.fromarray(image).resize(
+                    [round(factor * side) for side in image.shape[1::-1]], Image.Resampling.BOX
+                )
+            )
+            for name, image in obj.textures.items()
+        }
+    )
+
+
+def painted_at_random(
+    n_views: int, size: tuple[int, int], greys: Sequence[int], generator: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Stand-ins for what a target shows, where only time counts: clean (views, H, W, 3) and probes (greys, views, H, W,
+    3), each probe dimmed grey."""
+    clean = generator.integers(40, 200, (n_views, *size, 3), dtype=np.uint8)
+    shade = generator.uniform(0.4, 0.9, (n_views, *size, 1))
+    probes = np.stack([np.broadcast_to((grey * shade).astype(np.uint8), clean.shape) for grey in greys])
+    return clean, probes
+
+
+@contextmanager
+def running_renderer() -> Iterator[SailenvTarget]:
+    """A renderer worker process of its own on a free port, for as long as the context lasts."""
+    command = [sys.executable, "-m", "trompe_renderer", "--port", "0"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        ready = re.search(r"listening on ([\d.]+):(\d+)", process.stdout.readline())
+        if ready is None:
+            sys.exit("The renderer worker did not start; its message is above. `trompe doctor` says what is missing.")
+        target = SailenvTarget(ready[1], int(ready[2]))
+        yield target
+        target.close()
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds of each round of one contender."""
+
+    rounds: tuple[float, ...]
+
+    @property
+    def median(self) -> float:
+        """The middle one."""
+        return statistics.median(self.rounds)
+
+    @property
+    def best(self) -> float:
+        """The least disturbed one."""
+        return min(self.rounds)
+
+    def per(self, count: int) -> str:
+        """Median and least milliseconds for one of ``count``."""
+        return f"{1000 * self.median / count:.2f} / {1000 * self.best / count:.2f}"
+
+
+def in_rounds(contenders: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, Times]:
+    """Time all contenders ``rounds`` times in turn, after one turn that does not count.
+
+    On a machine that others use too, each meets the same weather this way.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in contenders}
+    for _ in range(rounds + 1):
+        for name, contender in contenders.items():
+            gc.collect()
+            started = time.perf_counter()
+            contender()
+            seconds[name].append(time.perf_counter() - started)
+    return {name: Times(tuple(values[1:])) for name, values in seconds.items()}
+
+
+def machine() -> str:
+    """One line on what the figures were measured with."""
+    load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
+    return (
+        f"{platform.machine()}, {os.cpu_count()} cores ({torch.get_num_threads()} threads used), load {load}; "
+        f"Python {platform.python_version()}, torch {torch.__version__}"
+    )
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A table with the header's columns."""
+    lines = [list(header), ["---"] * len(header), *([str(cell) for cell in row] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

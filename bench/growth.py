@@ -1,0 +1,183 @@
+"""How do time and memory of the surrogate grow with textures, images, views and faces? At most linearly, is the mark.
+
+python -m bench.growth [--axes texels pixels views faces] [--rounds 3] [--csv growth.csv]
+
+One shipped object; random pictures stand in for the target's. Prints CSV, then the exponent of each cost: the slope of
+its logarithm against the logarithm of the axis, over the largest half of the sizes, where fixed costs matter least.
+"""
+
+import argparse
+import csv
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, astuple, dataclass, fields, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bench._common import BenchObject, bench_objects, machine, markdown_table, painted_at_random
+from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
+from trompe_server.surrogate.calibration import CURVE_GREYS, Calibration, Fidelity, build_surrogate
+from trompe_shared.object3d import Object3D, Part
+
+TEXTURE_SIDES = (256, 512, 1024, 2048, 4096)
+IMAGE_SIDES = (64, 128, 224, 362, 512)
+VIEWS = (6, 12, 30, 60, 120)
+MOST_FACES = 1_000_000
+BATCH = 10
+
+Made = TypeVar("Made")
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is varied, its size, and how to make it."""
+
+    axis: str
+    size: int
+    obj: Object3D
+    views: int = 6
+    side: int = 128
+
+
+@dataclass(frozen=True)
+class Cost:
+    """The least of some rounds: preparing (rasterise, operator, colour model) in seconds, a step (forward and backward
+    of all views) in milliseconds, and the operators in MiB."""
+
+    axis: str
+    size: int
+    prepare_s: float
+    step_ms: float
+    operator_mib: float
+
+
+def cases(entry: BenchObject, axes: Sequence[str]) -> Iterator[Case]:
+    """All that is measured, smallest first on each axis."""
+    small = painted(entry.obj, 256)
+    made: dict[str, Callable[[], Iterator[Case]]] = {
+        "texels": lambda: (Case("texels", side * side, painted(entry.obj, side)) for side in TEXTURE_SIDES),
+        "pixels": lambda: (Case("pixels", side * side, small, side=side) for side in IMAGE_SIDES),
+        "views": lambda: (Case("views", count, small, views=count) for count in VIEWS),
+        "faces": lambda: (Case("faces", n_faces(obj), obj, views=2) for obj in refinements(small)),
+    }
+    for axis in axes:
+        yield from made[axis]()
+
+
+def painted(obj: Object3D, side: int) -> Object3D:
+    """``obj`` with every texture noise of side x side texels."""
+    random = np.random.default_rng(0)
+    return obj.with_textures({name: random.integers(0, 256, (side, side, 3), dtype=np.uint8) for name in obj.textures})
+
+
+def n_faces(obj: Object3D) -> int:
+    """Triangles of all parts."""
+    return sum(len(part.faces) for part in obj.parts)
+
+
+def refinements(obj: Object3D) -> Iterator[Object3D]:
+    """``obj``, and again with each triangle cut into four, as long as it has no more than ``MOST_FACES``."""
+    while n_faces(obj) <= MOST_FACES:
+        yield obj
+        obj = replace(obj, parts=tuple(_refined(part) for part in obj.parts))
+
+
+def _refined(part: Part) -> Part:
+    """Each triangle cut into four at the middles of its edges; corners are no longer shared."""
+    a, b, c = (part.faces[:, k] for k in range(3))
+
+    def cut(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        p, q, r = values[a], values[b], values[c]
+        x, y, z = (p + q) / 2, (q + r) / 2, (r + p) / 2
+        return np.concatenate([np.stack(t, 1) for t in ((p, x, z), (x, q, y), (z, y, r), (x, y, z))]).reshape(
+            -1, values.shape[1]
+        )
+
+    faces = np.arange(12 * len(part.faces), dtype=np.int32).reshape(-1, 3)
+    return Part(part.material, cut(part.vertices), cut(part.normals), cut(part.uvs), faces)
+
+
+def cost(entry: BenchObject, case: Case, rounds: int) -> Cost:
+    """The costs of one case."""
+    views = [entry.views(azimuths=6, elevations=-(-case.views // 6))[k] for k in range(case.views)]
+    size = (case.side, case.side)
+    clean, probes = painted_at_random(len(views), size, CURVE_GREYS, np.random.default_rng(0))
+    nothing = Fidelity((), (), (), ())
+    calibration = Calibration("curve", "for time alone", SamplingModel(), CURVE_GREYS, probes, nothing, 0)
+    preparing, stepping = [], []
+    for _ in range(rounds):
+        seconds, surrogate = timed(lambda: build_surrogate(calibration, case.obj, views, clean))
+        preparing.append(seconds)
+        stepping += [timed(lambda: step(surrogate, case.obj))[0] for _ in range(2)]  # noqa: B023
+    return Cost(case.axis, case.size, min(preparing), 1000 * min(stepping), surrogate.geometry.nbytes / 2**20)
+
+
+def step(surrogate: Surrogate, obj: Object3D) -> None:
+    """Forward and backward of all views."""
+    leaves = {name: texture.requires_grad_() for name, texture in textures_of(obj).items()}
+    texels = surrogate.texels(leaves)
+    collected = texels.detach().requires_grad_()
+    for first in range(0, surrogate.n_views, BATCH):
+        images = surrogate.render(collected, range(first, min(first + BATCH, surrogate.n_views)))
+        images.backward(torch.ones_like(images))  # type: ignore[no-untyped-call]
+    torch.autograd.grad(texels, list(leaves.values()), collected.grad)
+
+
+def timed(work: Callable[[], Made]) -> tuple[float, Made]:
+    """Seconds, and what came of it."""
+    started = time.perf_counter()
+    made = work()
+    return time.perf_counter() - started, made
+
+
+def exponents(costs: Sequence[Cost]) -> str:
+    """Table of the exponents; at most 1.1 counts as linear, for timings are not exact."""
+    rows = []
+    for axis in dict.fromkeys(each.axis for each in costs):
+        mine = [each for each in costs if each.axis == axis]
+        largest = mine[len(mine) // 2 :]
+        slopes = [
+            np.polyfit(np.log([c.size for c in largest]), np.log([getattr(c, name) for c in largest]), 1)[0]
+            for name in COSTS
+        ]
+        sizes = f"{largest[0].size} .. {largest[-1].size}"
+        rows.append([axis, sizes, *(f"{slope:.2f}" for slope in slopes), "yes" if max(slopes) <= 1.1 else "no"])
+    return markdown_table(["exponent against", "sizes", *COSTS, "linear at most"], rows)
+
+
+COSTS = [field.name for field in fields(Cost)][2:]
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    every = ["texels", "pixels", "views", "faces"]
+    parser.add_argument("--axes", nargs="+", choices=every, default=every)
+    parser.add_argument("--object", default="teapot", metavar="NAME", help="a shipped object, or one of TROMPE_ASSETS")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--csv", type=Path, metavar="FILE")
+    options = parser.parse_args()
+    (entry,) = bench_objects([options.object])
+    print(machine() + "\n")
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(asdict_names := [field.name for field in fields(Cost)])
+    costs = []
+    for case in cases(entry, options.axes):
+        costs.append(cost(entry, case, options.rounds))
+        writer.writerow([f"{value:.4g}" if isinstance(value, float) else value for value in astuple(costs[-1])])
+        sys.stdout.flush()
+    print("\n" + exponents(costs))
+    if options.csv is not None:
+        with options.csv.open("w", newline="", encoding="utf-8") as file:
+            rows = csv.DictWriter(file, asdict_names, lineterminator="\n")
+            rows.writeheader()
+            rows.writerows(asdict(each) for each in costs)
+
+
+if __name__ == "__main__":
+    main()

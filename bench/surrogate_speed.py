@@ -1,0 +1,268 @@
+"""What does the surrogate cost, beside the classifier and PyTorch3D on the same work? Rounds in turn, medians.
+
+python -m bench.surrogate_speed [--objects candle toilet] [--rounds 7] [--pytorch3d]
+
+Only time counts here, so random pictures stand in for the target's, and no renderer is needed. The classifier is
+MobileNetV2 from TROMPE_ASSETS/classifiers, or the shipped one; PyTorch3D is compared with where it can be imported.
+"""
+
+import argparse
+import importlib.util
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bench._common import (
+    BenchObject,
+    Times,
+    assets,
+    bench_objects,
+    in_rounds,
+    machine,
+    markdown_table,
+    painted_at_random,
+    rescaled,
+)
+from trompe_server.attack import Budget, attack, margin_loss, movable, start
+from trompe_server.attack.attack import BATCH
+from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
+from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of
+from trompe_server.surrogate.calibration import CURVE_GREYS, Calibration, Fidelity, build_surrogate
+from trompe_shared.geometry import View
+from trompe_shared.object3d import Object3D
+
+SMALL = 0.33
+"""The paper's factor on the textures' sides."""
+
+WANTED_RATIO = {"candle": 150, "toilet": 400}
+WANTED_SHARE, WANTED_SECONDS = 0.08, 4.0
+
+
+@dataclass(frozen=True)
+class Work:
+    """One object with one size of texture, ready to render: all its views in a step."""
+
+    name: str
+    obj: Object3D
+    views: Sequence[View]
+    surrogate: Surrogate
+    gradient: Float[Tensor, "batch 3 H W"]
+    """Arrives at every batch of images in the backward pass; channels last, as classifiers give it."""
+
+    def forward_backward(self) -> None:
+        """One step's work of the surrogate: textures to images of all views, and back."""
+        leaves = {name: t.requires_grad_() for name, t in textures_of(self.obj).items()}
+        texels = self.surrogate.texels(leaves)
+        collected = texels.detach().requires_grad_()
+        for batch in _batches(self.surrogate.n_views):
+            images = self.surrogate.render(collected, batch)
+            images.backward(self.gradient[: len(batch)])  # type: ignore[no-untyped-call]
+        torch.autograd.grad(texels, list(leaves.values()), collected.grad)
+
+
+def _batches(n_views: int) -> list[range]:
+    return [range(first, min(first + BATCH, n_views)) for first in range(0, n_views, BATCH)]
+
+
+def work_of(entry: BenchObject, obj: Object3D, name: str, size: tuple[int, int], n_views: int) -> Work:
+    """Prepare ``obj`` with pictures at random for probes."""
+    views = entry.views()[:n_views]
+    generator = np.random.default_rng(0)
+    clean, probes = painted_at_random(len(views), size, CURVE_GREYS, generator)
+    nothing = Fidelity((), (), (), ())
+    calibration = Calibration("curve", "for time alone", SamplingModel(), CURVE_GREYS, probes, nothing, 0)
+    surrogate = build_surrogate(calibration, obj, views, clean)
+    gradient = torch.randn(BATCH, 3, *size, generator=torch.Generator().manual_seed(0))
+    return Work(name, obj, views, surrogate, gradient.contiguous(memory_format=torch.channels_last))
+
+
+@dataclass
+class Inside:
+    """A classifier that notes how many seconds are spent in its forward and backward pass."""
+
+    classifier: WhiteBoxClassifier
+    seconds: float = field(default=0.0, init=False)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.classifier, name)
+
+    def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
+        """Its logits. The clock runs here, and in the backward pass from their gradient to the images' gradient."""
+        before = time.perf_counter()
+        logits = self.classifier.logits(images)
+        self.seconds += time.perf_counter() - before
+        logits.register_hook(lambda _: self._add(-time.perf_counter()))  # type: ignore[no-untyped-call]
+        images.register_hook(lambda _: self._add(time.perf_counter()))  # type: ignore[no-untyped-call]
+        return logits
+
+    def _add(self, seconds: float) -> None:
+        self.seconds += seconds
+
+
+def outside_share(work: Work, classifier: WhiteBoxClassifier, shares: list[float]) -> Callable[[], None]:
+    """A contender that takes one attack step and appends the share of it that was not the classifier's."""
+    textures, budget, inside = textures_of(work.obj), Budget(0.05, 0.01), Inside(classifier)
+    texels, state = movable(work.surrogate, budget), start(textures)
+
+    def step() -> None:
+        inside.seconds, started = 0.0, time.perf_counter()
+        attack(state, textures, work.surrogate, inside, 0, budget=budget, steps=1, texels=texels)  # type: ignore[arg-type]
+        shares.append(1 - inside.seconds / (time.perf_counter() - started))
+
+    return step
+
+
+def classifier_alone(classifier: WhiteBoxClassifier) -> Callable[[], None]:
+    """A contender: forward and gradient of one batch of images."""
+    generator = torch.Generator().manual_seed(0)
+    images = torch.rand(BATCH, *classifier.image_size, 3, generator=generator).permute(0, 3, 1, 2).requires_grad_()
+
+    def step() -> None:
+        torch.autograd.grad(margin_loss(classifier.logits(images), 0).sum(), images)
+
+    return step
+
+
+def fastest_classifier() -> WhiteBoxClassifier:
+    """MobileNetV2 where the real classifiers are, else the shipped one."""
+    folder = assets()
+    classifier = load_classifier(folder / "classifiers" / "mobilenet_v2.pt2" if folder is not None else "tiny")
+    assert isinstance(classifier, WhiteBoxClassifier)
+    return classifier
+
+
+def speed(works: Sequence[Work], times: dict[str, Times]) -> str:
+    """Table of forward + backward."""
+    rows = []
+    for work in works:
+        own, peer = times[work.name], times.get(peer_name(work))
+        row = [work.name, own.per(work.surrogate.n_views), "-", "-", "-"]
+        if peer is not None:
+            ratio = (peer.median / PEER_VIEWS) / (own.median / work.surrogate.n_views)
+            wanted = WANTED_RATIO.get(work.name.partition(" ")[0])
+            row[2:] = [peer.per(PEER_VIEWS), f"{ratio:.0f} x", f">= {wanted} x" if wanted else "-"]
+        rows.append(row)
+    header = ["forward + backward, ms per view (median / least)", "surrogate", "PyTorch3D", "ratio", "wanted"]
+    return markdown_table(header, rows)
+
+
+PEER_VIEWS = 3
+"""PyTorch3D takes seconds a view, so it is given only some."""
+
+
+def peer_name(work: Work) -> str:
+    """What PyTorch3D on the same work is called among the contenders."""
+    return f"PyTorch3D {work.name}"
+
+
+def preparation(entries: Sequence[BenchObject], size: tuple[int, int], n_views: int, rounds: int) -> str:
+    """Table of what preparing takes."""
+    rows = []
+    for entry in entries:
+        made: list[Geometry] = []
+
+        def prepare(entry: BenchObject = entry, made: list[Geometry] = made) -> None:
+            made[:] = [prepare_geometry(entry.obj, entry.views()[:n_views], size=size, sampling=SamplingModel())]
+
+        times = in_rounds({"prepare": prepare}, rounds)["prepare"]
+        wanted = f"<= {WANTED_SECONDS:g}" if entry.name == "toilet" else "-"
+        taps = sum(len(view.gather.index) for view in made[0].views)
+        pixels = sum(len(view.pixel) for view in made[0].views)
+        rows.append(
+            [
+                entry.name,
+                f"{times.median:.2f} / {times.best:.2f}",
+                wanted,
+                f"{made[0].nbytes / 2**20:.0f}",
+                f"{taps / max(pixels, 1):.1f}",
+            ]
+        )
+    header = [
+        f"preparing {n_views} views",
+        "seconds (median / least)",
+        "wanted",
+        "operators, MiB",
+        "texels read per pixel",
+    ]
+    return markdown_table(header, rows)
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--objects", nargs="+", default=[], metavar="NAME", help="default: candle toilet")
+    parser.add_argument("--size", type=int, default=224, help="side of the images, pixels")
+    parser.add_argument("--views", type=int, default=60, help="how many of the 60 views")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--pytorch3d", action="store_true", help="compare with PyTorch3D (slow), where installed")
+    options = parser.parse_args()
+    size = (options.size, options.size)
+    entries = bench_objects(options.objects or (["candle", "toilet"] if assets() else ["mug", "chair"]))
+    print(f"{machine()}; {options.views} views at {options.size}x{options.size}, {options.rounds} rounds\n")
+    print(preparation(entries, size, options.views, min(options.rounds, 3)) + "\n", flush=True)
+    works = [
+        work_of(entry, obj, f"{entry.name} {name}", size, options.views)
+        for entry in entries
+        for name, obj in ((f"{SMALL} texture", rescaled(entry.obj, SMALL)), ("full texture", entry.obj))
+    ]
+    classifier = fastest_classifier()
+    contenders: dict[str, Callable[[], object]] = {work.name: work.forward_backward for work in works}
+    contenders["classifier"] = classifier_alone(classifier)
+    shares: dict[str, list[float]] = {work.name: [] for work in works if work.name.endswith("full texture")}
+    for work in works:
+        if work.name in shares:
+            contenders[f"step {work.name}"] = outside_share(work, classifier, shares[work.name])
+    contenders |= peers(works, size) if options.pytorch3d else {}
+    times = in_rounds(contenders, options.rounds)
+    print(speed(works, times) + "\n")
+    print(f"{classifier.name}, forward + input gradient, ms per image: {times['classifier'].per(BATCH)}\n")
+    print(
+        markdown_table(
+            ["attack step", "ms per view (median / least)", "share outside the classifier, median", "wanted"],
+            [
+                [
+                    name,
+                    times[f"step {name}"].per(options.views),
+                    f"{np.median(share[1:]):.1%}",
+                    f"<= {WANTED_SHARE:.0%}",
+                ]
+                for name, share in shares.items()
+            ],
+        )
+    )
+
+
+def peers(works: Sequence[Work], size: tuple[int, int]) -> dict[str, Callable[[], object]]:
+    """PyTorch3D on the small textures."""
+    if importlib.util.find_spec("pytorch3d") is None:
+        print("PyTorch3D is not installed, so it is not compared with.\n")
+        return {}
+    from bench._pytorch3d import PyTorch3DPeer
+
+    found: dict[str, Callable[[], object]] = {}
+    for work in works:
+        if str(SMALL) in work.name:
+            chosen = [int(k) for k in np.linspace(0, len(work.views) - 1, PEER_VIEWS + 2)[1:-1]]
+            peer = PyTorch3DPeer(work.obj, [work.views[k] for k in chosen], size)
+            overlap = same_silhouette(work.surrogate, chosen, peer.forward_backward()[..., 3])
+            print(f"{work.name}: the silhouettes of both overlap to {overlap:.1%}.\n")
+            found[peer_name(work)] = peer.forward_backward
+    return found
+
+
+def same_silhouette(surrogate: Surrogate, views: Sequence[int], alpha: Float[Tensor, "views H W"]) -> float:
+    """Intersection over union of the object's pixels, so that the work is known to be the same."""
+    own = torch.zeros(alpha.shape, dtype=torch.bool).flatten(1)
+    for row, view in zip(own, views, strict=True):
+        row[surrogate.geometry.views[view].pixel] = True
+    theirs = alpha.flatten(1) > 0
+    return float((own & theirs).sum() / (own | theirs).sum())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""Make the objects that ship with Trompe: the same command gives the same files.
+
+python scripts/make_objects.py [--out FOLDER] [--only NAME]
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from objects.atlas import archive
+from objects.furniture import chair, lamp, table
+from objects.mesh import Patch
+from objects.tableware import bottle, mug, teapot
+from objects.things import ball, book
+
+from trompe_shared.object3d import load_object
+
+FOLDER: Final = Path(__file__).parents[1] / "shared" / "trompe_shared" / "shipped"
+FRAMING: Final = 2.1
+"""Camera distance in radii: the object fills the picture from every side, as ``framing_distance`` has it."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How an object is made, and from which elevations (degrees) it is looked at."""
+
+    make: Callable[[], Mapping[str, Sequence[Patch]]]
+    elevation: tuple[float, float]
+
+
+KINDS: Final = {
+    "ball": Kind(ball, (-30, 60)),
+    "book": Kind(book, (0, 50)),
+    "bottle": Kind(bottle, (-5, 45)),
+    "chair": Kind(chair, (0, 50)),
+    "lamp": Kind(lamp, (-10, 45)),
+    "mug": Kind(mug, (0, 50)),
+    "table": Kind(table, (5, 50)),
+    "teapot": Kind(teapot, (0, 50)),
+}
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Write archives and ``objects.json`` into a folder, by default the one that is part of the package."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=FOLDER, help="folder to write to (default: %(default)s)")
+    parser.add_argument("--only", choices=sorted(KINDS), help="make one object's archive and nothing else")
+    options = parser.parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
+    rows = {}
+    for name in [options.only] if options.only else sorted(KINDS):
+        data = archive(name, KINDS[name].make())
+        (options.out / f"{name}.zip").write_bytes(data)
+        distance = round(FRAMING * load_object(data).radius, 3)
+        rows[name] = {"label": name, "distance": distance, "elevation": KINDS[name].elevation}
+        print(f"{name}: {len(data) / 1e3:.0f} kB")
+    if not options.only:
+        (options.out / "objects.json").write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,1 @@
+"""How the objects that ship with Trompe are made: meshes, textures and materials, from code and seeds alone."""

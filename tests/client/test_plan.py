@@ -1,0 +1,117 @@
+"""Files the user points at: what is sent for them."""
+
+import io
+import json
+import zipfile
+
+import pytest
+
+from trompe_client._plan import (
+    AttackOptions,
+    Upload,
+    background_source,
+    classifier_source,
+    classifier_upload,
+    object_source,
+    plan_attack,
+)
+from trompe_shared.api import JobSpec
+from trompe_shared.errors import ClassifierError, ObjectError, SpecError
+
+
+def names(upload: Upload) -> list[str]:
+    return zipfile.ZipFile(io.BytesIO(upload.data)).namelist()
+
+
+def test_a_folder_is_zipped_flat_sorted_and_without_hidden_files(mug_folder):
+    assert names(object_source(mug_folder)) == ["a.png", "mug.obj", "mug_mat_def.json"]
+
+
+def test_the_same_folder_gives_the_same_bytes_whatever_its_dates(mug_folder):
+    before = object_source(str(mug_folder)).data
+    for file in mug_folder.iterdir():
+        file.write_bytes(file.read_bytes())
+    later = mug_folder.rename(mug_folder.with_name("elsewhere"))
+    assert object_source(later).data == before
+
+
+def test_an_obj_file_takes_its_materials_and_pictures_along_but_no_other_mesh(mug_folder):
+    (mug_folder / "other.obj").write_text("o other")
+    (mug_folder / "notes.txt").write_text("mine")
+    assert names(object_source(mug_folder / "mug.obj")) == ["a.png", "mug.obj", "mug_mat_def.json"]
+
+
+def test_a_zip_is_sent_as_it_is(mug_folder, tmp_path):
+    archive = tmp_path / "cup.zip"
+    archive.write_bytes(object_source(mug_folder).data)
+    assert object_source(archive) == Upload("cup.zip", archive.read_bytes())
+
+
+def test_a_word_is_the_name_of_a_stored_object_even_where_a_folder_of_that_name_holds_no_mesh(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mug").mkdir()
+    assert object_source("mug") == "mug"
+
+
+@pytest.mark.parametrize("source", ["missing.zip", "missing/mug.obj"])
+def test_a_path_that_leads_nowhere_is_an_error(source):
+    with pytest.raises(ObjectError, match="There is no file"):
+        object_source(source)
+
+
+def test_a_file_that_is_no_zip_is_not_sent(tmp_path):
+    (tmp_path / "mug.zip").write_text("<html>")
+    with pytest.raises(ObjectError, match="not a zip archive"):
+        object_source(tmp_path / "mug.zip")
+
+
+def test_a_folder_without_mesh_is_an_error(tmp_path):
+    with pytest.raises(ObjectError, match=r"holds no \.obj"):
+        object_source(tmp_path)
+
+
+def test_the_class_names_nearest_to_the_classifier_win(tmp_path):
+    victim = tmp_path / "net.v2.pt2"
+    victim.write_bytes(b"")
+    assert classifier_upload(victim).form == {}
+    for file, name in {"classes.json": "c", "imagenet_classes.json": "i", "net.v2.classes.json": "own"}.items():
+        (tmp_path / file).write_text(json.dumps([name]))
+        assert json.loads(classifier_upload(victim).form["classes"]) == [name]
+    assert json.loads(classifier_upload(victim, classes=["given"]).form["classes"]) == ["given"]
+
+
+@pytest.mark.parametrize("text", ['{"0": "mug"}', "[1, 2]", "mug"])
+def test_class_names_that_are_no_list_of_strings_are_refused(tmp_path, text):
+    (tmp_path / "net.onnx").write_bytes(b"")
+    (tmp_path / "classes.json").write_text(text)
+    with pytest.raises(ClassifierError, match="class names"):
+        classifier_source(tmp_path / "net.onnx")
+
+
+def test_a_classifier_is_a_file_by_its_suffix_and_a_name_otherwise(tmp_path):
+    assert classifier_source("mobilenet_v2") == "mobilenet_v2"
+    with pytest.raises(ClassifierError, match="There is no classifier file"):
+        classifier_source(tmp_path / "net.pt2")
+
+
+def test_a_background_is_a_colour_or_a_picture_file(tmp_path):
+    (tmp_path / "room.PNG").write_bytes(b"png")
+    assert background_source("#ff8800") == "#ff8800"
+    assert background_source(tmp_path / "room.PNG") == Upload("room.PNG", b"png")
+    with pytest.raises(SpecError, match="There is no background picture"):
+        background_source("room2.png")
+
+
+def test_the_options_are_those_of_a_job():
+    assert AttackOptions.__annotations__.keys() == JobSpec.model_fields.keys() - {
+        "object",
+        "label",
+        "classifier",
+        "judges",
+        "background",
+    }
+
+
+def test_a_wrong_option_is_named_before_any_server_is_asked():
+    with pytest.raises(SpecError, match="tau: Input should be less than 1"):
+        plan_attack("mug", label=0, classifier="tiny", judges=(), background="white", tau=1.5)

@@ -1,0 +1,94 @@
+"""The promise of the project on the paper's own objects: real renderer, real ImageNet network, the paper's 60 views."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from trompe_server.artifacts import LocalArtifacts
+from trompe_server.attack_job import open_pipeline
+from trompe_server.library import Library
+from trompe_server.target import SailenvTarget
+from trompe_shared.api import JobSpec, Result, SurrogateModel
+from trompe_shared.object3d import load_object
+
+ASSETS = os.environ.get("TROMPE_ASSETS")
+pytestmark = [
+    pytest.mark.assets,
+    pytest.mark.timeout(900),
+    pytest.mark.skipif(ASSETS is None, reason="TROMPE_ASSETS names no folder of real objects and classifiers"),
+]
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Library:
+    assert ASSETS is not None
+    library, folder = Library(tmp_path_factory.mktemp("library")), Path(ASSETS)
+    names = json.loads((folder / "classifiers" / "imagenet_classes.json").read_text())
+    with (folder / "classifiers" / "mobilenet_v2.pt2").open("rb") as file:
+        library.add_classifier(file, "mobilenet_v2.pt2", classes=names)
+    return library
+
+
+def run(
+    name: str,
+    library: Library,
+    target: SailenvTarget,
+    folder: Path,
+    *,
+    surrogate: SurrogateModel = "auto",
+    tau: float | None = None,
+    steps: int = 20,
+) -> Result:
+    """One whole job as the paper describes it: 6 azimuths x 10 elevations, epsilon 0.05, alpha 0.01."""
+    assert ASSETS is not None
+    paper = json.loads((Path(ASSETS) / "objects" / "objects.json").read_text())[name]
+    stored = library.add_object(load_object(Path(ASSETS) / "objects" / name).to_zip(), name)
+    spec = JobSpec(
+        object=stored.id,
+        label=paper["imagenet_class"],
+        classifier="mobilenet_v2",
+        epsilon=0.05,
+        alpha=0.01,
+        tau=tau,
+        steps=steps,
+        surrogate=surrogate,
+        distance=paper["distance"],
+        elevation=paper["elevation_range"],
+        background=paper["background"],
+    )
+    artifacts = LocalArtifacts(folder)
+    job = open_pipeline(spec, library=library, artifacts=artifacts, target=target)
+    for phase in job.phases():
+        job.run(phase, lambda _: None)
+    return Result.model_validate_json(artifacts.read("result.json"))
+
+
+@pytest.mark.parametrize("name", ["toilet_paper", "lamp_floor", "remote_controller", "plunger"])
+def test_the_target_is_fooled_and_the_surrogate_knew_it(
+    name: str, library: Library, target: SailenvTarget, tmp_path: Path
+) -> None:
+    result = run(name, library, target, tmp_path)
+    assert result.target.a_before >= 0.8
+    assert result.target.a_drop is not None
+    assert result.target.a_drop >= 0.95
+    assert result.surrogate is not None
+    assert result.surrogate.a_after is not None
+    assert result.target.a_after is not None
+    assert abs(result.surrogate.a_before - result.target.a_before) <= 0.04
+    assert abs(result.surrogate.a_after - result.target.a_after) <= 0.04
+    assert result.held_out is not None
+    assert result.held_out.views == 60
+    assert not result.warnings
+
+
+def test_saliency_spares_texels(library: Library, target: SailenvTarget, tmp_path: Path) -> None:
+    shares = [
+        run("lamp_floor", library, target, tmp_path / str(tau), tau=tau, steps=5).texels_altered
+        for tau in (None, 0.05, 0.2)
+    ]
+    assert shares[0] is not None
+    assert shares[1] is not None
+    assert shares[2] is not None
+    assert shares[0] > shares[1] > shares[2] > 0

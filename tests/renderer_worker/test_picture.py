@@ -1,0 +1,212 @@
+"""What the worker's pictures show: the right thing in the right place, in the right light."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from trompe_server.target import SailenvTarget
+from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View
+from trompe_shared.object3d import Object3D
+
+SIZE = (60, 80)
+GREY = (90, 90, 90)
+AMBIENT = Light(intensity=0.0, ambient=1.0)
+"""Light in which every surface shows its albedo as it is (but for the encoding's 2.2 against sRGB)."""
+
+Picture = NDArray[np.uint8]
+Boxes = Callable[..., Object3D]
+
+
+def show(target: SailenvTarget, obj: Object3D, camera: Camera, light: Light = AMBIENT, **options: object) -> Picture:
+    view = View(camera, light, **options)  # type: ignore[arg-type]
+    return np.asarray(target.render(obj, [view], size=SIZE)[0])
+
+
+def of_color(picture: Picture, color: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which pixels (H, W) have a face's colour."""
+    return np.asarray(np.abs(picture.astype(int) - color).max(axis=-1) < 12)
+
+
+def where(picture: Picture, color: tuple[int, int, int]) -> tuple[float, float]:
+    """Mean row and column of the pixels that have a face's colour."""
+    rows, columns = np.nonzero(of_color(picture, color))
+    assert len(rows), f"{color} is nowhere to be seen"
+    return float(rows.mean()), float(columns.mean())
+
+
+def on_screen(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(column, row) of world points (N, 3), in pixels from the top left corner of the picture."""
+    height, width = SIZE
+    x, y, z = (camera.world_to_camera() @ np.c_[points, np.ones(len(points))].T)[:3]
+    scale = height / 2 / np.tan(np.radians(FIELD_OF_VIEW / 2)) / -z
+    return np.stack([width / 2 + scale * x, height / 2 - scale * y], axis=-1)
+
+
+def linear(picture: Picture) -> NDArray[np.float64]:
+    return np.asarray((picture / 255.0) ** 2.2)
+
+
+def test_left_is_left_and_up_is_up(target: SailenvTarget, make_boxes: Boxes) -> None:
+    picture = show(target, make_boxes(), Camera(0.3, 30, 30), background=GREY)
+    front, right, top = (where(picture, color) for color in ((200, 0, 200), (200, 0, 0), (0, 0, 200)))
+    assert right[1] > front[1] + 5
+    assert top[0] < front[0] - 5
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "color"),
+    [
+        pytest.param(0, 0, (200, 0, 200), id="front"),
+        pytest.param(90, 0, (200, 0, 0), id="right"),
+        pytest.param(180, 0, (0, 200, 200), id="back"),
+        pytest.param(270, 0, (0, 200, 0), id="left"),
+        pytest.param(0, 90, (0, 0, 200), id="top, from straight above"),
+        pytest.param(0, -90, (200, 200, 0), id="bottom, from straight below"),
+    ],
+)
+def test_each_side_is_seen_from_its_side(
+    target: SailenvTarget, make_boxes: Boxes, azimuth: float, elevation: float, color: tuple[int, int, int]
+) -> None:
+    picture = show(target, make_boxes(), Camera(0.3, azimuth, elevation))
+    assert np.abs(picture[SIZE[0] // 2, SIZE[1] // 2].astype(int) - color).max() < 12
+
+
+def test_from_straight_above_the_front_is_at_the_bottom(target: SailenvTarget, make_boxes: Boxes) -> None:
+    picture = show(target, make_boxes(((0.02, 0, 0.06), (0.02, 0.01, 0.04))), Camera(0.3, 0, 90))
+    row, column = where(picture, (0, 0, 200))
+    assert row > SIZE[0] / 2 + 5
+    assert column > SIZE[1] / 2 + 1
+
+
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(st.floats(0.25, 0.6), st.floats(-180, 180), st.floats(-90, 90))
+def test_corners_are_within_a_pixel_of_where_the_camera_puts_them(
+    target: SailenvTarget, make_boxes: Boxes, distance: float, azimuth: float, elevation: float
+) -> None:
+    camera = Camera(distance, azimuth, elevation)
+    picture = show(target, make_boxes(), camera, background=(255, 255, 255))
+    rows, columns = np.nonzero((picture != 255).any(axis=-1))
+    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    corners = on_screen(camera, signs * (0.10, 0.06, 0.04)).clip(0, (SIZE[1], SIZE[0]))
+    seen = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+    assert np.abs(np.concatenate([corners.min(axis=0), corners.max(axis=0)]) - seen).max() < 1
+
+
+@settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(st.tuples(*[st.integers(0, 255)] * 3))
+def test_the_background_is_exactly_the_colour_asked_for(
+    target: SailenvTarget, make_boxes: Boxes, color: tuple[int, int, int]
+) -> None:
+    picture = show(target, make_boxes(), Camera(0.5, 10, 10), background=color)
+    assert (picture[0, 0] == color).all()
+
+
+def test_light_falls_from_the_side_that_it_is_said_to(target: SailenvTarget, make_boxes: Boxes) -> None:
+    white = {name: np.full((4, 4, 3), 255, np.uint8) for name in ("right", "left", "top", "front")}
+    box, camera = make_boxes(textures=white), Camera(0.35, 45, 30)
+    spots = on_screen(camera, np.array([[0.1, 0, 0], [0, 0.06, 0], [0, 0, 0.04]])).astype(int)
+    for brightest, (azimuth, elevation) in enumerate([(90, 0), (0, 90), (0, 0)]):
+        light = Light(azimuth=azimuth, elevation=elevation, intensity=1.0, ambient=0.1)
+        picture = show(target, box, camera, light)
+        levels = [int(picture[row, column, 0]) for column, row in spots]
+        assert levels[brightest] > 200
+        assert max(level for side, level in enumerate(levels) if side != brightest) < 110
+
+
+def test_at_intensity_one_a_white_wall_that_faces_the_light_is_white(target: SailenvTarget, make_boxes: Boxes) -> None:
+    box = make_boxes(textures={"front": np.full((4, 4, 3), 255, np.uint8)})
+    centres = [
+        linear(show(target, box, Camera(0.3, 0, 0), Light(0, 0, intensity, 0.0)))[30, 40, 0]
+        for intensity in (0.0, 0.25, 0.5, 1.0)
+    ]
+    assert np.allclose(centres, [0, 0.25, 0.5, 1.0], atol=0.06)
+
+
+def test_ambient_light_reaches_every_side(target: SailenvTarget, make_boxes: Boxes) -> None:
+    box = make_boxes(textures={"bottom": np.full((4, 4, 3), 255, np.uint8)})
+    picture = show(target, box, Camera(0.3, 0, -90), Light(0, 90, 1.0, ambient=0.5))
+    assert np.allclose(linear(picture)[30, 40], 0.5, atol=0.02)
+
+
+def test_repainting_a_side_changes_that_side_alone(target: SailenvTarget, make_boxes: Boxes) -> None:
+    box, camera = make_boxes(), Camera(0.3, 60, 30)
+    before = show(target, box, camera)
+    after = show(target, box.with_textures({"right_albedo.png": np.full((8, 8, 3), 30, np.uint8)}), camera)
+    red, purple, blue, white = (of_color(before, c) for c in ((200, 0, 0), (200, 0, 200), (0, 0, 200), (255,) * 3))
+    assert red.sum() > 100
+    assert (np.abs(after[red].astype(int) - 30) < 12).all()
+    assert not (before != after).any(axis=-1)[purple | blue | white].any()
+
+
+def test_each_texel_of_a_texture_of_odd_size_is_where_its_uv_is(target: SailenvTarget, make_boxes: Boxes) -> None:
+    texture = np.random.default_rng(1).integers(0, 256, (5, 3, 3), dtype=np.uint8)
+    camera = Camera(0.3, 0, 0)
+    picture = show(target, make_boxes(textures={"front": texture}), camera)
+    for row, column in np.ndindex(5, 3):
+        u, v = (column + 0.5) / 3, 1 - (row + 0.5) / 5
+        x, y = on_screen(camera, np.array([[0.2 * u - 0.1, 0.12 * v - 0.06, 0.04]]))[0].astype(int)
+        assert np.abs(picture[y, x].astype(int) - texture[row, column]).max() < 40
+
+
+@pytest.mark.parametrize(("green", "brighter"), [(200, True), (56, False)])
+def test_a_normal_maps_green_leans_towards_growing_v(
+    target: SailenvTarget, make_boxes: Boxes, green: int, brighter: bool
+) -> None:
+    light, camera = Light(0, 60, 1.0, 0.0), Camera(0.3, 0, 0)
+    flat, leaning = (np.full((4, 4, 3), color, np.uint8) for color in ((128, 128, 255), (128, green, 200)))
+    levels = [
+        linear(show(target, make_boxes(maps={"normal": normal}), camera, light))[30, 40, 0]
+        for normal in (flat, leaning)
+    ]
+    assert (levels[1] > 1.2 * levels[0]) if brighter else (levels[1] < 0.8 * levels[0])
+
+
+def test_metal_has_no_matt_colour_and_gloss_has_a_highlight(target: SailenvTarget, make_boxes: Boxes) -> None:
+    def level(metallic: int, smoothness: int, elevation: float) -> float:
+        texture = np.full((4, 4, 4), metallic, np.uint8)
+        texture[..., 3] = smoothness
+        box = make_boxes(maps={"metallic": texture})
+        return float(linear(show(target, box, Camera(0.3, 0, 0), Light(0, elevation, 0.5, 0.0)))[30, 40, 0])
+
+    assert level(255, 200, 60) < 0.3 * level(0, 200, 60)
+    assert level(255, 200, 0) > 2 * level(255, 20, 0)
+
+
+def test_what_stands_in_the_way_of_the_light_casts_a_shadow(
+    target: SailenvTarget, shadowless_worker: tuple[str, int], make_boxes: Boxes
+) -> None:
+    boxes = make_boxes(((0, -0.1, 0), (0.2, 0.005, 0.2)), ((0, 0.02, 0), (0.05, 0.005, 0.05)))
+    camera, light = Camera(0.6, 0, 30), Light(0, 90, 1.0, 0.2)
+    spots = on_screen(camera, np.array([[0, -0.095, 0], [0.15, -0.095, 0]])).astype(int)
+    other = SailenvTarget(*shadowless_worker)
+    with_shadows, without = show(target, boxes, camera, light), show(other, boxes, camera, light)
+    other.close()
+    covered, free = (int(with_shadows[row, column, 2]) for column, row in spots)
+    assert covered < 0.7 * free
+    assert [int(without[row, column, 2]) for column, row in spots] == [free, free]
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 20.0])
+def test_a_lit_box_of_any_size_has_no_stripes_of_its_own_shadow(
+    target: SailenvTarget, make_boxes: Boxes, scale: float
+) -> None:
+    box = make_boxes(((0, 0, 0), (0.1 * scale, 0.1 * scale, 0.1 * scale)))
+    for elevation in (10, 40, 80):
+        picture = show(target, box, Camera(0.25 * scale, 0, 0), Light(0, elevation, 1.0, 0.2))
+        assert np.ptp(linear(picture)[10:50, 20:60, 0]) < 0.05
+
+
+def test_the_same_view_gives_the_same_bytes_whatever_was_rendered_between(
+    target: SailenvTarget, make_boxes: Boxes
+) -> None:
+    box, other = make_boxes(), make_boxes(((0, 0, 0), (0.02, 0.2, 0.02)))
+    view = View(Camera(0.3, 20, 20), Light(40, 50))
+    first = target.render(box, [view], size=SIZE)
+    target.render(other, [View(Camera(0.4, 50, 0), Light(-40, 20))], size=(33, 17))
+    for _ in range(20):  # more objects than the worker keeps
+        target.render(make_boxes(((0, 0, 0), tuple(np.random.default_rng(_).uniform(0.01, 0.1, 3)))), [view], size=SIZE)
+    assert (target.render(box, [view, view], size=SIZE) == first).all()

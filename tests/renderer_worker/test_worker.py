@@ -1,0 +1,329 @@
+"""The worker on the wire: every command, both dialects, and agents that cannot harm each other."""
+
+import io
+import math
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from trompe_renderer.model import Library
+from trompe_renderer.server import MAX_AGENTS, _Agent
+from trompe_renderer.session import Session
+from trompe_shared.errors import RendererError
+from trompe_shared.object3d import Object3D, pack_zip
+from trompe_shared.sailenv import COMMANDS, VIEW_FLAGS, Command
+
+Connect = Callable[..., Any]
+Boxes = Callable[..., Object3D]
+ALL_VIEWS = sum(VIEW_FLAGS.values())
+
+SAMPLES: dict[str, dict[str, Any]] = {
+    "change_scene": {"scene": "object_view/scene"},
+    "set_position": {"position": (0, 0, 1)},
+    "set_rotation": {"rotation": (180, 0, 180)},
+    "spawn_object": {
+        "name": "mug",
+        "position": (0, 0, 0),
+        "rotation": (0, 0, 0),
+        "remove_dynamics": True,
+        "scale": (1, 1, 1),
+        "use_parent": True,
+    },
+    "despawn_object": {"instance": 7},
+    "send_obj_zip": {"file": ("x.zip", b"")},
+    "set_clear_color": {"color": (1, 2, 3)},
+    "set_ambient_light_color": {"color": (1, 2, 3)},
+    "move_object": {"instance": 7, "position": (0, 0, 0), "rotation": (0, 0, 0)},
+}
+"""Field values of each command that has fields; those of the lights are made in ``sample``."""
+
+
+def sample(command: Command) -> dict[str, Any]:
+    values = {"color": (1, 2, 3), "intensity": 0.5, "multiplier": 2.0, "position": (1, 2, 3), "direction": (0, -1, 0)}
+    if "light" in command.request:
+        return {"light": "Rim Light"} | {name: values[name] for name in command.request if name != "light"}
+    return SAMPLES.get(command.name, {})
+
+
+def is_closed(connection: socket.socket) -> bool:
+    """Whether the other side hangs up, with or without reading all it was sent."""
+    try:
+        return connection.recv(1) == b""
+    except ConnectionResetError:
+        return True
+
+
+def test_every_command_is_answered_in_full(wire: Connect) -> None:
+    agent = wire()
+    for command in COMMANDS.values():
+        if command.name in {"frame", "delete"}:
+            continue
+        try:
+            agent.ask(command.name, **sample(command))
+        except RendererError:
+            assert command.name in {"despawn_object", "move_object"}
+        agent.socket.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            agent.socket.recv(1)
+        agent.socket.settimeout(60)
+    assert agent.picture().shape == (32, 48, 3)
+
+
+@pytest.mark.parametrize("gzip", [False, True])
+def test_all_views_have_the_form_that_the_protocol_gives_them(wire: Connect, gzip: bool) -> None:
+    views, delta_time = wire(gzip=gzip).views(ALL_VIEWS)
+    assert delta_time >= 0
+    assert np.array(Image.open(io.BytesIO(views["main"]))).shape == (32, 48, 3)
+    assert np.array(Image.open(io.BytesIO(views["object"]))).shape == (32, 48, 3)
+    assert np.array(Image.open(io.BytesIO(views["depth"]))).shape == (32, 48)
+    assert len(views["category"]) == 32 * 48 * 3
+    assert len(views["optical"]) == 32 * 48 * 2 * 4
+
+
+def test_a_frame_without_views_is_a_delta_time(wire: Connect) -> None:
+    assert wire().views(0)[0] == {}
+
+
+def test_the_handshake_names_the_agent_and_the_scene_of_single_objects(wire: Connect) -> None:
+    first, second = wire(), wire()
+    assert first.agent != second.agent
+    assert first.scenes == ["object_view/scene"]
+
+
+@pytest.mark.parametrize("tail", [{}, {"frustum_limited": True, "dynamic": None}], ids=["short", "long"])
+def test_both_dialects_of_spawn_are_understood(wire: Connect, make_boxes: Boxes, tail: dict[str, Any]) -> None:
+    agent = wire()
+    for number in (1, 2):
+        assert agent.spawn(make_boxes(), **tail) == str(number)
+    agent.ask("set_position", position=(0, 0, 0.3))
+    agent.ask("set_rotation", rotation=(180, 0, 180))
+    assert (agent.picture()[16, 24] != 255).any()
+    agent.ask("despawn_object", instance=1)
+    agent.ask("despawn_object", instance=2)
+    assert (agent.picture() == 255).all()
+
+
+def test_the_picture_is_sent_mirrored_as_unity_shows_it(wire: Connect, make_boxes: Boxes) -> None:
+    agent = wire()
+    agent.spawn(make_boxes(((0.05, 0, 0), (0.02, 0.02, 0.02))))
+    agent.ask("set_position", position=(0, 0, 0.3))
+    agent.ask("set_rotation", rotation=(180, 0, 180))
+    columns = np.nonzero((agent.picture() != 255).any(axis=(0, 2)))[0]
+    assert columns.max() < 24
+
+
+def test_an_object_is_placed_turned_and_scaled_as_unity_would(wire: Connect, make_boxes: Boxes) -> None:
+    agent = wire(size=(64, 64))
+    agent.ask("set_position", position=(0, 0, 0.5))
+    agent.ask("set_rotation", rotation=(180, 0, 180))
+    agent.spawn(make_boxes(((0.05, 0, 0), (0.02, 0.01, 0.01))), rotation=(0, 0, 90), scale=(2, 1, 1))
+    rows, columns = np.nonzero((agent.picture() != 255).any(axis=-1))
+    assert rows.max() < 32  # x became up
+    assert 2.5 * np.ptp(columns) < np.ptp(rows) < 6 * np.ptp(columns)
+    agent.ask("move_object", instance=1, position=(0, -0.2, 0), rotation=(0, 0, 90))
+    assert np.nonzero((agent.picture() != 255).any(axis=-1))[0].min() > 32
+
+
+def test_lights_say_what_they_were_told(wire: Connect) -> None:
+    agent = wire()
+    assert agent.ask("get_lights_names") == ["Main Light", "Rim Light"]
+    assert agent.ask("get_light_type", light="Main Light") == "Directional"
+    assert agent.ask("get_light_type", light="Sun") == "light_not_found"
+    for name, value in (("color", (10, 20, 30)), ("intensity", 0.25), ("indirect_multiplier", 3.0)):
+        field = "multiplier" if name == "indirect_multiplier" else name
+        agent.ask(f"set_light_{name}", light="Rim Light", **{field: value})
+        assert agent.ask(f"get_light_{name}", light="Rim Light") == value
+    for name in ("position", "direction"):
+        agent.ask(f"set_light_{name}", light="Main Light", **{name: (1.0, -2.0, 0.5)})
+        assert agent.ask(f"get_light_{name}", light="Main Light") == (1.0, -2.0, 0.5)
+    assert agent.ask("get_ambient_light_color") == (128, 128, 128)
+
+
+def test_the_rim_light_lights_once_it_has_an_intensity(wire: Connect, make_boxes: Boxes) -> None:
+    agent = wire()
+    agent.spawn(make_boxes())
+    agent.ask("set_position", position=(0, 0, 0.3))
+    agent.ask("set_rotation", rotation=(180, 0, 180))
+    agent.ask("set_light_intensity", light="Main Light", intensity=0.0)
+    dark = agent.picture()[16, 24].astype(int)
+    agent.ask("set_light_direction", light="Rim Light", direction=(0, 0, -1))
+    agent.ask("set_light_color", light="Rim Light", color=(255, 0, 0))
+    assert (agent.picture()[16, 24] == dark).all()
+    agent.ask("set_light_intensity", light="Rim Light", intensity=0.5)
+    red, _, blue = agent.picture()[16, 24].astype(int) - dark
+    assert red > 20
+    assert blue <= 2
+
+
+@pytest.mark.parametrize(
+    ("command", "values"),
+    [
+        pytest.param("set_position", {"position": (math.nan, 0, 0)}, id="position not a number"),
+        pytest.param("set_rotation", {"rotation": (math.inf, 0, 0)}, id="rotation infinite"),
+        pytest.param("set_clear_color", {"color": (0, 256, 0)}, id="colour out of range"),
+        pytest.param("set_light_intensity", {"light": "Main Light", "intensity": -1}, id="negative light"),
+        pytest.param("set_light_direction", {"light": "Main Light", "direction": (0, 0, 0)}, id="no direction"),
+        pytest.param("set_light_color", {"light": "Sun", "color": (0, 0, 0)}, id="no such light"),
+        pytest.param("change_scene", {"scene": "room"}, id="no such scene"),
+        pytest.param("despawn_object", {"instance": 99}, id="no such instance"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_with_a_reason_that_can_be_asked_again(
+    wire: Connect, command: str, values: dict[str, Any]
+) -> None:
+    agent = wire()
+    with pytest.raises(RendererError) as refusal:
+        agent.ask(command, **values)
+    reason = agent.ask("last_error")
+    assert len(reason) > 10
+    assert reason in str(refusal.value)
+    assert agent.ask("last_error") == ""
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        pytest.param(b"PK no zip at all", "zip", id="not a zip"),
+        pytest.param(pack_zip({"readme.txt": b"hello"}), ".obj", id="no mesh"),
+        pytest.param(pack_zip({"a.obj": b"v 0 0 0\nf 1 2 3\n"}), "a.obj", id="broken mesh"),
+    ],
+)
+def test_a_broken_object_is_stored_and_its_spawn_refused(wire: Connect, data: bytes, reason: str) -> None:
+    agent = wire()
+    path = agent.ask("send_obj_zip", file=("a.zip", data))
+    assert path
+    assert agent.ask("spawn_object", **(SAMPLES["spawn_object"] | {"name": f"file:{path}"})) == ""
+    assert reason in agent.ask("last_error")
+    assert agent.picture().shape == (32, 48, 3)
+
+
+@pytest.mark.parametrize("name", ["file:/etc/passwd", "file:../x.zip", "box", "file:"])
+def test_only_paths_that_this_agent_was_given_can_be_spawned(wire: Connect, make_boxes: Boxes, name: str) -> None:
+    wire().spawn(make_boxes())
+    assert wire().ask("spawn_object", **(SAMPLES["spawn_object"] | {"name": name})) == ""
+
+
+def test_a_fresh_scene_is_empty_and_lit_as_at_the_start(wire: Connect, make_boxes: Boxes) -> None:
+    agent = wire()
+    agent.spawn(make_boxes())
+    agent.ask("set_light_intensity", light="Main Light", intensity=9.0)
+    agent.ask("set_clear_color", color=(0, 0, 0))
+    agent.ask("change_scene", scene="object_view/scene")
+    assert agent.ask("get_light_intensity", light="Main Light") == 1.25
+    assert (agent.picture() == 255).all()
+
+
+def test_agents_do_not_see_each_others_objects(wire: Connect, make_boxes: Boxes) -> None:
+    busy, idle = wire(), wire()
+    for agent in (busy, idle):
+        agent.ask("set_position", position=(0, 0, 0.3))
+        agent.ask("set_rotation", rotation=(180, 0, 180))
+    busy.spawn(make_boxes())
+    assert (busy.picture() != 255).any()
+    assert (idle.picture() == 255).all()
+
+
+@pytest.mark.parametrize(
+    "junk",
+    [
+        pytest.param(bytes([0xAA]) * 100, id="unknown command"),
+        pytest.param(b"\x02" + struct.pack("<i", -5), id="negative length"),
+        pytest.param(b"\x0c" + struct.pack("<i", 2**31 - 1), id="huge length"),
+        pytest.param(bytes(np.random.default_rng(5).integers(0x20, 0xDF, 1000, dtype=np.uint8)), id="noise"),
+    ],
+)
+def test_an_agent_that_talks_nonsense_is_closed_and_no_other(wire: Connect, junk: bytes) -> None:
+    good, bad = wire(), wire()
+    bad.socket.sendall(junk)
+    assert is_closed(bad.socket)
+    assert good.picture().shape == (32, 48, 3)
+
+
+@pytest.mark.parametrize("hello", [struct.pack("<ii?", 0, 10, False), struct.pack("<ii?", 10, 100_000, False)])
+def test_a_handshake_for_images_of_impossible_size_is_closed(worker: tuple[str, int], hello: bytes) -> None:
+    with socket.create_connection(worker, timeout=60) as connection:
+        connection.sendall(hello)
+        assert is_closed(connection)
+
+
+def test_an_agent_that_hangs_up_in_mid_sentence_leaves_the_worker_alive(worker: tuple[str, int], wire: Connect) -> None:
+    with socket.create_connection(worker, timeout=60) as connection:
+        connection.sendall(b"\x10")
+    assert wire().picture().shape == (32, 48, 3)
+
+
+def test_delete_ends_the_connection(wire: Connect) -> None:
+    agent = wire()
+    agent.socket.sendall(COMMANDS["delete"].encode_request())
+    assert is_closed(agent.socket)
+
+
+def test_a_worker_that_cannot_listen_says_so(worker: tuple[str, int]) -> None:
+    command = [sys.executable, "-m", "trompe_renderer", "--port", str(worker[1])]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 1
+    assert ended.stdout == ""
+    assert f"Cannot listen on 127.0.0.1:{worker[1]}" in ended.stderr
+
+
+def test_an_upload_of_the_same_bytes_gets_the_same_path_and_of_others_another(wire: Connect, make_boxes: Boxes) -> None:
+    agent, box = wire(), make_boxes()
+    paths = [agent.ask("send_obj_zip", file=("same name", data)) for data in (box.to_zip(), box.to_zip(), b"other")]
+    assert paths[0] == paths[1] != paths[2]
+
+
+class _BrokenRenderer:
+    def render(self, *_args: object, **_sizes: int) -> None:
+        raise RuntimeError("out of memory")
+
+
+def test_a_frame_that_cannot_be_rendered_is_sent_flat_and_marked(wire_to: Connect) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            with listener.accept()[0] as connection:
+                _Agent(connection, 3, _BrokenRenderer(), Session(Library())).serve()  # type: ignore[arg-type]
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        agent = wire_to(listener.getsockname())
+        views, delta_time = agent.views(ALL_VIEWS)
+        assert math.isnan(delta_time)
+        assert np.array(Image.open(io.BytesIO(views["main"]))).shape == (32, 48, 3)
+        assert "out of memory" in agent.ask("last_error")
+        agent.socket.sendall(COMMANDS["delete"].encode_request())
+        thread.join(timeout=30)
+        agent.socket.close()
+
+
+def test_more_agents_than_there_are_places_are_turned_away_until_one_leaves(
+    worker: tuple[str, int], wire_to: Connect
+) -> None:
+    agents = []
+    with suppress(EOFError, ConnectionError):
+        for _ in range(MAX_AGENTS + 1):
+            agents.append(wire_to(worker))
+    assert len(agents) <= MAX_AGENTS
+    assert agents[0].picture().shape == (32, 48, 3)
+    for agent in agents:
+        agent.socket.close()
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        try:
+            late = wire_to(worker)
+        except (EOFError, ConnectionError):
+            time.sleep(0.05)
+        else:
+            late.socket.close()
+            return
+    raise AssertionError("no place became free")

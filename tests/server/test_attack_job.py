@@ -1,0 +1,419 @@
+"""The main job over a fake target and the shipped classifier: phases, restarts, files, and what it says of failure."""
+
+import dataclasses
+import io
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from trompe_server.array_files import unpack_arrays
+from trompe_server.attack import Budget, attack, load_state, saliency_masks, start
+from trompe_server.attack_job import AttackJob, open_pipeline
+from trompe_server.errors import NotFoundError
+from trompe_server.library import Library
+from trompe_server.pipeline import PhaseReport
+from trompe_server.scene import Scene, open_scene
+from trompe_server.surrogate import SamplingModel, diffuse_surrogate, prepare_geometry, textures_of
+from trompe_server.target import BackdropTarget, FakeTarget, SailenvTarget, TargetRenderer
+from trompe_shared.api import ClassifierInfo, JobSpec, JobState, Progress, Result
+from trompe_shared.errors import ClassifierError, LabelError
+from trompe_shared.geometry import Camera, View
+from trompe_shared.object3d import Object3D, encode_png, load_object
+from trompe_shared.shipped import shipped_objects
+
+CHAIR = shipped_objects()["chair"]
+SPEC = JobSpec.model_validate(
+    {
+        "object": "chair",
+        "label": "chair",
+        "epsilon": 0.1,
+        "alpha": 0.03,
+        "surrogate": "calibrated",
+        "steps": 6,
+        "azimuths": 2,
+        "elevations": 2,
+        "held_out": 3,
+    }
+)
+QUICK = SPEC.model_copy(update={"surrogate": "diffuse", "steps": 2})
+PICTURES = {"contact_sheet.png", "difference.png", "saliency.png", "textures.png"}
+Image8 = NDArray[np.uint8]
+
+
+class MemoryArtifacts:
+    """A job's files in a dictionary."""
+
+    def __init__(self) -> None:
+        self.files: dict[str, bytes] = {}
+
+    def read(self, name: str) -> bytes:
+        if name not in self.files:
+            raise FileNotFoundError(name)
+        return self.files[name]
+
+    def write(self, name: str, data: bytes) -> None:
+        self.files[name] = data
+
+    def exists(self, name: str) -> bool:
+        return name in self.files
+
+    def result(self) -> Result:
+        return Result.model_validate_json(self.files["result.json"])
+
+    def lasting(self) -> dict[str, bytes]:
+        """All files, without what a clock wrote into them."""
+        untimed = {name: data for name, data in self.files.items() if not name.startswith("seconds-")}
+        result = json.loads(untimed.pop("result.json", b"{}"))
+        result.pop("seconds", None)
+        return untimed | {"result.json": json.dumps(result).encode()}
+
+
+class DarkTarget(FakeTarget):
+    """A target whose images are half as bright on their left."""
+
+    def render(
+        self,
+        obj: Object3D,
+        views: Sequence[View],
+        *,
+        size: tuple[int, int],
+        on_frame: Callable[[], None] | None = None,
+    ) -> Image8:
+        images = super().render(obj, views, size=size, on_frame=on_frame)
+        images[:, :, : size[1] // 2] //= 2
+        return images
+
+
+@dataclasses.dataclass
+class Run:
+    """A job that was run through: its files, what each phase reported, and the progress it told."""
+
+    artifacts: MemoryArtifacts
+    reports: dict[str, PhaseReport]
+    progress: list[Progress]
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Library:
+    return Library(tmp_path_factory.mktemp("library"))
+
+
+def run(
+    spec: JobSpec, library: Library, *, target: TargetRenderer | None = None, new: bool = False, times: int = 1
+) -> Run:
+    """Run all phases until the job ends; ``new`` opens the job anew for each, ``times`` runs each so often."""
+    artifacts, reports, progress = MemoryArtifacts(), {}, list[Progress]()
+
+    def opened() -> AttackJob:
+        return open_pipeline(spec, library=library, artifacts=artifacts, target=target or FakeTarget())
+
+    job = opened()
+    for phase in job.phases():
+        for _ in range(times):
+            job = opened() if new else job
+            reports[phase] = job.run(phase, progress.append)
+        if reports[phase].state is not None:
+            break
+    return Run(artifacts, reports, progress)
+
+
+@pytest.fixture(scope="module")
+def finished(library: Library) -> Run:
+    return run(SPEC, library)
+
+
+def test_a_job_goes_through_its_phases_and_succeeds(finished: Run) -> None:
+    assert list(finished.reports) == ["prepare", "calibrate", "attack-000", "attack-001", "judge"]
+    states = [report.state for report in finished.reports.values()]
+    assert states == [None, None, None, None, JobState.succeeded]
+    assert set(finished.reports["judge"].public) == PICTURES | {"adversarial.zip", "result.json"}
+    assert set(finished.reports["judge"].public) <= set(finished.artifacts.files)
+
+
+def test_progress_grows_from_nothing_to_all(finished: Run) -> None:
+    fractions = [progress.fraction for progress in finished.progress]
+    assert fractions == sorted(fractions)
+    assert 0 < fractions[0] < 0.1
+    assert fractions[-1] == pytest.approx(1)
+    steps = [(progress.step, progress.steps) for progress in finished.progress if progress.phase == "attack"]
+    assert steps == [(step, 6) for step in range(1, 7)]
+
+
+def test_the_result_says_what_was_asked_and_what_came_out(finished: Run) -> None:
+    result = finished.artifacts.result()
+    assert (result.object, result.label_name, result.classifier, result.image_size) == (
+        "chair",
+        "chair",
+        "tiny",
+        (128, 128),
+    )
+    assert (result.epsilon, result.alpha, result.tau, result.steps, result.seed) == (0.1, 0.03, None, 6, 0)
+    assert result.target.a_before > 0
+    assert result.held_out is not None
+    assert (result.target.views, result.held_out.views) == (4, 3)
+    assert (len(result.views), len(result.held_out_views)) == (4, 3)
+    assert result.surrogate is not None
+    assert result.surrogate.a_before == result.target.a_before
+    assert result.surrogate_model == "calibrated"
+    assert result.probe_renders > 0
+    assert {"prepare", "calibrate", "attack"} <= set(result.seconds)
+    assert set(result.fidelity) == {"error", "correlation", "slope", "explained"}
+    assert all(view.after is not None for view in result.views + result.held_out_views)
+
+
+def test_the_figures_of_the_change_are_those_of_the_files(finished: Run) -> None:
+    result, before = finished.artifacts.result(), load_object(CHAIR.read())
+    after = load_object(finished.artifacts.read("adversarial.zip"))
+    change = np.concatenate(
+        [np.abs(after.textures[n].astype(int) - t).reshape(-1, 3) for n, t in before.textures.items()]
+    )
+    altered = change.any(axis=1)
+    assert change.max() == 25  # floor(0.1 * 255)
+    assert result.texels_altered == pytest.approx(altered.mean())
+    assert result.mean_texel_change == pytest.approx(change[altered].mean() / 255)
+    clean, painted = (unpack_arrays(finished.artifacts.read(f"{name}.npz")) for name in ("clean", "after"))
+    seen = max(np.abs(clean[k].astype(int) - painted[k]).max() for k in ("own", "held_out"))
+    assert result.max_view_change == pytest.approx(seen / 255)
+
+
+def test_the_repainted_object_differs_in_its_albedo_files_alone(finished: Run) -> None:
+    before, after = load_object(CHAIR.read()), load_object(finished.artifacts.read("adversarial.zip"))
+    assert list(after.files) == list(before.files)
+    assert {name for name in before.files if after.files[name] != before.files[name]} == set(before.textures)
+
+
+def test_what_is_judged_is_the_texture_that_is_saved(finished: Run, library: Library) -> None:
+    scene = open_scene(SPEC, library=library, target=FakeTarget())
+    saved = load_object(finished.artifacts.read("adversarial.zip"))
+    images = FakeTarget().render(saved, scene.views, size=scene.size)
+    assert (unpack_arrays(finished.artifacts.read("after.npz"))["own"] == images).all()
+    verdicts = scene.classifier.predict(images).argmax(axis=1)
+    assert [view.after for view in finished.artifacts.result().views] == verdicts.tolist()
+    assert finished.artifacts.result().target.a_after == (verdicts == scene.label).mean()
+
+
+def test_the_pictures_can_be_seen(finished: Run) -> None:
+    for name in PICTURES:
+        with Image.open(io.BytesIO(finished.artifacts.read(name))) as picture:
+            assert min(picture.size) > 100
+            assert len(picture.convert("RGB").getcolors(2**24) or []) > 10
+
+
+def test_each_phase_may_run_in_another_process_and_twice(finished: Run, library: Library) -> None:
+    again = run(SPEC, library, new=True, times=2)
+    assert again.artifacts.lasting() == finished.artifacts.lasting()
+
+
+def test_the_seed_changes_the_held_out_views_and_only_them_of_the_images(finished: Run, library: Library) -> None:
+    job = open_pipeline(
+        SPEC.model_copy(update={"seed": 1}), library=library, artifacts=MemoryArtifacts(), target=FakeTarget()
+    )
+    job.run("prepare", lambda _: None)
+    clean, other = (unpack_arrays(files.read("clean.npz")) for files in (finished.artifacts, job.artifacts))
+    assert (clean["own"] == other["own"]).all()
+    assert (clean["held_out"] != other["held_out"]).any()
+
+
+def test_an_object_that_is_never_recognised_is_not_applicable(library: Library) -> None:
+    ended = run(QUICK.model_copy(update={"label": "ball"}), library)
+    report = ended.reports["prepare"]
+    assert (list(ended.reports), report.state) == (["prepare"], JobState.not_applicable)
+    assert report.note is not None
+    for word in ("n.a.", "'ball'", "none of the 4", "--label", "--background"):
+        assert word in report.note
+    assert set(report.public) == {"result.json", "saliency.png"}
+    result = ended.artifacts.result()
+    assert (result.target.a_before, result.target.a_after, result.target.a_drop) == (0, None, None)
+    assert (result.surrogate, result.texels_altered, result.transfer_gap) == (None, None, None)
+    assert report.note in result.warnings
+
+
+def test_a_job_without_held_out_views_or_with_one_view_works_too(library: Library) -> None:
+    ended = run(QUICK.model_copy(update={"held_out": 0, "azimuths": 1, "elevations": 1}), library)
+    result = ended.artifacts.result()
+    assert ended.reports["judge"].state is JobState.succeeded
+    assert (result.held_out, result.held_out_views, result.target.views) == (None, [], 1)
+
+
+def test_the_higher_the_threshold_the_fewer_texels_are_altered(library: Library) -> None:
+    altered = [
+        run(QUICK.model_copy(update={"tau": tau}), library).artifacts.result().texels_altered
+        for tau in (None, 0.05, 0.2)
+    ]
+    shares = [share for share in altered if share is not None]
+    assert len(set(shares)) == 3
+    assert shares == sorted(shares, reverse=True)
+    assert shares[-1] > 0
+
+
+def test_the_threshold_stops_the_gradient_of_the_pixels_below_it(library: Library) -> None:
+    spec = QUICK.model_copy(update={"tau": 0.2})
+    artifacts, scene = run(spec, library).artifacts, open_scene(spec, library=library, target=FakeTarget())
+    maps = torch.from_numpy(unpack_arrays(artifacts.read("saliency.npz"))["maps"].astype(np.float32))
+    geometry = prepare_geometry(scene.obj, scene.views, size=scene.size, sampling=SamplingModel())
+    textures, masks = textures_of(scene.obj), saliency_masks(maps, 0.2)
+    expected = attack(
+        start(textures),
+        textures,
+        diffuse_surrogate(geometry, scene.views),
+        scene.classifier,
+        scene.label,
+        budget=Budget(spec.epsilon, spec.alpha),
+        steps=2,
+        masks=masks,
+    )
+    done = load_state(artifacts.read("state-001.npz"))
+    assert done.step == 2
+    for name, delta in expected.deltas.items():
+        assert torch.equal(done.deltas[name], delta)
+
+
+def saliency_of(target: TargetRenderer, library: Library) -> NDArray[np.float16]:
+    artifacts = MemoryArtifacts()
+    open_pipeline(QUICK, library=library, artifacts=artifacts, target=target).run("prepare", lambda _: None)
+    return unpack_arrays(artifacts.read("saliency.npz"))["maps"]
+
+
+def test_saliency_is_that_of_the_targets_images(library: Library) -> None:
+    bright, dark = saliency_of(FakeTarget(), library), saliency_of(DarkTarget(), library)
+    assert bright.shape == (4, 128, 128)
+    assert (bright.min(), bright.max()) == (0, 1)
+    assert (bright != dark).mean() > 0.1
+
+
+def test_judges_say_what_they_think_of_the_same_images(library: Library) -> None:
+    result = run(QUICK.model_copy(update={"judges": ["tiny"]}), library).artifacts.result()
+    (judge,) = result.judges
+    assert (judge.classifier, judge.target, judge.held_out) == ("tiny", result.target, result.held_out)
+
+
+# The scene
+
+
+def scene_of(library: Library, **changes: object) -> Scene:
+    return open_scene(SPEC.model_copy(update=changes), library=library, target=FakeTarget())
+
+
+def test_a_shipped_object_is_looked_at_as_it_was_made_for(library: Library) -> None:
+    scene = scene_of(library)
+    assert (scene.object_name, scene.label, scene.size) == ("chair", 3, (128, 128))
+    assert (len(scene.views), len(scene.held_out)) == (4, 3)
+    assert {view.camera.distance for view in scene.views} == {CHAIR.distance}
+    assert {view.camera.elevation for view in scene.views} == set(CHAIR.elevation)
+    assert {view.background for view in scene.views} == {(255, 255, 255)}
+
+
+def test_distance_and_elevation_can_be_asked_for(library: Library) -> None:
+    scene = scene_of(library, distance=2.5, elevation=(0.0, 0.0))
+    assert {(view.camera.distance, view.camera.elevation) for view in scene.views} == {(2.5, 0)}
+
+
+def test_an_uploaded_object_is_framed_by_its_size(tmp_path: Path, mug: Object3D) -> None:
+    library = Library(tmp_path)
+    library.add_object(mug.to_zip(), "cup.zip")
+    scene = scene_of(library, object="cup", label="mug")
+    assert {round(view.camera.distance / mug.radius, 3) for view in scene.views} == {2.1}
+    assert {view.camera.elevation for view in scene.views} == {0, 50}
+
+
+@pytest.mark.parametrize(
+    ("background", "colour"), [("black", (0, 0, 0)), ("#0a64ff", (10, 100, 255)), ("#000000", (0, 0, 0))]
+)
+def test_a_background_can_be_a_colour(library: Library, background: str, colour: tuple[int, int, int]) -> None:
+    scene = scene_of(library, background=background)
+    assert {view.background for view in (*scene.views, *scene.held_out)} == {colour}
+    assert isinstance(scene.target, FakeTarget)
+
+
+@pytest.mark.parametrize("background", ["#xyzxyz", "#12 34 ", "#123", "red", ""])
+def test_a_background_that_is_nothing_known_is_refused(library: Library, background: str) -> None:
+    with pytest.raises(NotFoundError, match="background"):
+        scene_of(library, background=background)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        pytest.param({"object": "sofa"}, NotFoundError, "sofa.*chair", id="object"),
+        pytest.param({"classifier": "resnet"}, NotFoundError, "resnet.*tiny", id="classifier"),
+        pytest.param({"judges": ["resnet"]}, NotFoundError, "resnet", id="judge"),
+        pytest.param({"label": "chairs"}, LabelError, "did you mean 'chair'", id="label"),
+        pytest.param({"label": 8}, LabelError, r"0\.\.7", id="index"),
+    ],
+)
+def test_what_is_unknown_is_named_with_what_is_known(
+    library: Library, changes: dict[str, object], error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        scene_of(library, **changes)
+
+
+def test_a_classifier_without_gradients_cannot_be_attacked(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Opaque:
+        """Gives scores only, as an .onnx file does."""
+
+        name, image_size, n_classes, classes = "net", (8, 8), 2, None
+
+        def predict(self, images: Image8) -> NDArray[np.float32]:
+            return np.zeros((len(images), 2), np.float32)
+
+    info = ClassifierInfo(id="net", name="net", white_box=False, image_size=(8, 8), n_classes=2, classes=None)
+    monkeypatch.setattr(library, "classifier", lambda _: info)
+    monkeypatch.setattr(library, "classifier_path", lambda _: "net.onnx")
+    monkeypatch.setattr("trompe_server.scene.load_classifier", lambda *_, **__: Opaque())
+    with pytest.raises(ClassifierError, match=r"'net'.*no gradients.*\.onnx.*judge.*\.pt2"):
+        scene_of(library, classifier="net", label=0)
+
+
+# A photograph behind the object
+
+
+@pytest.fixture
+def photo() -> Image8:
+    """(90, 60, 3), in large squares of random colours."""
+    image = np.random.default_rng(0).integers(0, 256, (90, 60, 3), dtype=np.uint8)
+    return np.kron(image[::15, ::15], np.ones((15, 15, 1), np.uint8))
+
+
+def test_an_uploaded_photograph_stands_behind_the_object(tmp_path: Path, photo: Image8) -> None:
+    library = Library(tmp_path)
+    info = library.add_background(encode_png(photo), "wall.png")
+    scene = scene_of(library, background=info.id)
+    image = scene.target.render(scene.obj, scene.views[:1], size=scene.size)[0]
+    assert isinstance(scene.target, BackdropTarget)
+    plain = FakeTarget().render(scene.obj, scene.views[:1], size=scene.size)[0]
+    there = (plain != 0).any(axis=-1)
+    assert (image[there] == plain[there]).all()
+    assert len(np.unique(image[~there], axis=0)) > 50
+
+
+def test_a_photograph_is_what_compositing_by_hand_gives(mug: Object3D, photo: Image8) -> None:
+    views, size = [View(Camera(0.157, 30, 20)), View(Camera(0.3, 90, 0), background=(1, 2, 3))], (40, 60)
+    frames: list[None] = []
+    images = BackdropTarget(FakeTarget(), photo).render(mug, views, size=size, on_frame=lambda: frames.append(None))
+    cropped = Image.fromarray(photo[25:65]).resize((60, 40), Image.Resampling.LANCZOS)
+    for image, view in zip(images, views, strict=True):
+        black, white = (
+            FakeTarget().render(mug, [dataclasses.replace(view, background=colour)], size=size)[0]
+            for colour in ((0, 0, 0), (255, 255, 255))
+        )
+        free = (black == 0).all(axis=-1) & (white == 255).all(axis=-1)
+        expected = np.where(free[..., None], np.asarray(cropped), black)
+        assert np.abs(image.astype(int) - expected).max() <= 1
+        assert 0.1 < free.mean() < 0.97
+    assert len(frames) == len(views)
+
+
+def test_a_plain_photograph_is_the_same_as_a_uniform_background_at_soft_edges_too(
+    mug: Object3D, target: SailenvTarget
+) -> None:
+    views, size = [View(Camera(0.157, 30, 20), background=(120, 60, 200))], (64, 64)
+    picture = np.full((5, 5, 3), views[0].background, np.uint8)
+    composed = BackdropTarget(target, picture).render(mug, views, size=size)
+    assert np.abs(composed.astype(int) - target.render(mug, views, size=size)).max() <= 2

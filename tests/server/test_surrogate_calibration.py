@@ -1,0 +1,254 @@
+"""Calibration: it finds how a target samples, asks no more than it needs, counts what it asks, and is not fooled."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from trompe_server.surrogate import (
+    SamplingModel,
+    Surrogate,
+    diffuse_surrogate,
+    prepare_geometry,
+    textures_of,
+)
+from trompe_server.surrogate.calibration import (
+    CALIBRATED_GREYS,
+    CURVE_GREYS,
+    MAX_ERROR,
+    MIN_EXPLAINED,
+    Calibration,
+    build_surrogate,
+    calibrate,
+    painted_grey,
+    painted_noise,
+)
+from trompe_server.surrogate.shading import decode, encode
+from trompe_server.target import SailenvTarget
+from trompe_shared.api import SurrogateModel
+from trompe_shared.geometry import Camera, View
+from trompe_shared.object3d import Object3D
+from trompe_shared.shipped import shipped_objects
+
+SIZE = (64, 64)
+MUG = shipped_objects()["mug"]
+VIEWS = [View(Camera(MUG.distance, azimuth, elevation)) for azimuth in (0, 70, 200) for elevation in (5, 40)]
+Image8 = NDArray[np.uint8]
+Render = Callable[[Object3D, Sequence[View]], Image8]
+
+
+@dataclass
+class Asked:
+    """Asks ``render``, and keeps in mind how many images of what."""
+
+    render: Render
+    images: int = 0
+    greys: set[int] = field(default_factory=set)
+
+    def __call__(self, obj: Object3D, views: Sequence[View]) -> Image8:
+        self.images += len(views)
+        texture = next(iter(obj.textures.values()))
+        if (texture == texture[0, 0, 0]).all():
+            self.greys.add(int(texture[0, 0, 0]))
+        return self.render(obj, views)
+
+
+def images_of(surrogate: Surrogate, obj: Object3D) -> Image8:
+    with torch.no_grad():
+        images = surrogate.render(surrogate.texels(textures_of(obj)), range(surrogate.n_views))
+    return images.mul(255).round().byte().permute(0, 2, 3, 1).numpy()
+
+
+@dataclass
+class KnownTarget:
+    """A target whose true model is known: it samples textures by ``sampling``, and lights them in linear light as a
+    renderer does, or (not ``affine``) as the paper's surrogate does."""
+
+    sampling: SamplingModel
+    affine: bool = True
+    known: dict[object, Surrogate] = field(default_factory=dict)
+
+    def __call__(self, obj: Object3D, views: Sequence[View]) -> Image8:
+        key = (tuple(views), *(texture.shape for texture in obj.textures.values()))
+        if key not in self.known:
+            geometry = prepare_geometry(obj, views, size=SIZE, sampling=self.sampling)
+            self.known[key] = diffuse_surrogate(geometry, views)
+        return (self._affine_images if self.affine else images_of)(self.known[key], obj)
+
+    def _affine_images(self, surrogate: Surrogate, obj: Object3D) -> Image8:
+        images, texels = surrogate.base.numpy().copy(), surrogate.texels(textures_of(obj))
+        for image, view in zip(images, surrogate.geometry.views, strict=True):
+            values = view.gather.forward(texels)
+            light = view.shade * (values if self.sampling.filtered == "linear" else decode(values))
+            colour = view.coverage * encode(light.clamp(0, 1)) + (1 - view.coverage)  # before white
+            image.reshape(-1, 3)[view.pixel.numpy()] = colour.mul(255).round().byte().numpy()
+        return images
+
+
+def found(obj: Object3D, ask: Render, wanted: SurrogateModel, *, views: Sequence[View] = VIEWS) -> Calibration:
+    return calibrate(obj, views, ask(obj, views), ask, wanted=wanted, generator=np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def busy_mug(mug: Object3D) -> Object3D:
+    """The mug with much contrast from texel to texel, where hypotheses differ most."""
+    random = np.random.default_rng(0)
+    return mug.with_textures({n: random.integers(0, 256, (128, 128, 3), dtype=np.uint8) for n in mug.textures})
+
+
+CONFOUNDED = pytest.mark.xfail(
+    strict=True, reason="the search settles lod before bias, though each makes up for the other, and never looks back"
+)
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        pytest.param(SamplingModel(), id="the default"),
+        pytest.param(SamplingModel(filtered="linear", samples="centre"), id="linear, centre"),
+        pytest.param(SamplingModel(filtered="linear", lod="area", bias=0.5), id="linear, area, 0.5", marks=CONFOUNDED),
+        pytest.param(SamplingModel(filtered="linear", bias=-0.5), id="linear, -0.5", marks=CONFOUNDED),
+        pytest.param(SamplingModel(lod="area", samples="centre", bias=0.25), id="area, centre, 0.25", marks=CONFOUNDED),
+    ],
+)
+def test_the_sampling_of_a_known_target_is_recovered(busy_mug: Object3D, truth: SamplingModel) -> None:
+    calibration = found(busy_mug, KnownTarget(truth), "curve")
+    for member in ("samples", "shade_at", "lod", "filtered", "cull"):
+        assert getattr(calibration.sampling, member) == getattr(truth, member)
+    assert calibration.sampling.bias == pytest.approx(truth.bias, abs=0.1)
+    assert calibration.fidelity.mean()["explained"] > 0.98
+    assert calibration.fidelity.mean()["slope"] == pytest.approx(1, abs=0.03)
+    assert calibration.fidelity.mean()["correlation"] > 0.98
+
+
+def test_two_probes_a_view_are_taken_where_they_are_good_enough(mug: Object3D) -> None:
+    asked = Asked(KnownTarget(SamplingModel()))
+    calibration = found(mug, asked, "auto")
+    assert (calibration.model, calibration.greys) == ("calibrated", CALIBRATED_GREYS)
+    assert calibration.probes.shape == (2, len(VIEWS), *SIZE, 3)
+    assert calibration.fidelity.good_enough
+    assert "good enough" in calibration.reason
+    assert calibration.renders == asked.images - len(VIEWS)
+    assert calibration.renders < found(mug, KnownTarget(SamplingModel()), "curve").renders
+
+
+def test_no_probe_is_taken_where_the_diffuse_model_is_good_enough(mug: Object3D) -> None:
+    asked = Asked(KnownTarget(SamplingModel(), affine=False))
+    calibration = found(mug, asked, "auto")
+    assert (calibration.model, calibration.greys, len(calibration.probes)) == ("diffuse", (), 0)
+    assert "good enough without probes" in calibration.reason
+    assert asked.greys == set()
+    assert calibration.renders == asked.images - len(VIEWS) < len(VIEWS)
+
+
+@pytest.mark.parametrize("wanted", ["diffuse", "calibrated", "curve"])
+def test_the_model_that_was_asked_for_is_taken_whatever_it_is_worth(mug: Object3D, wanted: SurrogateModel) -> None:
+    asked = Asked(KnownTarget(SamplingModel(), affine=wanted == "diffuse"))
+    calibration = found(mug, asked, wanted)
+    assert (calibration.model, calibration.reason) == (wanted, "asked for")
+    greys = {"diffuse": (), "calibrated": CALIBRATED_GREYS, "curve": CURVE_GREYS}[wanted]
+    assert calibration.greys == greys
+    assert set(greys) <= asked.greys
+    assert wanted != "diffuse" or asked.greys == set()
+    assert calibration.renders == asked.images - len(VIEWS)
+    assert calibration.probes.shape == (len(greys), len(VIEWS), *SIZE, 3)
+
+
+def test_the_probes_are_the_targets_own_images_in_the_order_of_greys_and_views(mug: Object3D) -> None:
+    ask = KnownTarget(SamplingModel())
+    calibration = found(mug, ask, "curve")
+    for grey, probe in zip(calibration.greys, calibration.probes, strict=True):
+        assert (probe == ask(painted_grey(mug, grey), VIEWS)).all()
+
+
+@pytest.mark.parametrize("views", [VIEWS[:1], VIEWS[:2]], ids=["one view", "two views"])
+def test_a_few_views_are_enough(mug: Object3D, views: list[View]) -> None:
+    asked = Asked(KnownTarget(SamplingModel()))
+    calibration = found(mug, asked, "curve", views=views)
+    assert calibration.renders == asked.images - len(views)
+    assert len(calibration.fidelity.error) <= len(views)
+    assert calibration.fidelity.good_enough
+
+
+def test_the_same_generator_gives_the_same_calibration(mug: Object3D) -> None:
+    ask = KnownTarget(SamplingModel())
+    first, second = found(mug, ask, "calibrated"), found(mug, ask, "calibrated")
+    assert first.fidelity == second.fidelity
+    assert (first.probes == second.probes).all()
+
+
+def test_a_target_that_lies_is_found_out(mug: Object3D) -> None:
+    honest, random = KnownTarget(SamplingModel()), np.random.default_rng(0)
+
+    def lying(obj: Object3D, views: Sequence[View]) -> Image8:
+        images = honest(obj, views).astype(int)
+        return np.clip(images + random.normal(0, 20, images.shape), 0, 255).astype(np.uint8)
+
+    for wanted in ("diffuse", "calibrated", "curve", "auto"):
+        calibration = found(mug, lying, wanted)
+        assert not calibration.fidelity.good_enough
+        assert calibration.fidelity.mean()["explained"] < MIN_EXPLAINED
+
+
+def test_a_target_that_shows_another_object_is_found_out(mug: Object3D) -> None:
+    honest = KnownTarget(SamplingModel())
+    calibration = found(mug, lambda obj, views: honest(obj, views)[:, ::-1].copy(), "auto")
+    assert not calibration.fidelity.good_enough
+    assert calibration.model == "curve"
+
+
+def test_a_surrogate_is_built_again_from_what_was_found(mug: Object3D) -> None:
+    ask = KnownTarget(SamplingModel())
+    clean = ask(mug, VIEWS)
+    for wanted in ("diffuse", "calibrated", "curve"):
+        surrogate = build_surrogate(found(mug, ask, wanted), mug, VIEWS, clean)
+        assert (surrogate.model, surrogate.n_views) == (wanted, len(VIEWS))
+    assert (images_of(surrogate, mug) == clean).all()
+
+
+def test_a_real_target_is_understood(mug: Object3D, target: SailenvTarget) -> None:
+    asked = Asked(lambda obj, views: target.render(obj, views, size=SIZE))
+    calibration = found(mug, asked, "auto")
+    mean = calibration.fidelity.mean()
+    assert calibration.renders == asked.images - len(VIEWS)
+    assert calibration.model in {"calibrated", "curve"}
+    assert mean["error"] <= MAX_ERROR
+    assert mean["explained"] >= MIN_EXPLAINED
+    assert mean["slope"] == pytest.approx(1, abs=0.1)
+    assert calibration.fidelity.good_enough
+
+
+def test_painting_grey_or_noise_keeps_the_object(mug: Object3D) -> None:
+    grey, noise = painted_grey(mug, 77), painted_noise(mug, np.random.default_rng(3))
+    for painted in (grey, noise):
+        assert painted.parts == mug.parts
+        assert set(painted.textures) == set(mug.textures)
+    assert all((texture == 77).all() for texture in grey.textures.values())
+    for name, texture in noise.textures.items():
+        change = texture.astype(int) - mug.textures[name]
+        free = (mug.textures[name] >= 26) & (mug.textures[name] <= 229)
+        assert set(np.unique(change[free])) == {-26, 26}
+        assert np.abs(change).max() == 26
+
+
+def test_another_generator_paints_other_noise(mug: Object3D) -> None:
+    one, same, other = (painted_noise(mug, np.random.default_rng(seed)).to_zip() for seed in (0, 0, 1))
+    assert one == same != other
+
+
+@pytest.mark.xfail(strict=True, reason="the diffuse surrogate shows the views' uniform background, not the target's")
+def test_a_photograph_behind_the_object_is_behind_every_surrogate(mug: Object3D) -> None:
+    ask = KnownTarget(SamplingModel())
+    photo = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
+    outside = (ask(painted_grey(mug, 0), VIEWS) == 255).all(axis=-1, keepdims=True)
+
+    clean = np.where(outside, photo, ask(mug, VIEWS))
+    black = [View(view.camera, view.light, (0, 0, 0)) for view in VIEWS]
+    calibration = calibrate(mug, VIEWS, clean, ask, wanted="diffuse", generator=np.random.default_rng(0))
+    images = images_of(build_surrogate(calibration, mug, black, clean, backdrop=photo), mug)
+    corner = np.s_[:, :4, :4]
+    assert outside[corner].all()
+    assert (images[corner] == photo[:4, :4]).all()

@@ -1,0 +1,374 @@
+"""The object format: what is read, what comes back unchanged, and what is refused with a word that helps."""
+
+import io
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from trompe_shared.errors import ObjectError
+from trompe_shared.object3d import Object3D, decode_rgb, encode_png, load_object, object_from_files, pack_zip
+from trompe_shared.wavefront import parse_mtl, parse_obj
+
+MESH = """# a triangle
+mtllib thing.mtl
+v 0 0 0
+v 1 0 0
+v 0 1 0
+vt 0 0
+vt 1 0
+vt 0 1
+usemtl paint
+f 1/1 2/2 3/3
+"""
+TABLE = b'{"paint": {"albedo": "paint.png", "normal": null, "metallic": ""}}'
+PAINT = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+FILES: dict[str, bytes] = {
+    "thing.obj": MESH.encode(),
+    "thing_mat_def.json": TABLE,
+    "paint.png": encode_png(PAINT),
+    "readme.txt": b"\x00 kept as it is \xff",
+}
+
+
+def with_files(**changes: bytes | None) -> dict[str, bytes]:
+    """The files of a good object, some replaced or taken away; ``__`` stands for a dot."""
+    changed = {name.replace("__", "."): data for name, data in changes.items()}
+    return {name: data for name, data in {**FILES, **changed}.items() if data is not None}
+
+
+def zipped(files: Mapping[str, bytes], *, method: int = zipfile.ZIP_DEFLATED) -> bytes:
+    """A zip as other programs make it."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
+
+
+def refusal(source: bytes | Path | Mapping[str, bytes]) -> str:
+    """The message with which an object is refused."""
+    with pytest.raises(ObjectError) as raised:
+        object_from_files(source) if isinstance(source, Mapping) else load_object(source)
+    return str(raised.value)
+
+
+def only_part(mesh: str) -> tuple[np.ndarray, np.ndarray]:
+    """(corner positions, corner normals), each (F, 3, 3), of a mesh of one material."""
+    (part,) = parse_obj(mesh, "thing.obj")
+    return part.vertices[part.faces], part.normals[part.faces]
+
+
+# What is read
+
+
+def test_an_object_is_read_whole() -> None:
+    obj = load_object(zipped(FILES))
+    assert (obj.name, list(obj.files), list(obj.materials)) == ("thing", list(FILES), ["paint"])
+    assert (obj.materials["paint"].normal, obj.materials["paint"].metallic) == (None, None)
+    assert obj.albedo_of(obj.parts[0]) == "paint.png"
+    assert (obj.textures["paint.png"] == PAINT).all()
+    assert obj.textures["paint.png"].dtype == np.uint8
+    assert (obj.n_texels, obj.radius) == (24, 1.0)
+
+
+def test_a_zip_a_folder_and_the_obj_itself_are_the_same_object(tmp_path: Path) -> None:
+    folder = tmp_path / "thing"
+    folder.mkdir()
+    (folder / "subfolder").mkdir()
+    for name, data in FILES.items():
+        (folder / name).write_bytes(data)
+    archive = tmp_path / "other-name.zip"
+    archive.write_bytes(zipped(FILES))
+    in_a_folder = zipped({f"things/my thing/{name}": data for name, data in FILES.items()})
+    littered = zipped(FILES | {"__MACOSX/._thing.obj": b"finder", "empty/": b""})
+    sources: list[bytes | str | Path] = [folder, str(folder), folder / "thing.obj", archive, in_a_folder, littered]
+    assert {(obj.name, frozenset(obj.files.items())) for obj in map(load_object, sources)} == {
+        ("thing", frozenset(FILES.items()))
+    }
+
+
+def test_an_mtl_will_do_where_there_is_no_material_definition() -> None:
+    mtl = (
+        "# blender\nnewmtl other\nmap_Kd other.png\nnewmtl paint\nKd 1 1 1\n"
+        "map_Kd C:\\my textures\\paint.png\nbump -bm 1.0 ../maps/bumps.png\n"
+    )
+    obj = object_from_files(
+        with_files(thing_mat_def__json=None, thing__mtl=mtl.encode(), bumps__png=FILES["paint.png"])
+    )
+    assert (obj.materials["paint"].albedo, obj.materials["paint"].normal) == ("paint.png", "bumps.png")
+    assert list(obj.materials) == ["paint"]
+    assert parse_mtl(mtl)["other"] == {"albedo": "other.png"}
+
+
+def test_several_materials_become_parts_in_the_order_of_their_first_use() -> None:
+    mesh = MESH + "usemtl glaze\nf 1/1 2/2 3/3\nusemtl paint\nf 3/3 2/2 1/1\n"
+    table = {"glaze": {"albedo": "folder/glaze.png"}, "paint": {"albedo": "paint.png"}, "unused": {"albedo": "no.png"}}
+    obj = object_from_files(
+        with_files(
+            thing__obj=mesh.encode(),
+            thing_mat_def__json=json.dumps(table).encode(),
+            glaze__png=encode_png(np.zeros((2, 2, 3), np.uint8)),
+        )
+    )
+    assert [(part.material, len(part.faces)) for part in obj.parts] == [("paint", 2), ("glaze", 1)]
+    assert {name: image.shape for name, image in obj.textures.items()} == {
+        "paint.png": (4, 6, 3),
+        "glaze.png": (2, 2, 3),
+    }
+    assert obj.n_texels == 28
+
+
+def test_polygons_are_split_into_fans() -> None:
+    mesh = MESH + "v 1 1 0\nvt 1 1\nv -1 0 0\nf 1/1 2/2 4/4 3/3 5/3\n"
+    corners, _ = only_part(mesh)
+    fan = [[(0, 0), (1, 0), (1, 1)], [(0, 0), (1, 1), (0, 1)], [(0, 0), (0, 1), (-1, 0)]]
+    assert corners[1:, :, :2].tolist() == np.array(fan, float).tolist()
+
+
+def test_negative_indices_count_from_the_last_statement() -> None:
+    relative = MESH.replace("f 1/1 2/2 3/3", "f -3/-3 -2/-2 -1/-1")
+    mesh = relative + "v 5 5 5\nvt 1 1\nf -1/-1 -2/2 -3/-4\n"
+    corners, _ = only_part(mesh)
+    assert (corners[0] == only_part(MESH)[0][0]).all()
+    assert corners[1].tolist() == [[5, 5, 5], [0, 1, 0], [1, 0, 0]]
+
+
+def test_given_normals_are_made_unit_and_missing_ones_computed() -> None:
+    given = MESH.replace("f 1/1 2/2 3/3", "vn 0 3 4\nvn 0 0 0\nf 1/1/1 2/2/1 3/3/2")
+    normals = only_part(given)[1][0]
+    np.testing.assert_allclose(normals, np.array([[0, 0.6, 0.8], [0, 0.6, 0.8], [0, 0, 1]]), atol=1e-6)
+    assert (only_part(MESH)[1] == [0, 0, 1]).all()
+
+
+def test_computed_normals_are_smooth_across_a_shared_edge() -> None:
+    roof = "v 0 0 0\nv 0 0 1\nv 1 1 0\nv -1 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 2/1 1/1 4/1\n"
+    corners, normals = only_part(roof)
+    on_the_edge = (corners[..., 0] == 0).all(axis=1, keepdims=True) | (corners[..., :2] == 0).all(axis=2)
+    np.testing.assert_allclose(np.abs(normals[on_the_edge]), np.tile([0, 1, 0], (4, 1)), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=2), 1, atol=1e-6)
+
+
+def test_a_triangle_without_area_still_has_unit_normals() -> None:
+    _, normals = only_part(MESH.replace("v 0 1 0", "v 2 0 0"))
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=2), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "P", "RGBA", "1"])
+def test_images_of_every_mode_are_read_as_rgb(mode: str) -> None:
+    decoded = decode_rgb(encode_png(Image.fromarray(PAINT).convert(mode)), "paint.png")
+    assert decoded.shape == (4, 6, 3)
+    assert decoded.dtype == np.uint8
+
+
+# What comes back
+
+
+def test_every_file_comes_back_byte_for_byte() -> None:
+    again = load_object(load_object(zipped(FILES)).to_zip())
+    assert dict(again.files) == FILES
+
+
+def test_the_same_content_gives_the_same_bytes() -> None:
+    one, other = load_object(zipped(FILES)), load_object(zipped(FILES, method=zipfile.ZIP_STORED))
+    assert one.to_zip() == other.to_zip() == pack_zip(FILES)
+
+
+@given(st.dictionaries(st.text("abc.é_-", min_size=1, max_size=8), st.binary(max_size=200), max_size=5))
+@settings(max_examples=30)
+def test_a_packed_zip_holds_what_was_put_in(files: dict[str, bytes]) -> None:
+    with zipfile.ZipFile(io.BytesIO(pack_zip(files))) as archive:
+        assert {name: archive.read(name) for name in archive.namelist()} == files
+        assert archive.namelist() == list(files)
+
+
+def test_a_repainted_object_differs_in_its_albedo_file_alone() -> None:
+    obj, other = load_object(zipped(FILES)), 255 - PAINT
+    painted = obj.with_textures({"paint.png": other})
+    again = load_object(painted.to_zip())
+    assert (painted.textures["paint.png"] == other).all()
+    assert (again.textures["paint.png"] == other).all()
+    assert {name for name in FILES if again.files[name] != FILES[name]} == {"paint.png"}
+    assert (obj.textures["paint.png"] == PAINT).all()
+
+
+def with_alpha(mode: str) -> tuple[Object3D, np.ndarray]:
+    alpha = np.arange(24, dtype=np.uint8).reshape(4, 6) * 10
+    picture = Image.fromarray(PAINT)
+    picture.putalpha(Image.fromarray(alpha))
+    return object_from_files(with_files(paint__png=encode_png(picture.convert(mode)))), alpha
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA"])
+def test_a_repainted_texture_keeps_its_opacity(mode: str) -> None:
+    obj, alpha = with_alpha(mode)
+    painted = obj.with_textures({"paint.png": 255 - PAINT})
+    with Image.open(io.BytesIO(painted.files["paint.png"])) as image:
+        assert (np.array(image.getchannel("A")) == alpha).all()
+        assert (np.array(image.convert("RGB")) == 255 - PAINT).all()
+
+
+def test_a_texture_may_be_replaced_by_one_of_another_size() -> None:
+    obj, _ = with_alpha("RGBA")
+    painted = obj.with_textures({"paint.png": np.full((1, 1, 3), 7, np.uint8)})
+    assert load_object(painted.to_zip()).textures["paint.png"].tolist() == [[[7, 7, 7]]]
+
+
+def test_a_name_that_is_no_albedo_texture_cannot_be_painted() -> None:
+    with pytest.raises(ObjectError, match=r"readme\.txt.*paint\.png"):
+        load_object(zipped(FILES)).with_textures({"readme.txt": PAINT})
+
+
+# What is refused
+
+
+def faulty_mesh(line: str) -> dict[str, bytes]:
+    return with_files(thing__obj=(MESH + line + "\n").encode())
+
+
+REFUSED = {
+    "no mesh": (with_files(thing__obj=None), ["exactly one .obj", "readme.txt"]),
+    "nothing at all": ({}, ["exactly one .obj"]),
+    "two meshes": (with_files(other__obj=b""), ["exactly one .obj", "other.obj", "thing.obj"]),
+    "an empty mesh": (with_files(thing__obj=b""), ["thing.obj", "no faces"]),
+    "points without faces": (with_files(thing__obj=b"v 0 0 0\n"), ["thing.obj", "no faces"]),
+    "a missing texture": (with_files(paint__png=None), ["paint.png", "add the file"]),
+    "an empty texture": (with_files(paint__png=b""), ["paint.png", "PNG"]),
+    "a texture that is text": (with_files(paint__png=b"hello"), ["paint.png", "PNG"]),
+    "half a texture": (with_files(paint__png=FILES["paint.png"][:-30]), ["paint.png", "PNG"]),
+    "an undefined material": (with_files(thing_mat_def__json=b"{}"), ["'paint'", "thing_mat_def.json", "none"]),
+    "no materials": (with_files(thing_mat_def__json=None), ["'paint'", ".mtl", "none"]),
+    "an mtl without a map": (with_files(thing_mat_def__json=None, a__mtl=b"newmtl paint\nKd 1 1 1"), ["'paint'"]),
+    "a table cut short": (with_files(thing_mat_def__json=TABLE[:-1]), ["thing_mat_def.json", '"albedo"']),
+    "a table that is a list": (with_files(thing_mat_def__json=b"[1]"), ["thing_mat_def.json", '"albedo"']),
+    "a material that is a text": (with_files(thing_mat_def__json=b'{"paint": "x"}'), ["thing_mat_def.json", "albedo"]),
+    "a material without albedo": (with_files(thing_mat_def__json=b'{"paint": {}}'), ["albedo"]),
+    "an albedo that is a number": (with_files(thing_mat_def__json=b'{"paint": {"albedo": 3}}'), ["albedo"]),
+    "a table that is no text": (with_files(thing_mat_def__json=b"\xff\xfe\x00"), ["thing_mat_def.json"]),
+    "a table nested too deep": (with_files(thing_mat_def__json=b"[" * 100_000), ["thing_mat_def.json"]),
+    "faces without uvs": (with_files(thing__obj=MESH.replace("1/1 2/2 3/3", "1 2 3").encode()), ["vt", "unwrap"]),
+    "one corner without uv": (faulty_mesh("f 1/1 2/2 3"), ["vt", "unwrap", "'paint'"]),
+    "an index too large": (faulty_mesh("f 1/1 2/2 4/3"), ["thing.obj, line 11", "v 4", "3 are defined"]),
+    "a uv index too large": (faulty_mesh("f 1/1 2/2 3/9"), ["line 11", "vt 9"]),
+    "an index too far back": (faulty_mesh("f 1/1 2/2 -4/3"), ["line 11", "v -4"]),
+    "index zero": (faulty_mesh("f 0/1 2/2 3/3"), ["line 11", "v 0"]),
+    "an index that is no number": (faulty_mesh("f 1/1 2/2 x/3"), ["line 11", "'f 1/1 2/2 x/3'"]),
+    "a face of two corners": (faulty_mesh("f 1/1 2/2"), ["line 11", "three corners"]),
+    "a vertex of two numbers": (faulty_mesh("v 1 2"), ["line 11", "expected 3"]),
+    "a vertex of words": (faulty_mesh("v a b c"), ["line 11"]),
+    "a vertex that is not a number": (faulty_mesh("v nan 0 0"), ["thing.obj", "'v'", "not finite"]),
+    "an infinite uv": (faulty_mesh("vt 0 inf"), ["thing.obj", "'vt'", "not finite"]),
+    "a vertex beyond single precision": (faulty_mesh("v 1e50 0 0"), ["thing.obj", "'v'", "not finite"]),
+}
+
+
+@pytest.mark.parametrize(("files", "words"), REFUSED.values(), ids=REFUSED)
+def test_what_does_not_hold_together_is_refused_with_the_place_and_the_remedy(
+    files: dict[str, bytes], words: list[str]
+) -> None:
+    message = refusal(files)
+    assert [word for word in words if word not in message] == []
+
+
+def encrypted() -> bytes:
+    """A zip whose members say that they are encrypted."""
+    data = bytearray(zipped(FILES))
+    for signature, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        place = data.find(signature)
+        while place >= 0:
+            data[place + flags] |= 1
+            place = data.find(signature, place + 4)
+    return bytes(data)
+
+
+def scrambled() -> bytes:
+    """A zip with other bytes in the middle of a deflated member."""
+    files = {"thing.obj": bytes(np.random.default_rng(0).integers(0, 40, 5000, dtype=np.uint8))}
+    data = bytearray(zipped(files))
+    data[300:600] = b"\xff" * 300
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("archive", "words"),
+    [
+        pytest.param(b"", ["not a zip", "Zip the folder"], id="nothing"),
+        pytest.param(MESH.encode(), ["not a zip", "Zip the folder"], id="an obj"),
+        pytest.param(zipped(FILES)[:-40], ["not a zip", "Zip the folder"], id="cut short"),
+        pytest.param(encrypted(), ["damaged or encrypted", "Zip the folder"], id="encrypted"),
+        pytest.param(scrambled(), ["damaged or encrypted", "Zip the folder"], id="scrambled"),
+        pytest.param(zipped({f"../{n}": d for n, d in FILES.items()}), ["flat"], id="path traversal"),
+        pytest.param(zipped({f"/etc/{n}": d for n, d in FILES.items()}), ["flat"], id="absolute path"),
+        pytest.param(zipped(FILES | {"more/x.png": b""}), ["flat", "one folder"], id="two folders"),
+        pytest.param(zipped({f"{k}.txt": b"" for k in range(300)}), ["300 files", "256"], id="too many files"),
+    ],
+)
+def test_archives_that_cannot_be_trusted_are_refused(archive: bytes, words: list[str]) -> None:
+    message = refusal(archive)
+    assert [word for word in words if word not in message] == []
+
+
+def test_a_zip_bomb_is_refused_unread() -> None:
+    data = bytearray(zipped({"thing.obj": bytes(1000)}))
+    place = data.find(b"PK\x01\x02")
+    data[place + 24 : place + 28] = struct.pack("<I", 2**31)
+    assert "512 MiB" in refusal(bytes(data))
+
+
+def test_a_path_that_leads_nowhere_is_named(tmp_path: Path) -> None:
+    assert "nowhere.zip" in refusal(tmp_path / "nowhere.zip")
+    assert "exactly one .obj" in refusal(tmp_path)
+
+
+def png_of_size(width: int, height: int) -> bytes:
+    """A PNG that claims a size and holds no pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("side", [8193, 12_000, 30_000], ids=["a little", "much", "absurdly"])
+def test_an_image_that_is_too_large_is_refused_undecoded(side: int) -> None:
+    message = refusal(with_files(paint__png=png_of_size(side, side)))
+    assert "paint.png" in message
+    assert "8192" in message
+
+
+def test_an_image_without_pixels_is_refused() -> None:
+    assert "paint.png" in refusal(with_files(paint__png=png_of_size(0, 0)))
+
+
+@given(place=st.integers(0, len(FILES["paint.png"]) - 1), value=st.integers(0, 255))
+@settings(max_examples=400, deadline=None)
+def test_a_texture_with_any_byte_changed_is_read_or_refused(place: int, value: int) -> None:
+    data = bytearray(FILES["paint.png"])
+    data[place] = value
+    try:
+        assert decode_rgb(bytes(data), "paint.png").shape[2] == 3
+    except ObjectError as error:
+        assert "paint.png" in str(error)  # noqa: PT017
+
+
+ARCHIVE = zipped(FILES)
+
+
+@given(place=st.integers(0, len(ARCHIVE) - 1), value=st.integers(0, 255))
+@settings(max_examples=400, deadline=None)
+def test_an_archive_with_any_byte_changed_is_read_or_refused(place: int, value: int) -> None:
+    data = bytearray(ARCHIVE)
+    data[place] = value
+    try:
+        assert load_object(bytes(data)).parts
+    except ObjectError as error:
+        assert str(error)  # noqa: PT017
