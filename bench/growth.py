@@ -10,7 +10,7 @@ import argparse
 import csv
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import TypeVar
@@ -18,6 +18,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from bench._common import BenchObject, bench_objects, machine, markdown_table, painted_at_random
 from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
@@ -109,17 +110,18 @@ def cost(entry: BenchObject, case: Case, rounds: int) -> Cost:
     clean, probes = painted_at_random(len(views), size, CURVE_GREYS, np.random.default_rng(0))
     nothing = Fidelity((), (), (), ())
     calibration = Calibration("curve", "for time alone", SamplingModel(), CURVE_GREYS, probes, nothing, 0)
+    textures = textures_of(case.obj)
     preparing, stepping = [], []
     for _ in range(rounds):
         seconds, surrogate = timed(lambda: build_surrogate(calibration, case.obj, views, clean))
         preparing.append(seconds)
-        stepping += [timed(lambda: step(surrogate, case.obj))[0] for _ in range(2)]  # noqa: B023
+        stepping += [timed(lambda: step(surrogate, textures))[0] for _ in range(2)]  # noqa: B023
     return Cost(case.axis, case.size, min(preparing), 1000 * min(stepping), surrogate.geometry.nbytes / 2**20)
 
 
-def step(surrogate: Surrogate, obj: Object3D) -> None:
+def step(surrogate: Surrogate, textures: Mapping[str, Tensor]) -> None:
     """Forward and backward of all views."""
-    leaves = {name: texture.requires_grad_() for name, texture in textures_of(obj).items()}
+    leaves = {name: texture.detach().requires_grad_() for name, texture in textures.items()}
     texels = surrogate.texels(leaves)
     collected = texels.detach().requires_grad_()
     for first in range(0, surrogate.n_views, BATCH):

@@ -9,7 +9,7 @@ MobileNetV2 from TROMPE_ASSETS/classifiers, or the shipped one; PyTorch3D is com
 import argparse
 import importlib.util
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -51,12 +51,13 @@ class Work:
     obj: Object3D
     views: Sequence[View]
     surrogate: Surrogate
+    textures: Mapping[str, Float[Tensor, "H W 3"]]
     gradient: Float[Tensor, "batch 3 H W"]
     """Arrives at every batch of images in the backward pass; channels last, as classifiers give it."""
 
     def forward_backward(self) -> None:
         """One step's work of the surrogate: textures to images of all views, and back."""
-        leaves = {name: t.requires_grad_() for name, t in textures_of(self.obj).items()}
+        leaves = {name: texture.detach().requires_grad_() for name, texture in self.textures.items()}
         texels = self.surrogate.texels(leaves)
         collected = texels.detach().requires_grad_()
         for batch in _batches(self.surrogate.n_views):
@@ -78,7 +79,8 @@ def work_of(entry: BenchObject, obj: Object3D, name: str, size: tuple[int, int],
     calibration = Calibration("curve", "for time alone", SamplingModel(), CURVE_GREYS, probes, nothing, 0)
     surrogate = build_surrogate(calibration, obj, views, clean)
     gradient = torch.randn(BATCH, 3, *size, generator=torch.Generator().manual_seed(0))
-    return Work(name, obj, views, surrogate, gradient.contiguous(memory_format=torch.channels_last))
+    gradient = gradient.contiguous(memory_format=torch.channels_last)
+    return Work(name, obj, views, surrogate, textures_of(obj), gradient)
 
 
 @dataclass
@@ -106,7 +108,7 @@ class Inside:
 
 def outside_share(work: Work, classifier: WhiteBoxClassifier, shares: list[float]) -> Callable[[], None]:
     """A contender that takes one attack step and appends the share of it that was not the classifier's."""
-    textures, budget, inside = textures_of(work.obj), Budget(0.05, 0.01), Inside(classifier)
+    textures, budget, inside = work.textures, Budget(0.05, 0.01), Inside(classifier)
     texels, state = movable(work.surrogate, budget), start(textures)
 
     def step() -> None:
@@ -192,21 +194,10 @@ def preparation(entries: Sequence[BenchObject], size: tuple[int, int], n_views: 
     return markdown_table(header, rows)
 
 
-def main() -> None:
-    """The command."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--objects", nargs="+", default=[], metavar="NAME", help="default: candle toilet")
-    parser.add_argument("--size", type=int, default=224, help="side of the images, pixels")
-    parser.add_argument("--views", type=int, default=60, help="how many of the 60 views")
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--pytorch3d", action="store_true", help="compare with PyTorch3D (slow), where installed")
-    options = parser.parse_args()
-    size = (options.size, options.size)
-    entries = bench_objects(options.objects or (["candle", "toilet"] if assets() else ["mug", "chair"]))
-    print(f"{machine()}; {options.views} views at {options.size}x{options.size}, {options.rounds} rounds\n")
-    print(preparation(entries, size, options.views, min(options.rounds, 3)) + "\n", flush=True)
+def compare(entries: Sequence[BenchObject], size: tuple[int, int], n_views: int, rounds: int, peer: bool) -> None:
+    """Everything in the same rounds: surrogate, classifier, attack step, and PyTorch3D if wanted."""
     works = [
-        work_of(entry, obj, f"{entry.name} {name}", size, options.views)
+        work_of(entry, obj, f"{entry.name} {name}", size, n_views)
         for entry in entries
         for name, obj in ((f"{SMALL} texture", rescaled(entry.obj, SMALL)), ("full texture", entry.obj))
     ]
@@ -217,24 +208,16 @@ def main() -> None:
     for work in works:
         if work.name in shares:
             contenders[f"step {work.name}"] = outside_share(work, classifier, shares[work.name])
-    contenders |= peers(works, size) if options.pytorch3d else {}
-    times = in_rounds(contenders, options.rounds)
+    contenders |= peers(works, size) if peer else {}
+    times = in_rounds(contenders, rounds)
     print(speed(works, times) + "\n")
     print(f"{classifier.name}, forward + input gradient, ms per image: {times['classifier'].per(BATCH)}\n")
-    print(
-        markdown_table(
-            ["attack step", "ms per view (median / least)", "share outside the classifier, median", "wanted"],
-            [
-                [
-                    name,
-                    times[f"step {name}"].per(options.views),
-                    f"{np.median(share[1:]):.1%}",
-                    f"<= {WANTED_SHARE:.0%}",
-                ]
-                for name, share in shares.items()
-            ],
-        )
-    )
+    rows = [
+        [name, times[f"step {name}"].per(n_views), f"{np.median(share[1:]):.1%}", f"<= {WANTED_SHARE:.0%}"]
+        for name, share in shares.items()
+    ]
+    header = ["attack step", "ms per view (median / least)", "share outside the classifier, median", "wanted"]
+    print(markdown_table(header, rows))
 
 
 def peers(works: Sequence[Work], size: tuple[int, int]) -> dict[str, Callable[[], object]]:
@@ -262,6 +245,22 @@ def same_silhouette(surrogate: Surrogate, views: Sequence[int], alpha: Float[Ten
         row[surrogate.geometry.views[view].pixel] = True
     theirs = alpha.flatten(1) > 0
     return float((own & theirs).sum() / (own | theirs).sum())
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--objects", nargs="+", default=[], metavar="NAME", help="default: candle toilet")
+    parser.add_argument("--size", type=int, default=224, help="side of the images, pixels")
+    parser.add_argument("--views", type=int, default=60, help="how many of the 60 views")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--pytorch3d", action="store_true", help="compare with PyTorch3D (slow), where installed")
+    options = parser.parse_args()
+    size = (options.size, options.size)
+    entries = bench_objects(options.objects or (["candle", "toilet"] if assets() else ["mug", "chair"]))
+    print(f"{machine()}; {options.views} views at {options.size}x{options.size}, {options.rounds} rounds\n")
+    print(preparation(entries, size, options.views, min(options.rounds, 3)) + "\n", flush=True)
+    compare(entries, size, options.views, options.rounds, options.pytorch3d)
 
 
 if __name__ == "__main__":

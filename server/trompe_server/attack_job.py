@@ -74,14 +74,14 @@ class AttackJob:
 
     def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
         """See ``Pipeline.run``."""
-        started = time.perf_counter()
         kind, _, number = phase.partition("-")
+        self._running = kind, time.perf_counter()
         if kind == "attack":
             report = self._attack(int(number), on_progress)
         else:
             work = {"prepare": self._prepare, "calibrate": self._calibrate, "judge": self._judge}[kind]
             report = work(on_progress)
-        self._note_seconds(phase, time.perf_counter() - started)
+        self._note_seconds(phase, time.perf_counter() - self._running[1])
         return report
 
     def _prepare(self, on_progress: OnProgress) -> PhaseReport:
@@ -152,6 +152,7 @@ class AttackJob:
             scene.label,
             budget=self.budget,
             steps=steps,
+            total_steps=self.spec.steps,
             masks=masks,
             texels=self._movable,
             on_step=on_step,
@@ -235,18 +236,19 @@ class AttackJob:
         self.artifacts.write(f"seconds-{phase}.json", json.dumps(seconds).encode())
 
     def _seconds(self) -> dict[str, float]:
-        """Seconds of the phases that are done, those of all attack phases together."""
+        """Seconds of the phases that are done, those of all attack phases together, and of the one that runs."""
         seconds: dict[str, float] = {}
         for phase in self.phases():
             if self.artifacts.exists(f"seconds-{phase}.json"):
                 kind = phase.partition("-")[0]
                 seconds[kind] = seconds.get(kind, 0.0) + json.loads(self.artifacts.read(f"seconds-{phase}.json"))
-        return seconds
+        kind, started = self._running
+        return seconds | {kind: time.perf_counter() - started}
 
 
 def _state(chunk: int) -> str:
-    """Name of the checkpoint after ``chunk`` chunks."""
-    return f"state-{chunk:03d}.npz"
+    """Name of the checkpoint after ``chunk`` chunks. Two take turns: the one a chunk starts from outlives it."""
+    return f"state-{chunk % 2}.npz"
 
 
 def _progress(phase: str, share: float) -> Progress:

@@ -93,7 +93,7 @@ class Object3D:
     def _repaint(self, name: str, image: Texture) -> bytes:
         """PNG bytes of ``image``, carrying over the alpha channel (opacity) of the file it replaces."""
         with Image.open(io.BytesIO(self.files[name])) as before:
-            alpha = before.getchannel("A") if before.mode in {"RGBA", "LA"} else None
+            alpha = before.convert("RGBA").getchannel("A") if before.has_transparency_data else None
         picture = Image.fromarray(image)
         if alpha is not None and alpha.size == picture.size:
             picture.putalpha(alpha)

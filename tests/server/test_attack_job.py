@@ -268,7 +268,7 @@ def test_the_threshold_stops_the_gradient_of_the_pixels_below_it(library: Librar
         steps=2,
         masks=masks,
     )
-    done = load_state(artifacts.read("state-001.npz"))
+    done = load_state(artifacts.read("state-1.npz"))
     assert done.step == 2
     for name, delta in expected.deltas.items():
         assert torch.equal(done.deltas[name], delta)

@@ -25,15 +25,19 @@ __all__ = ["BATCH", "AttackState", "Step", "attack", "load_state", "movable", "s
 BATCH = 10
 """Views per forward and backward pass: the fastest on CPUs (larger ones miss the caches)."""
 
+MOMENTUM = 0.9
+
 Textures = Mapping[str, Float[Tensor, "H W 3"]]
 
 
 @dataclass(frozen=True)
 class AttackState:
-    """The change of each texture after ``step`` steps, sRGB in [0, 1] units: all that a step starts from."""
+    """All that a step starts from: the change of each texture after ``step`` steps (sRGB in [0, 1] units), and the
+    running mean of its gradients, each of norm 1."""
 
     step: int
     deltas: Textures
+    momenta: Textures
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,8 @@ class Step:
 
 def start(textures: Textures) -> AttackState:
     """No change at all."""
-    return AttackState(0, {name: torch.zeros_like(texture) for name, texture in textures.items()})
+    nothing = {name: torch.zeros_like(texture) for name, texture in textures.items()}
+    return AttackState(0, nothing, nothing)
 
 
 def movable(
@@ -73,25 +78,36 @@ def attack(
     *,
     budget: Budget,
     steps: int,
+    total_steps: int | None = None,
     masks: Bool[Tensor, "views H W"] | None = None,
     texels: Mapping[str, Bool[Tensor, "H W"]] | None = None,
     on_step: Callable[[Step], None] = lambda _: None,
 ) -> AttackState:
     """``steps`` more steps of projected sign-gradient ascent on the expected margin over the surrogate's views.
 
-    ``textures`` are sRGB in [0, 1]; ``masks`` (saliency) let only those pixels' gradients through, and only ``texels``
-    (by default those that are ``movable``) move. Deterministic.
+    Momentum as Dong et al. (2018); the step falls linearly from ``2 alpha`` to 0 over ``total_steps`` (by default those
+    that end with this call), so that ``alpha`` is its mean. ``textures`` are sRGB in [0, 1]; ``masks`` (saliency) let
+    only those pixels' gradients through, and only ``texels`` (by default those ``movable``) move. Deterministic.
     """
+    total = state.step + steps if total_steps is None else total_steps
     allowed = movable(surrogate, budget, masks) if texels is None else texels
-    deltas = dict(state.deltas)
     for step in range(state.step, state.step + steps):
-        gradients, seen = _gradients(deltas, textures, surrogate, classifier, label, masks)
+        gradients, seen = _gradients(state.deltas, textures, surrogate, classifier, label, masks)
         on_step(Step(step, *seen))
-        deltas = {
-            name: budget.ascend(delta, gradients[name] * allowed[name][..., None], textures[name])
-            for name, delta in deltas.items()
+        momenta = _accumulated(state.momenta, gradients)
+        scale = 2 * (total - step - 0.5) / total
+        moved = {
+            name: budget.ascend(delta, momenta[name] * allowed[name][..., None], textures[name], scale=scale)
+            for name, delta in state.deltas.items()
         }
-    return AttackState(state.step + steps, deltas)
+        state = AttackState(step + 1, moved, momenta)
+    return state
+
+
+def _accumulated(momenta: Textures, gradients: Textures) -> Textures:
+    """The running mean of the gradients with one more, scaled to an L1 norm of 1 over all textures."""
+    norm = sum(float(gradient.abs().sum()) for gradient in gradients.values())
+    return {name: MOMENTUM * momenta[name] + gradient / max(norm, 1e-30) for name, gradient in gradients.items()}
 
 
 def _gradients(
@@ -119,8 +135,9 @@ def _gradients(
 
 def save_state(state: AttackState) -> bytes:
     """A state as the bytes of an .npz file; exact."""
-    deltas = {_DELTA + name: delta.cpu().numpy() for name, delta in state.deltas.items()}
-    return pack_arrays({"step": np.array(state.step)} | deltas)
+    tables = {_DELTA: state.deltas, _MOMENTUM: state.momenta}
+    arrays = {prefix + name: table[name].cpu().numpy() for prefix, table in tables.items() for name in table}
+    return pack_arrays({"step": np.array(state.step)} | arrays, compressed=False)
 
 
 def load_state(data: bytes) -> AttackState:
@@ -128,8 +145,13 @@ def load_state(data: bytes) -> AttackState:
     arrays = unpack_arrays(data)
     if "step" not in arrays:
         raise ValueError(f"These arrays are no attack state: there is no 'step' among {sorted(arrays)}.")
-    names = [name for name in arrays if name.startswith(_DELTA)]
-    return AttackState(int(arrays["step"]), {n.removeprefix(_DELTA): torch.from_numpy(arrays[n]) for n in names})
+
+    def table(prefix: str) -> Textures:
+        names = [name for name in arrays if name.startswith(prefix)]
+        return {name.removeprefix(prefix): torch.from_numpy(arrays[name]) for name in names}
+
+    return AttackState(int(arrays["step"]), table(_DELTA), table(_MOMENTUM))
 
 
 _DELTA = "delta:"
+_MOMENTUM = "momentum:"

@@ -34,11 +34,15 @@ class Budget:
         return (texture + delta.clamp(-self.epsilon, self.epsilon)).clamp(0, 1) - texture
 
     def ascend(
-        self, delta: Float[Tensor, "H W 3"], gradient: Float[Tensor, "H W 3"], texture: Float[Tensor, "H W 3"]
+        self,
+        delta: Float[Tensor, "H W 3"],
+        direction: Float[Tensor, "H W 3"],
+        texture: Float[Tensor, "H W 3"],
+        *,
+        scale: float = 1.0,
     ) -> Float[Tensor, "H W 3"]:
-        """One projected step up along the sign of ``gradient``; texels without gradient stay where they are (DESIGN:
-        step 3)."""
-        return self.project(delta + self.alpha * gradient.sign(), texture)
+        """One projected step of ``scale * alpha`` along the sign of ``direction``; texels where it is zero stay."""
+        return self.project(delta + scale * self.alpha * direction.sign(), texture)
 
     def quantise(self, delta: Float[Tensor, "H W 3"], texture: UInt8[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
         """The 8-bit texture that is saved: ``texture + delta`` rounded, never further than epsilon off."""

@@ -152,42 +152,54 @@ def _compare(
 def find_sampling(score: Callable[[SamplingModel], float]) -> SamplingModel:
     """The sampling hypothesis with the highest ``score`` (``Fidelity.score``).
 
-    One member is varied at a time, the most telling first; a change must gain 0.002 to be believed. The bias of the
-    level of detail, the one continuous member, is read off a parabola.
+    One group of members is varied at a time, the most telling first, until a whole round changes nothing; a change
+    must gain 0.002 to be believed. At the end the bias of the level of detail is read off a parabola.
     """
+    known: dict[SamplingModel, float] = {}
+
+    def scored(model: SamplingModel) -> float:
+        if model not in known:
+            known[model] = score(model)
+        return known[model]
+
     best = SamplingModel()
-    reached = score(best)
-    for member, values in ALTERNATIVES:
-        for value in values:
-            trial = best.but(**{member: value})
-            gained = score(trial)
-            if gained > reached + 0.002:
-                best, reached = trial, gained
-    low, high = score(best.but(bias=-BIAS_STEP)), score(best.but(bias=BIAS_STEP))
-    trial = best.but(bias=_vertex(low, reached, high))
-    return trial if score(trial) > max(low, reached, high) + 0.0005 else best
+    for _ in range(MAX_ROUNDS):
+        before = best
+        for group in ALTERNATIVES:
+            leader = max((best.but(**members) for members in group), key=scored)
+            best = leader if scored(leader) > scored(best) + 0.002 else best
+        if best == before:
+            break
+    return _fine_bias(best, scored)
 
 
-ALTERNATIVES: Final[tuple[tuple[str, tuple[object, ...]], ...]] = (
-    ("encoding", ("power",)),
-    ("filtered", ("linear",)),
-    ("samples", ("msaa4-mirrored", "centre")),
-    ("lod", ("area",)),
-    ("mips", ("rounded",)),
-    ("shade_at", ("centroid",)),
-    ("cull", (False,)),
+MAX_ROUNDS: Final = 4
+
+BIASES: Final = (0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0)
+
+ALTERNATIVES: Final[tuple[tuple[dict[str, object], ...], ...]] = (
+    ({"encoding": "srgb"}, {"encoding": "power"}),
+    ({"filtered": "encoded"}, {"filtered": "linear"}),
+    ({"samples": "msaa4"}, {"samples": "msaa4-mirrored"}, {"samples": "centre"}),
+    tuple({"lod": lod, "bias": bias} for lod in ("longer", "area") for bias in BIASES),
+    ({"mips": "exact"}, {"mips": "rounded"}),
+    ({"shade_at": "centre"}, {"shade_at": "centroid"}),
+    ({"cull": True}, {"cull": False}),
 )
-"""Members of the hypothesis, and the values they could have other than the default."""
+"""Groups of members of the hypothesis that make up for each other, and the values they could have."""
 
 BIAS_STEP: Final = 0.25
 
 
-def _vertex(low: float, middle: float, high: float) -> float:
-    """Where the parabola through the scores at -BIAS_STEP, 0 and BIAS_STEP peaks, at most four steps away."""
-    bend = 2 * middle - low - high
+def _fine_bias(best: SamplingModel, score: Callable[[SamplingModel], float]) -> SamplingModel:
+    """``best`` with the bias at which the parabola through its own and two neighbouring scores peaks, if that gains."""
+    low, high = (score(best.but(bias=best.bias + step)) for step in (-BIAS_STEP, BIAS_STEP))
+    bend = 2 * score(best) - low - high
     if bend <= 1e-9:
-        return 4 * BIAS_STEP if high > low else -4 * BIAS_STEP
-    return round(min(4.0, max(-4.0, (high - low) / (2 * bend))) * BIAS_STEP, 4)
+        return best
+    shift = min(1.0, max(-1.0, (high - low) / (2 * bend))) * BIAS_STEP
+    fine = best.but(bias=round(best.bias + shift, 4))
+    return fine if score(fine) > score(best) + 0.0005 else best
 
 
 @dataclass(frozen=True)
@@ -235,12 +247,9 @@ def _shaded(
 ) -> Surrogate:
     """The surrogate on a geometry that stands already."""
     if calibration.model == "diffuse":
-        return diffuse_surrogate(geometry, views)
-    if backdrop is None:
-        behind = np.array([view.background for view in views], np.uint8)[:, None, None, :]
-    else:
-        behind = backdrop[None]
-    return curve_surrogate(geometry, obj, clean, calibration.greys, calibration.probes, behind)
+        return diffuse_surrogate(geometry, views, backdrop=backdrop)
+    greys, probes = calibration.greys, calibration.probes
+    return curve_surrogate(geometry, obj, views, clean, greys, probes, backdrop=backdrop)
 
 
 def calibrate(

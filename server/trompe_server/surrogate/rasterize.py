@@ -122,10 +122,10 @@ def _pixel_box(
     limit = torch.tensor([width, height], device=corners.device)
     low, high = points.amin(1), points.amax(1)
     behind = (depth < NEAR).any(1)
-    low = torch.where(behind[:, None], torch.zeros_like(low), low.clamp(min=0))
-    high = torch.where(behind[:, None], limit - 1.0, torch.minimum(high, limit - 1.0))
+    low = torch.where(behind[:, None], torch.zeros_like(low), low.clamp(min=0)).floor()
+    high = torch.where(behind[:, None], limit - 1.0, torch.minimum(high, limit - 1.0)).floor()
     touches = (high >= low).all(1) & (depth >= NEAR).any(1)
-    return torch.cat([low.floor(), high.floor()], 1).nan_to_num(0.0).long(), touches
+    return torch.cat([low, high], 1).nan_to_num(0.0).long(), touches
 
 
 def rasterize(planes: Planes, size: tuple[int, int], samples: tuple[tuple[float, float], ...]) -> Visibility:

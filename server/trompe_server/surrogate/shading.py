@@ -54,8 +54,9 @@ def encode_as(linear: Tensor, encoding: Encoding) -> Tensor:
     return encode(linear) if encoding == "srgb" else linear ** (1 / POWER)
 
 
-def encode_slope(encoded: Tensor, linear: Tensor, encoding: Encoding) -> Tensor:
-    """Derivative of ``encode_as`` at ``linear`` > 0, whose encoding is ``encoded``."""
+def encode_slope(linear: Tensor, encoding: Encoding) -> Tensor:
+    """Derivative of ``encode_as`` at ``linear`` > 0."""
+    encoded = encode_as(linear, encoding)
     return 1 / decode_slope(encoded, linear) if encoding == "srgb" else encoded / (POWER * linear)
 
 
@@ -68,7 +69,7 @@ class DiffuseShading:
 
     shade: Float[Tensor, "pixels 1"]
     coverage: Float[Tensor, "pixels 1"]
-    background: Float[Tensor, " 3"]
+    background: Float[Tensor, "pixels 3"]
 
     def __call__(
         self, values: Float[Tensor, "pixels 3"]
@@ -111,10 +112,10 @@ class CurveShading:
         linear = decode(values)
         start, light, slope = self._segment(linear)
         exact = torch.addcmul(light, slope, linear - start)
-        shown = exact.clamp(DARKEST, 1)
+        shown = exact.clamp(0, 1)
         colour = encode_as(shown, self.encoding)
-        steepness = slope * decode_slope(values, linear) * encode_slope(colour, shown, self.encoding)
-        steepness = steepness * ((exact > DARKEST) & (exact < 1))
+        steepness = slope * decode_slope(values, linear) * encode_slope(shown.clamp(min=DIM), self.encoding)
+        steepness = steepness * ((exact >= 0) & (exact < 1))
         return self.coverage * colour + (1 - self.coverage) * self.background, self.coverage * steepness
 
     def _segment(self, linear: Float[Tensor, "pixels 3"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -126,8 +127,9 @@ class CurveShading:
         return self.nodes[segment], light, slope
 
 
-DARKEST = 1e-6
-"""Linear light below which an image shows black: keeps the slope of the encoding finite."""
+DIM = 1e-4
+"""Linear light below which the slope of the encoding grows no further: a chord over the first 8-bit steps, not a
+tangent."""
 
 WHITE = 0.996
 """Encoded values from here on may be clipped."""

@@ -1,8 +1,8 @@
 """The surrogate renderer: images of a repainted object for fixed views, and their gradients, at the cost of a gather.
 
 geometry = prepare_geometry(obj, views, size=(224, 224), sampling=SamplingModel())
-surrogate = curve_surrogate(geometry, obj, clean, greys, probes, backgrounds)      # or diffuse_surrogate(geometry,
-views) images = surrogate.render(surrogate.texels(textures), batch=[0, 1])   # differentiable in the textures
+surrogate = curve_surrogate(geometry, obj, views, clean, greys, probes)  # or diffuse_surrogate(geometry, views)
+images = surrogate.render(surrogate.texels(textures), batch=[0, 1])  # differentiable in the textures
 """
 
 from collections.abc import Mapping, Sequence
@@ -217,36 +217,46 @@ class Surrogate:
         return colour.clamp(0, 1), slope
 
 
-def diffuse_surrogate(geometry: Geometry, views: Sequence[View]) -> Surrogate:
-    """The paper's surrogate: asks nothing of the target. ``views`` are those of ``geometry``."""
-    device = geometry.views[0].pixel.device
-    background = torch.tensor([view.background for view in views], dtype=torch.uint8, device=device)
-    base = background[:, None, None, :].expand(-1, *geometry.size, -1).contiguous()
+def diffuse_surrogate(geometry: Geometry, views: Sequence[View], *, backdrop: Image8 | None = None) -> Surrogate:
+    """The paper's surrogate: asks nothing of the target. ``views`` are those of ``geometry``.
+
+    ``backdrop`` (H, W, 3) uint8 is what stands behind the object in place of the views' uniform backgrounds.
+    """
+    base = _behind(geometry, views, backdrop)
     shadings = tuple(
-        DiffuseShading(prepared.shade, prepared.coverage, colour.float() / 255)
-        for prepared, colour in zip(geometry.views, background, strict=True)
+        DiffuseShading(view.shade, view.coverage, behind.flatten(0, 1)[view.pixel].float() / 255)
+        for view, behind in zip(geometry.views, base, strict=True)
     )
     return Surrogate(geometry, "diffuse", base, shadings)
+
+
+def _behind(geometry: Geometry, views: Sequence[View], backdrop: Image8 | None) -> UInt8[Tensor, "views H W 3"]:
+    """What each view shows where there is no object."""
+    colours = np.array([view.background for view in views], np.uint8)[:, None, None, :]
+    full = np.broadcast_to(colours if backdrop is None else backdrop, (len(views), *geometry.size, 3))
+    return torch.from_numpy(full.copy()).to(geometry.views[0].pixel.device)
 
 
 def curve_surrogate(
     geometry: Geometry,
     obj: Object3D,
+    views: Sequence[View],
     clean: Image8,
     greys: Sequence[int],
     probes: Image8,
-    backgrounds: Image8,
+    *,
+    backdrop: Image8 | None = None,
 ) -> Surrogate:
     """A surrogate measured on the target: ``calibrated`` with two greys, ``curve`` with more.
 
     clean: the target's images of ``obj``, (views, H, W, 3) uint8. greys: encoded values, ascending, the first 0.
-    probes: the target's images of ``obj`` painted in each grey, (greys, views, H, W, 3) uint8. backgrounds: what the
-    target shows where there is no object, (views, H or 1, W or 1, 3) uint8.
+    probes: the target's images of ``obj`` painted in each grey, (greys, views, H, W, 3) uint8. ``backdrop`` as for
+    ``diffuse_surrogate``.
     """
     device = geometry.views[0].pixel.device
     levels = torch.tensor(list(greys), dtype=torch.uint8, device=device)
     images = torch.from_numpy(probes).to(device).flatten(2, 3)
-    behind = torch.from_numpy(np.broadcast_to(backgrounds, clean.shape).copy()).to(device).flatten(1, 2)
+    behind = _behind(geometry, views, backdrop).flatten(1, 2)
     shadings = tuple(
         fit_curve(
             levels,
