@@ -136,7 +136,7 @@ _out_option = click.option(
 @click.option(
     "--epsilon", type=float, metavar="E", help=f"Largest change of a texel, 0..1. Default: {_default('epsilon')}."
 )
-@click.option("--alpha", type=float, metavar="A", help=f"Step size, 0..1. Default: {_default('alpha')}.")
+@click.option("--alpha", type=float, metavar="A", help="Mean step, 0..1. Default: 0.01, or epsilon / 5 if less.")
 @click.option("--tau", type=float, metavar="T", help="Saliency threshold, 0..1. Default: attack all texels.")
 @click.option("--surrogate", type=click.Choice(get_args(SurrogateModel)), help=f"Default: {_default('surrogate')}.")
 @click.option("--steps", type=int, metavar="N", help=f"Steps of the attack. Default: {_default('steps')}.")

@@ -195,13 +195,14 @@ def _pictures(evidence: Evidence) -> dict[str, bytes]:
     scene = evidence.scene
     own = evidence.before["own"]
     title = f"{scene.object_name} as {scene.class_name(scene.label).split(',')[0]!r}, {scene.classifier.name}"
-    some = representative(len(own), SALIENCY_VIEWS)
+    distinct = _distinct(scene)
+    some = distinct[representative(len(distinct), SALIENCY_VIEWS)]
     maps = evidence.maps[some]
     sheets = {
         "saliency.png": saliency_sheet(own[some], maps, tau=evidence.spec.tau, title=f"Saliency of {title}", columns=3)
     }
     if evidence.after is not None and evidence.painted is not None:
-        shown = representative(len(own), SHEET_VIEWS)
+        shown = distinct[representative(len(distinct), SHEET_VIEWS)]
         sheets["contact_sheet.png"] = contact_sheet(
             own[shown],
             evidence.after["own"][shown],
@@ -209,10 +210,18 @@ def _pictures(evidence: Evidence) -> dict[str, bytes]:
             _verdicts((evidence.logits_after or {})["own"][shown], scene),
             title=f"{title}, epsilon {evidence.spec.epsilon:g}",
         )
-        few = representative(len(own), DIFFERENCE_VIEWS)
+        few = distinct[representative(len(distinct), DIFFERENCE_VIEWS)]
         sheets["difference.png"] = difference_strip(own[few], evidence.after["own"][few], title=title)
         sheets["textures.png"] = texture_sheet(scene.obj.textures, evidence.painted.textures, title=title)
     return {name: encode_png(sheet) for name, sheet in sheets.items()}
+
+
+def _distinct(scene: Scene) -> NDArray[np.int64]:
+    """Views that show something new: the paper's grid holds azimuth 0 twice, as 0 and as 360."""
+    seen: dict[tuple[float, float, float], int] = {}
+    for index, view in enumerate(scene.views):
+        seen.setdefault((view.camera.azimuth % 360, view.camera.elevation, view.camera.distance), index)
+    return np.array(list(seen.values()))
 
 
 def _verdicts(logits: NDArray[np.float32], scene: Scene) -> list[Verdict]:

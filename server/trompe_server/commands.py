@@ -90,7 +90,7 @@ def _address(text: str) -> tuple[str, int]:
 @click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder of the result.")
 def demo(out: Path) -> None:
     """Attack the shipped mug against the shipped classifier, from object to result."""
-    attack = ["attack", "mug", "--label", "mug", "--classifier", "tiny", "--out", str(out)]
+    attack = ["attack", "mug", "--label", "mug", "--classifier", "tiny", "--steps", "40", "--out", str(out)]
     sys.exit(subprocess.run([sys.executable, "-m", "trompe_client.cli", *attack], check=False).returncode)
 
 

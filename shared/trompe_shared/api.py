@@ -67,7 +67,9 @@ class JobSpec(_Schema):
     classifier: str = "tiny"
     judges: list[str] = Field(default_factory=list, description="other classifiers that judge the result")
     epsilon: Annotated[float, Field(gt=0, le=1)] = 0.05
-    alpha: Annotated[float, Field(gt=0, le=1)] = 0.01
+    alpha: Annotated[float, Field(gt=0, le=1)] = Field(
+        0.01, description="mean step; by default 0.01, or a fifth of epsilon where that is smaller"
+    )
     tau: Annotated[float, Field(ge=0, lt=1)] | None = Field(
         None, description="saliency threshold; null attacks all texels"
     )
@@ -84,6 +86,13 @@ class JobSpec(_Schema):
     azimuths: Annotated[int, Field(ge=1, le=360)] = 6
     elevations: Annotated[int, Field(ge=1, le=180)] = 10
     held_out: Annotated[int, Field(ge=0, le=1000)] = Field(60, description="held-out views the result is judged on")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _small_steps_in_a_small_budget(cls, given: Any) -> Any:
+        if isinstance(given, dict) and "alpha" not in given and isinstance(given.get("epsilon"), float):
+            return given | {"alpha": min(0.01, max(given["epsilon"] / 5, 1e-9))}
+        return given
 
     @model_validator(mode="after")
     def _consistent(self) -> "JobSpec":
