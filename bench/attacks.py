@@ -44,7 +44,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, running_renderer() as target:
         library = _library(Path(folder), assets, options.classifier)
         for name in options.objects:
-            for number, (surrogate, tau) in enumerate(SETTINGS):
+            for number, (surrogate, tau) in enumerate(SETTINGS[:1] if options.pool else SETTINGS):
                 spec = _spec(name, library, assets, options).model_copy(update={"surrogate": surrogate, "tau": tau})
                 started = time.perf_counter()
                 result = _run(spec, library, target, Path(folder) / f"{name}-{number}")
@@ -62,6 +62,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--epsilon", type=float, default=0.05)
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--pool", type=int, default=0, help="attack so many random views, not the paper's grid")
+    parser.add_argument("--held-out", type=int, default=60)
     parser.add_argument("--csv", type=Path)
     if "TROMPE_ASSETS" not in os.environ:
         sys.exit("TROMPE_ASSETS must name the folder with the paper's objects and the classifiers.")
@@ -91,6 +93,8 @@ def _spec(name: str, library: Library, assets: Path, options: argparse.Namespace
         distance=paper["distance"],
         elevation=paper["elevation_range"],
         background=paper["background"],
+        pool=options.pool,
+        held_out=options.held_out,
     )
 
 

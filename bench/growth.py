@@ -29,7 +29,6 @@ TEXTURE_SIDES = (256, 512, 1024, 2048, 4096)
 IMAGE_SIDES = (64, 128, 224, 362, 512)
 VIEWS = (6, 12, 30, 60, 120)
 MOST_FACES = 1_000_000
-BATCH = 10
 
 Made = TypeVar("Made")
 
@@ -124,8 +123,8 @@ def step(surrogate: Surrogate, textures: Mapping[str, Tensor]) -> None:
     leaves = {name: texture.detach().requires_grad_() for name, texture in textures.items()}
     texels = surrogate.texels(leaves)
     collected = texels.detach().requires_grad_()
-    for first in range(0, surrogate.n_views, BATCH):
-        images = surrogate.render(collected, range(first, min(first + BATCH, surrogate.n_views)))
+    for batch in range(len(surrogate.batches)):
+        images = surrogate.render(collected, batch)
         images.backward(torch.ones_like(images))  # type: ignore[no-untyped-call]
     torch.autograd.grad(texels, list(leaves.values()), collected.grad)
 

@@ -29,10 +29,10 @@ from bench._common import (
     rescaled,
 )
 from trompe_server.attack import Budget, attack, margin_loss, movable, start
-from trompe_server.attack.attack import BATCH
 from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate.calibration import CURVE_GREYS, Calibration, Fidelity, build_surrogate
+from trompe_server.surrogate.surrogate import BATCH
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
@@ -60,14 +60,10 @@ class Work:
         leaves = {name: texture.detach().requires_grad_() for name, texture in self.textures.items()}
         texels = self.surrogate.texels(leaves)
         collected = texels.detach().requires_grad_()
-        for batch in _batches(self.surrogate.n_views):
-            images = self.surrogate.render(collected, batch)
-            images.backward(self.gradient[: len(batch)])  # type: ignore[no-untyped-call]
+        for number, views in enumerate(self.surrogate.batches):
+            images = self.surrogate.render(collected, number)
+            images.backward(self.gradient[: len(views)])  # type: ignore[no-untyped-call]
         torch.autograd.grad(texels, list(leaves.values()), collected.grad)
-
-
-def _batches(n_views: int) -> list[range]:
-    return [range(first, min(first + BATCH, n_views)) for first in range(0, n_views, BATCH)]
 
 
 def work_of(entry: BenchObject, obj: Object3D, name: str, size: tuple[int, int], n_views: int) -> Work:
@@ -173,8 +169,8 @@ def preparation(entries: Sequence[BenchObject], size: tuple[int, int], n_views: 
 
         times = in_rounds({"prepare": prepare}, rounds)["prepare"]
         wanted = f"<= {WANTED_SECONDS:g}" if entry.name == "toilet" else "-"
-        taps = sum(len(view.gather.index) for view in made[0].views)
-        pixels = sum(len(view.pixel) for view in made[0].views)
+        taps = sum(len(batch.gather.index) for batch in made[0].batches)
+        pixels = sum(len(batch.pixel) for batch in made[0].batches)
         rows.append(
             [
                 entry.name,
@@ -240,9 +236,10 @@ def peers(works: Sequence[Work], size: tuple[int, int]) -> dict[str, Callable[[]
 
 def same_silhouette(surrogate: Surrogate, views: Sequence[int], alpha: Float[Tensor, "views H W"]) -> float:
     """Intersection over union of the object's pixels, so that the work is known to be the same."""
-    own = torch.zeros(alpha.shape, dtype=torch.bool).flatten(1)
-    for row, view in zip(own, views, strict=True):
-        row[surrogate.geometry.views[view].pixel] = True
+    silhouettes = torch.zeros(surrogate.base.shape[:3], dtype=torch.bool)
+    for batch in surrogate.geometry.batches:
+        silhouettes[batch.views.start : batch.views.stop].view(-1)[batch.pixel] = True
+    own = silhouettes[list(views)].flatten(1)
     theirs = alpha.flatten(1) > 0
     return float((own & theirs).sum() / (own | theirs).sum())
 

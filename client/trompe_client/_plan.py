@@ -53,6 +53,7 @@ class AttackOptions(TypedDict, total=False):
     azimuths: int
     elevations: int
     held_out: int
+    pool: int
 
 
 @dataclass(frozen=True)

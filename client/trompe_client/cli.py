@@ -161,6 +161,12 @@ _out_option = click.option(
     metavar="COLOUR_OR_FILE",
     help="Behind the object.",
 )
+@click.option(
+    "--pool",
+    type=int,
+    metavar="N",
+    help="Attack N random cameras and lights (240 is a good number) in place of the paper's grid of 60 views.",
+)
 @click.option("--judge", "judges", multiple=True, metavar="FILE_OR_NAME", help="Another classifier, which only judges.")
 @_server_option(required=False)
 @_out_option

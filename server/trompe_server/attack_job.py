@@ -7,9 +7,10 @@ judge       the 8-bit texture goes back into the target; report
 """
 
 import json
+import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -31,11 +32,12 @@ from trompe_server.attack import (
     start,
 )
 from trompe_server.attack_report import Evidence, public_files
+from trompe_server.calibration_files import calibration_key, pack_calibration, unpack_calibration
 from trompe_server.library import Library
 from trompe_server.pipeline import Artifacts, OnProgress, PhaseReport
 from trompe_server.scene import Scene, open_scene
-from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
-from trompe_server.surrogate.calibration import Calibration, Fidelity, build_surrogate, calibrate
+from trompe_server.surrogate import Surrogate, textures_of
+from trompe_server.surrogate.calibration import Calibration, build_surrogate, calibrate
 from trompe_server.target import TargetRenderer
 from trompe_shared.api import JobSpec, JobState, Progress
 from trompe_shared.geometry import View
@@ -43,8 +45,13 @@ from trompe_shared.object3d import Object3D
 
 __all__ = ["AttackJob", "open_pipeline"]
 
+logger = logging.getLogger(__name__)
+
 CHUNK: Final = 5
 """Attack steps per phase: what is lost at most when a worker dies."""
+
+VIEWS_PER_STEP: Final = 40
+"""Views of the pool that one step looks at."""
 
 PROBE_STREAM: Final = 0
 """Keeps the random numbers of the probes apart from those of the held-out views."""
@@ -57,14 +64,17 @@ Image8 = NDArray[np.uint8]
 
 def open_pipeline(spec: JobSpec, *, library: Library, artifacts: Artifacts, target: TargetRenderer) -> "AttackJob":
     """The phases of the job that ``spec`` describes. Raises ``TrompeError`` for what the user can mend."""
-    return AttackJob(spec, open_scene(spec, library=library, target=target), artifacts)
+    return AttackJob(spec, open_scene(spec, library=library, target=target), artifacts, library.calibrations)
 
 
 class AttackJob:
-    """One job; see the head of this module. All that a phase leaves for later ones is in ``artifacts``."""
+    """One job; see the head of this module. All that a phase leaves for later ones is in ``artifacts``.
 
-    def __init__(self, spec: JobSpec, scene: Scene, artifacts: Artifacts) -> None:
-        self.spec, self.scene, self.artifacts = spec, scene, artifacts
+    ``calibrations`` are kept for other jobs: one that would ask the target the same questions asks none.
+    """
+
+    def __init__(self, spec: JobSpec, scene: Scene, artifacts: Artifacts, calibrations: Artifacts) -> None:
+        self.spec, self.scene, self.artifacts, self.calibrations = spec, scene, artifacts, calibrations
         self.budget = Budget(spec.epsilon, spec.alpha)
 
     def phases(self) -> list[str]:
@@ -106,25 +116,47 @@ class AttackJob:
         return PhaseReport(_progress("judge", 1.0), JobState.not_applicable, note, public)
 
     def _calibrate(self, on_progress: OnProgress) -> PhaseReport:
+        if not self.artifacts.exists("calibration.npz"):
+            clean = self._load("clean")["own"]
+            name = f"{self._calibration_key(clean)}.npz"
+            found = self._known_calibration(name)
+            if found is None:
+                found = self._ask_the_target(clean, on_progress)
+            self.artifacts.write("calibration.npz", pack_calibration(found))
+            if found.renders:
+                self.calibrations.write(name, pack_calibration(found))
+        return PhaseReport(_progress("calibrate", 1.0))
+
+    def _calibration_key(self, clean: Image8) -> str:
+        scene, spec = self.scene, self.spec
+        return calibration_key(
+            scene.obj, scene.views, clean, wanted=spec.surrogate, seed=spec.seed, backdrop=scene.backdrop
+        )
+
+    def _known_calibration(self, name: str) -> Calibration | None:
+        """What an earlier job found out by the same questions; a damaged file counts as none."""
+        if not self.calibrations.exists(name):
+            return None
+        try:
+            known = unpack_calibration(self.calibrations.read(name))
+        except (ValueError, OSError):
+            logger.warning("the stored calibration %s is damaged; the target is asked again", name)
+            return None
+        return replace(known, renders=0, reason=f"{known.reason} (known from an earlier job)")
+
+    def _ask_the_target(self, clean: Image8, on_progress: OnProgress) -> Calibration:
         scene = self.scene
         # Five greys on every view and some trials; fewer when the cheaper models do.
         ask = self._asker("calibrate", 5 * len(scene.views) + 4, on_progress)
-        generator = np.random.default_rng([self.spec.seed, PROBE_STREAM])
-        clean = self._load("clean")["own"]
-        found = calibrate(
+        return calibrate(
             scene.obj,
             scene.views,
             clean,
             ask,
             wanted=self.spec.surrogate,
-            generator=generator,
+            generator=np.random.default_rng([self.spec.seed, PROBE_STREAM]),
             backdrop=scene.backdrop,
         )
-        self._save("probes", probes=found.probes)
-        described = {k: v for k, v in vars(found).items() if k != "probes"}
-        described |= {"sampling": asdict(found.sampling), "fidelity": asdict(found.fidelity)}
-        self.artifacts.write("calibration.json", json.dumps(described, indent=1).encode())
-        return PhaseReport(_progress("calibrate", 1.0))
 
     def _attack(self, chunk: int, on_progress: OnProgress) -> PhaseReport:
         before = load_state(self.artifacts.read(_state(chunk))) if chunk else start(self._textures)
@@ -155,6 +187,8 @@ class AttackJob:
             total_steps=self.spec.steps,
             masks=masks,
             texels=self._movable,
+            views_per_step=VIEWS_PER_STEP if self.spec.pool else None,
+            seed=self.spec.seed,
             on_step=on_step,
         )
 
@@ -189,13 +223,7 @@ class AttackJob:
 
     @cached_property
     def _calibration(self) -> Calibration:
-        described = json.loads(self.artifacts.read("calibration.json"))
-        described |= {
-            "sampling": SamplingModel(**described["sampling"]),
-            "fidelity": Fidelity(**{name: tuple(values) for name, values in described["fidelity"].items()}),
-            "greys": tuple(described["greys"]),
-        }
-        return Calibration(**described, probes=self._load("probes")["probes"])
+        return unpack_calibration(self.artifacts.read("calibration.npz"))
 
     @cached_property
     def _surrogate(self) -> Surrogate:

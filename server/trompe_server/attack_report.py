@@ -44,7 +44,6 @@ SHEET_VIEWS: Final = 12
 SALIENCY_VIEWS: Final = 6
 DIFFERENCE_VIEWS: Final = 4
 FEW_RECOGNISED: Final = 0.3
-SURROGATE_BATCH: Final = 10
 
 
 @dataclass(frozen=True)
@@ -135,12 +134,8 @@ def _surrogate_accuracy(evidence: Evidence) -> Accuracy | None:
 def _surrogate_images(surrogate: Surrogate, obj: Object3D) -> NDArray[np.uint8]:
     """The surrogate's images of ``obj`` in 8 bits, (views, H, W, 3)."""
     with torch.no_grad():
-        texels = surrogate.texels(textures_of(obj))
-        batches = [
-            surrogate.render(texels, range(first, min(first + SURROGATE_BATCH, surrogate.n_views)))
-            for first in range(0, surrogate.n_views, SURROGATE_BATCH)
-        ]
-        images: NDArray[np.uint8] = torch.cat(batches).mul(255).round().byte().permute(0, 2, 3, 1).numpy()
+        shown = surrogate.render_all(surrogate.texels(textures_of(obj)))
+        images: NDArray[np.uint8] = shown.mul(255).round().byte().permute(0, 2, 3, 1).numpy()
     return images
 
 

@@ -18,6 +18,7 @@ from typing import BinaryIO, Final, Generic, TypeVar
 
 from pydantic import BaseModel
 
+from trompe_server.artifacts import LocalArtifacts
 from trompe_server.errors import AmbiguousError, NotFoundError
 from trompe_server.files import write_whole
 from trompe_shared.api import ClassifierInfo, ObjectInfo
@@ -103,6 +104,8 @@ class Library:
         self._objects = _Shelf("object", folder / "objects", ObjectInfo, _shipped_objects)
         self._classifiers = _Shelf("classifier", folder / "classifiers", ClassifierInfo, _shipped_classifiers)
         self._backgrounds = _Shelf("background", folder / "backgrounds", BackgroundInfo, list)
+        self.calibrations = LocalArtifacts(folder / "calibrations")
+        """What jobs found out about the target, for later jobs."""
 
     def objects(self) -> list[ObjectInfo]:
         """All objects."""

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_server.attack import framing_distance, grid_views, held_out_views
+from trompe_server.attack import framing_distance, grid_views, random_views
 from trompe_server.classifiers import Classifier, WhiteBoxClassifier, load_classifier
 from trompe_server.labels import resolve_label
 from trompe_server.library import Library
@@ -101,19 +101,25 @@ def _hex_colour(text: str) -> tuple[int, int, int] | None:
 def _views(
     spec: JobSpec, distance: float, elevation: tuple[float, float], background: tuple[int, int, int]
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    own = grid_views(
+    """The views that are attacked (the pool, else the paper's grid), and those held out."""
+
+    def drawn(count: int, stream: int) -> tuple[View, ...]:
+        generator = np.random.default_rng([spec.seed, stream])
+        views = random_views(count, distance=distance, elevation=elevation, background=background, generator=generator)
+        return tuple(views)
+
+    held_out = drawn(spec.held_out, HELD_OUT_STREAM)
+    if spec.pool:
+        return drawn(spec.pool, POOL_STREAM), held_out
+    grid = grid_views(
         distance=distance,
         elevation=elevation,
         azimuths=spec.azimuths,
         elevations=spec.elevations,
         background=background,
     )
-    generator = np.random.default_rng([spec.seed, HELD_OUT_STREAM])
-    fresh = held_out_views(
-        spec.held_out, distance=distance, elevation=elevation, background=background, generator=generator
-    )
-    return tuple(own), tuple(fresh)
+    return tuple(grid), held_out
 
 
-HELD_OUT_STREAM: Final = 1
-"""Keeps the random numbers of the held-out views apart from those of the probes."""
+HELD_OUT_STREAM, POOL_STREAM = 1, 2
+"""Keep the random numbers of held-out views, pool and probes (0) apart."""

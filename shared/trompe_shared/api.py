@@ -83,8 +83,11 @@ class JobSpec(_Schema):
         None, description="range of camera elevations, degrees; null is the shipped object's own, else 0 to 50"
     )
     background: str = Field("white", description="'white', 'black', '#rrggbb' or the id of an uploaded picture")
-    azimuths: Annotated[int, Field(ge=1, le=360)] = 6
-    elevations: Annotated[int, Field(ge=1, le=180)] = 10
+    azimuths: Annotated[int, Field(ge=1, le=360)] = Field(6, description="columns of the paper's grid of views")
+    elevations: Annotated[int, Field(ge=1, le=180)] = Field(10, description="rows of the paper's grid of views")
+    pool: Annotated[int, Field(ge=0, le=2000)] = Field(
+        0, description="attack this many random cameras and lights in place of the grid; each step draws 40 of them"
+    )
     held_out: Annotated[int, Field(ge=0, le=1000)] = Field(60, description="held-out views the result is judged on")
 
     @model_validator(mode="before")

@@ -20,11 +20,11 @@ from trompe_server.attack import (
     fooled,
     framing_distance,
     grid_views,
-    held_out_views,
     load_state,
     margin,
     margin_loss,
     movable,
+    random_views,
     saliency,
     saliency_masks,
     save_state,
@@ -208,7 +208,7 @@ def test_a_grid_of_one_is_the_first_end_of_both_ranges() -> None:
 
 def held_out(n: int, seed: int) -> list[View]:
     generator = np.random.default_rng(seed)
-    return list(held_out_views(n, distance=2, elevation=(-10, 45), background=(9, 9, 9), generator=generator))
+    return list(random_views(n, distance=2, elevation=(-10, 45), background=(9, 9, 9), generator=generator))
 
 
 def test_held_out_views_fill_their_ranges_and_nothing_else() -> None:
@@ -304,7 +304,7 @@ def test_what_a_step_reports_is_the_mean_over_all_views_before_it_moved(square: 
     seen: list[Step] = []
     run(square, surrogate, steps=1, on_step=seen.append)
     texels = surrogate.texels(textures_of(square))
-    logits = fake_classifier().logits(surrogate.render(texels, range(surrogate.n_views)))
+    logits = fake_classifier().logits(surrogate.render_all(texels))
     assert seen[0].loss == pytest.approx(float(margin_loss(logits, LABEL).mean()), abs=1e-4)
     assert seen[0].fooled == float(fooled(logits, LABEL).float().mean())
 
@@ -312,7 +312,7 @@ def test_what_a_step_reports_is_the_mean_over_all_views_before_it_moved(square: 
 def test_a_step_goes_along_the_sign_of_the_mean_gradient(square: Object3D, surrogate: Surrogate) -> None:
     leaf = textures_of(square)["m0.png"].requires_grad_()
     texels = surrogate.texels(textures_of(square) | {"m0.png": leaf})
-    logits = fake_classifier().logits(surrogate.render(texels, range(surrogate.n_views)))
+    logits = fake_classifier().logits(surrogate.render_all(texels))
     (gradient,) = torch.autograd.grad(margin_loss(logits, LABEL).mean(), leaf)
     clear = gradient.abs() > 1e-6
     delta = run(square, surrogate, steps=1).deltas["m0.png"]
@@ -428,3 +428,44 @@ def test_damaged_bytes_are_an_error_that_can_be_caught(data: bytes) -> None:
 def test_arrays_that_are_no_state_are_damaged_too() -> None:
     with pytest.raises(ValueError, match="step"):
         load_state(PACKED)
+
+
+# The pool: each step looks at some of the views
+
+
+@pytest.fixture(scope="module")
+def many_views(square: Object3D) -> Surrogate:
+    views = pool(30, seed=5)
+    return diffuse_surrogate(prepare_geometry(square, views, size=SIZE, sampling=SamplingModel()), views)
+
+
+def pool(n: int, *, seed: int) -> list[View]:
+    generator = np.random.default_rng(seed)
+    return list(random_views(n, distance=2, elevation=(0, 40), background=(0, 0, 0), generator=generator))
+
+
+def losses(square: Object3D, surrogate: Surrogate, **options: Any) -> list[float]:
+    seen: list[Step] = []
+    run(square, surrogate, steps=4, on_step=seen.append, **options)
+    return [step.loss for step in seen]
+
+
+def test_a_step_that_draws_views_looks_at_other_ones_than_the_next(square: Object3D, many_views: Surrogate) -> None:
+    texels = many_views.texels(textures_of(square))
+    with torch.no_grad():
+        logits = [fake_classifier().logits(many_views.render(texels, batch)) for batch in range(3)]
+    first = losses(square, many_views, views_per_step=10)[0]
+    assert any(first == pytest.approx(float(margin_loss(some, LABEL).mean()), abs=1e-4) for some in logits)
+    assert first != pytest.approx(losses(square, many_views)[0], abs=1e-6)
+
+
+def test_the_seed_decides_which_views_are_drawn(square: Object3D, many_views: Surrogate) -> None:
+    drawn = [losses(square, many_views, views_per_step=10, seed=seed) for seed in (1, 1, 2, 3)]
+    assert drawn[0] == drawn[1]
+    assert drawn[2:] != [drawn[0], drawn[0]]
+
+
+def test_a_run_over_a_pool_that_was_cut_off_goes_on_bit_for_bit(square: Object3D, many_views: Surrogate) -> None:
+    whole = run(square, many_views, steps=5, views_per_step=10, seed=7)
+    half = load_state(save_state(run(square, many_views, steps=2, total_steps=5, views_per_step=10, seed=7)))
+    assert same(run(square, many_views, steps=3, state=half, views_per_step=10, seed=7), whole)

@@ -3,8 +3,10 @@
 import dataclasses
 import io
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -105,9 +107,20 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Library:
 
 
 def run(
-    spec: JobSpec, library: Library, *, target: TargetRenderer | None = None, new: bool = False, times: int = 1
+    spec: JobSpec,
+    library: Library,
+    *,
+    target: TargetRenderer | None = None,
+    new: bool = False,
+    times: int = 1,
+    calibrations: bool = False,
 ) -> Run:
-    """Run all phases until the job ends; ``new`` opens the job anew for each, ``times`` runs each so often."""
+    """Run all phases until the job ends; ``new`` opens the job anew for each, ``times`` runs each so often.
+
+    Nothing that earlier jobs found out about the target is known, unless with ``calibrations``.
+    """
+    if not calibrations:
+        shutil.rmtree(library.calibrations.folder, ignore_errors=True)
     artifacts, reports, progress = MemoryArtifacts(), {}, list[Progress]()
 
     def opened() -> AttackJob:
@@ -208,6 +221,56 @@ def test_the_pictures_can_be_seen(finished: Run) -> None:
 def test_each_phase_may_run_in_another_process_and_twice(finished: Run, library: Library) -> None:
     again = run(SPEC, library, new=True, times=2)
     assert again.artifacts.lasting() == finished.artifacts.lasting()
+
+
+class Counting(FakeTarget):
+    """Counts the images it is asked for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        object.__setattr__(self, "images", 0)
+
+    def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
+        object.__setattr__(self, "images", self.images + len(views))
+        return super().render(obj, views, **options)
+
+
+def test_a_second_job_on_the_same_object_and_views_spends_no_probe(library: Library) -> None:
+    targets = [Counting(), Counting()]
+    spec = SPEC.model_copy(update={"steps": 1})
+    first = run(spec, library, target=targets[0])
+    second = run(
+        spec.model_copy(update={"epsilon": 0.05, "alpha": 0.01}), library, target=targets[1], calibrations=True
+    )
+    assert first.artifacts.result().probe_renders == targets[0].images - targets[1].images > 0
+    assert second.artifacts.result().probe_renders == 0
+    assert "earlier job" in second.artifacts.result().surrogate_reason
+    assert second.artifacts.result().fidelity == first.artifacts.result().fidelity
+
+
+def test_a_calibration_serves_only_the_renderer_it_was_made_with(library: Library) -> None:
+    spec = SPEC.model_copy(update={"steps": 1})
+    run(spec, library)
+    assert run(spec, library, target=DarkTarget(), calibrations=True).artifacts.result().probe_renders > 0
+
+
+def test_a_damaged_calibration_is_made_anew(library: Library) -> None:
+    spec = SPEC.model_copy(update={"steps": 1})
+    whole = run(spec, library)
+    (stored,) = library.calibrations.folder.iterdir()
+    stored.write_bytes(stored.read_bytes()[:-100])
+    again = run(spec, library, calibrations=True)
+    assert again.artifacts.lasting() == whole.artifacts.lasting()
+    assert len(list(library.calibrations.folder.iterdir())) == 1
+
+
+def test_a_pool_of_random_views_takes_the_place_of_the_grid(library: Library) -> None:
+    pool = run(SPEC.model_copy(update={"pool": 50, "steps": 2, "surrogate": "diffuse"}), library)
+    result = pool.artifacts.result()
+    assert result.target.views == len(result.views) == 50
+    assert len({view.azimuth for view in result.views}) == 50
+    assert len({view.light_azimuth for view in result.views}) == 50
+    assert not {view.azimuth for view in result.views} & {view.azimuth for view in result.held_out_views}
 
 
 def test_the_seed_changes_the_held_out_views_and_only_them_of_the_images(finished: Run, library: Library) -> None:

@@ -58,7 +58,7 @@ class Asked:
 
 def images_of(surrogate: Surrogate, obj: Object3D) -> Image8:
     with torch.no_grad():
-        images = surrogate.render(surrogate.texels(textures_of(obj)), range(surrogate.n_views))
+        images = surrogate.render_all(surrogate.texels(textures_of(obj)))
     return images.mul(255).round().byte().permute(0, 2, 3, 1).numpy()
 
 
@@ -80,11 +80,12 @@ class KnownTarget:
 
     def _affine_images(self, surrogate: Surrogate, obj: Object3D) -> Image8:
         images, texels = surrogate.base.numpy().copy(), surrogate.texels(textures_of(obj))
-        for image, view in zip(images, surrogate.geometry.views, strict=True):
-            values = view.gather.forward(texels)
-            light = view.shade * (values if self.sampling.filtered == "linear" else decode(values))
-            colour = view.coverage * encode(light.clamp(0, 1)) + (1 - view.coverage)  # before white
-            image.reshape(-1, 3)[view.pixel.numpy()] = colour.mul(255).round().byte().numpy()
+        for batch in surrogate.geometry.batches:
+            values = batch.gather.forward(texels)
+            light = batch.shade * (values if self.sampling.filtered == "linear" else decode(values))
+            colour = batch.coverage * encode(light.clamp(0, 1)) + (1 - batch.coverage)  # before white
+            some = images[batch.views.start : batch.views.stop].reshape(-1, 3)
+            some[batch.pixel.numpy()] = colour.mul(255).round().byte().numpy()
         return images
 
 

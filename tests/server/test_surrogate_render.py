@@ -25,6 +25,7 @@ from trompe_server.surrogate.calibration import (
     build_surrogate,
     painted_grey,
 )
+from trompe_server.surrogate.surrogate import BATCH
 from trompe_server.target import FakeTarget, SailenvTarget, TargetRenderer
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D
@@ -36,7 +37,6 @@ VIEWS = [
     View(Camera(0.18, 100, 40), Light(40, 50, 1.0, 0.3), (10, 20, 30)),
     View(Camera(0.16, 250, 0), Light(-30, 80)),
 ]
-ALL = range(len(VIEWS))
 BLOCK = 64
 """Side, in texels, of the squares that are repainted."""
 
@@ -52,8 +52,8 @@ def measured(
     return build_surrogate(calibration, obj, views, clean), clean
 
 
-def diffuse(obj: Object3D, model: SamplingModel) -> Surrogate:
-    return diffuse_surrogate(prepare_geometry(obj, VIEWS, size=SIZE, sampling=model), VIEWS)
+def diffuse(obj: Object3D, model: SamplingModel, views: Sequence[View] = VIEWS) -> Surrogate:
+    return diffuse_surrogate(prepare_geometry(obj, views, size=SIZE, sampling=model), views)
 
 
 @pytest.fixture(scope="module")
@@ -61,14 +61,14 @@ def curved(mug: Object3D) -> Surrogate:
     return measured(mug, FakeTarget(), CURVE_GREYS)[0]
 
 
-def images_of(surrogate: Surrogate, textures: dict[str, Tensor], batch: Sequence[int] = ALL) -> Tensor:
-    return surrogate.render(surrogate.texels(textures), batch)
+def images_of(surrogate: Surrogate, textures: dict[str, Tensor]) -> Tensor:
+    return surrogate.render_all(surrogate.texels(textures))
 
 
 def gradient_of(surrogate: Surrogate, obj: Object3D, weights: Tensor, masks: Tensor | None = None) -> dict[str, Tensor]:
     """Gradient of the ``weights`` sum of all images, by texture."""
     leaves = {name: texture.requires_grad_() for name, texture in textures_of(obj).items()}
-    images = surrogate.render(surrogate.texels(leaves), ALL, masks=masks)
+    images = surrogate.render_all(surrogate.texels(leaves), masks=masks)
     gradients = torch.autograd.grad((images * weights).sum(), list(leaves.values()))
     return dict(zip(leaves, gradients, strict=True))
 
@@ -178,37 +178,60 @@ def test_pixels_outside_of_the_masks_pass_no_gradient(mug: Object3D, curved: Sur
 def test_masks_do_not_change_the_images(mug: Object3D, curved: Surrogate) -> None:
     texels = curved.texels(textures_of(mug))
     masks = torch.zeros(len(VIEWS), *SIZE, dtype=torch.bool)
-    assert torch.equal(curved.render(texels, ALL, masks=masks), curved.render(texels, ALL))
+    assert torch.equal(curved.render_all(texels, masks=masks), curved.render_all(texels))
 
 
-def test_each_view_is_the_same_in_any_batch(mug: Object3D, curved: Surrogate) -> None:
-    texels = curved.texels(textures_of(mug))
-    alone = torch.cat([curved.render(texels, [k]) for k in ALL])
-    assert torch.equal(curved.render(texels, [2, 0, 1]), alone[[2, 0, 1]])
-    assert torch.equal(curved.render(texels, [1, 1]), alone[[1, 1]])
-    assert alone.shape == (len(VIEWS), 3, *SIZE)
+MANY = [View(Camera(0.16 + 0.002 * k, 30.0 * k, 5.0 * k - 25), background=(20 * k, 0, 255)) for k in range(12)]
+"""More than a batch of views."""
 
 
-def test_the_order_of_the_views_in_a_batch_does_not_change_the_gradient(mug: Object3D, curved: Surrogate) -> None:
-    def gradient(batch: list[int]) -> Tensor:
-        texels = curved.texels(textures_of(mug)).requires_grad_()
-        (found,) = torch.autograd.grad((curved.render(texels, batch) * random_weights()[batch]).sum(), texels)
-        return found
+def test_views_are_rendered_in_successive_batches(mug: Object3D) -> None:
+    surrogate = diffuse(mug, SamplingModel(), MANY)
+    assert surrogate.batches == (range(BATCH), range(BATCH, 12))
+    texels = surrogate.texels(textures_of(mug))
+    images = [surrogate.render(texels, k) for k in range(2)]
+    assert [tuple(some.shape) for some in images] == [(BATCH, 3, *SIZE), (2, 3, *SIZE)]
+    assert all(some.is_contiguous(memory_format=torch.channels_last) for some in images)
+    assert torch.equal(surrogate.render_all(texels), torch.cat(images))
 
-    torch.testing.assert_close(gradient([0, 1, 2]), gradient([2, 0, 1]), atol=1e-5, rtol=1e-4)
+
+def test_each_view_is_the_same_in_any_batch(mug: Object3D) -> None:
+    together = images_of(diffuse(mug, SamplingModel(), MANY), textures_of(mug))
+    for number in (0, 9, 11):
+        alone = images_of(diffuse(mug, SamplingModel(), MANY[number : number + 1]), textures_of(mug))
+        torch.testing.assert_close(together[number], alone[0], atol=1e-6, rtol=0)
+
+
+def test_the_order_of_the_views_changes_neither_images_nor_gradient(mug: Object3D) -> None:
+    order = [11, 3, 0, 7, 1, 9, 2, 10, 4, 8, 5, 6]
+    weights = torch.randn(len(MANY), 3, *SIZE, generator=torch.Generator().manual_seed(0))
+    masks = weights[:, 0] > 0
+    one, other = diffuse(mug, SamplingModel(), MANY), diffuse(mug, SamplingModel(), [MANY[k] for k in order])
+    torch.testing.assert_close(
+        images_of(one, textures_of(mug))[order], images_of(other, textures_of(mug)), atol=1e-6, rtol=0
+    )
+    first, second = gradient_of(one, mug, weights, masks), gradient_of(other, mug, weights[order], masks[order])
+    for name, gradient in first.items():
+        assert gradient.abs().max() > 0
+        torch.testing.assert_close(gradient, second[name], atol=1e-5, rtol=1e-4)
+
+
+def test_the_same_work_gives_the_same_bits(mug: Object3D, curved: Surrogate) -> None:
+    first, second = (gradient_of(curved, mug, random_weights()) for _ in range(2))
+    assert all(torch.equal(first[name], second[name]) for name in first)
 
 
 def test_influence_sums_to_the_pixels_that_read(mug: Object3D, curved: Surrogate) -> None:
-    pixels = sum(len(view.pixel) for view in curved.geometry.views)
+    (batch,) = curved.geometry.batches
     everything = curved.influence()
     assert {name: tuple(weight.shape) for name, weight in everything.items()} == {
         name: texture.shape[:2] for name, texture in mug.textures.items()
     }
-    assert sum(float(weight.sum()) for weight in everything.values()) == pytest.approx(pixels, rel=1e-3)
+    assert sum(float(weight.sum()) for weight in everything.values()) == pytest.approx(sum(batch.counts), rel=1e-3)
     masks = torch.zeros(len(VIEWS), *SIZE, dtype=torch.bool)
     masks[1] = True
     second = sum(float(weight.sum()) for weight in curved.influence(masks).values())
-    assert second == pytest.approx(len(curved.geometry.views[1].pixel), rel=1e-3)
+    assert second == pytest.approx(batch.counts[1], rel=1e-3)
     assert all((weight >= 0).all() for weight in everything.values())
 
 
@@ -218,7 +241,7 @@ def test_a_texture_that_no_view_sees_has_no_influence_and_changes_no_image(make_
     surrogate = diffuse_surrogate(prepare_geometry(obj, views, size=SIZE, sampling=SamplingModel()), views)
     assert (surrogate.influence()["m1.png"] == 0).all()
     before, hidden, seen = (
-        images_of(surrogate, textures_of(obj.with_textures(new)), [0])
+        images_of(surrogate, textures_of(obj.with_textures(new)))
         for new in ({}, {"m1.png": half + 100}, {"m0.png": half + 100})
     )
     assert torch.equal(before, hidden)

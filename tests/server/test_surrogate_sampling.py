@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
-from trompe_server.surrogate.sampling import mip_layout, mip_pyramid
+from trompe_server.surrogate.sampling import mip_layout, mip_levels
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, View
 from trompe_shared.object3d import Object3D
 
@@ -37,11 +37,17 @@ def reading(obj: Object3D, model: SamplingModel = MODELS[0], views: list[View] =
     return geometry, diffuse_surrogate(geometry, views)
 
 
+def n_read(geometry: Geometry) -> int:
+    """How many texels the views read."""
+    return sum(len(reads) for reads in geometry.reads)
+
+
 def read_values(obj: Object3D, model: SamplingModel = MODELS[0], views: list[View] = VIEWS) -> list[Tensor]:
     """The texture value that each object pixel of each view reads, encoded, (pixels, 3)."""
     geometry, surrogate = reading(obj, model, views)
     texels = surrogate.texels(textures_of(obj))
-    return [view.gather.forward(texels) for view in geometry.views]
+    (batch,) = geometry.batches
+    return list(torch.split(batch.gather.forward(texels), list(batch.counts)))
 
 
 def front_view(texture: Image8, make_object: Make, make_quad: Make, *, pixels: float, **options: Any) -> Tensor:
@@ -52,7 +58,7 @@ def front_view(texture: Image8, make_object: Make, make_quad: Make, *, pixels: f
     views = [View(Camera(DISTANCE, 0, 0))]
     geometry, _ = reading(obj, views=views)
     image = torch.full((SIZE[0] * SIZE[1], 3), torch.nan)
-    image[geometry.views[0].pixel] = read_values(obj, views=views)[0]
+    image[geometry.batches[0].pixel] = read_values(obj, views=views)[0]
     return image.view(*SIZE, 3)
 
 
@@ -72,7 +78,7 @@ def averaged(level: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.fl
 def test_the_pyramid_is_the_texture_averaged_again_and_again(height: int, width: int) -> None:
     layout = mip_layout([(height, width), (2, 3)])
     textures = [noise(height, width) / 255, noise(2, 3, seed=1) / 255]
-    flat = mip_pyramid([torch.from_numpy(t) for t in textures], layout).numpy()
+    flat = torch.cat(mip_levels([torch.from_numpy(t) for t in textures], layout)).numpy()
     assert len(flat) == layout.total
     for level, sizes, starts in zip(textures, layout.sizes, layout.starts, strict=True):
         expected = level
@@ -97,10 +103,22 @@ def test_levels_are_halved_and_rounded_down_to_one_texel(size: tuple[int, int], 
 @pytest.mark.parametrize("model", MODELS, ids=repr)
 def test_the_weights_of_each_pixel_sum_to_one(mug: Object3D, model: SamplingModel) -> None:
     geometry, _ = reading(mug, model)
-    for view in geometry.views:
-        assert len(view.pixel) > 500
-        ones = torch.ones(geometry.layout.total, 3)
-        torch.testing.assert_close(view.gather.forward(ones), torch.ones(len(view.pixel), 3), atol=1e-4, rtol=0)
+    (batch,) = geometry.batches
+    assert min(batch.counts) > 500
+    sums = batch.gather.forward(torch.ones(n_read(geometry), 3))
+    torch.testing.assert_close(sums, torch.ones(len(batch.pixel), 3), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("model", MODELS, ids=repr)
+def test_a_pixel_reads_each_texel_once_and_every_texel_is_read(mug: Object3D, model: SamplingModel) -> None:
+    geometry, _ = reading(mug, model)
+    (batch,) = geometry.batches
+    taps = torch.diff(batch.gather.offsets, append=torch.tensor([len(batch.gather.index)]))
+    pixel = torch.arange(len(batch.pixel)).repeat_interleave(taps)
+    pairs = pixel * n_read(geometry) + batch.gather.index
+    assert (pairs.sort().values.diff() > 0).all()
+    assert (torch.bincount(batch.gather.index, minlength=n_read(geometry)) > 0).all()
+    assert n_read(geometry) < geometry.layout.total
 
 
 @pytest.mark.parametrize("model", MODELS, ids=repr)
@@ -109,7 +127,7 @@ def test_a_texture_of_one_colour_is_read_as_that_colour(mug: Object3D, model: Sa
     plain = mug.with_textures({name: np.full((5, 3, 3), colour) for name in mug.textures})
     _, surrogate = reading(plain, model)
     texels = surrogate.texels(textures_of(plain))
-    images, mean = surrogate.render(texels, [0, 1]), float(texels[0, 1])
+    images, mean = surrogate.render_all(texels), float(texels[0, 1])
     assert torch.isfinite(images).all()
     for values in read_values(plain, model):
         torch.testing.assert_close(values[:, 1], torch.full((len(values),), mean), atol=1e-4, rtol=0)
@@ -119,16 +137,12 @@ def test_a_texture_of_one_colour_is_read_as_that_colour(mug: Object3D, model: Sa
 def test_the_way_back_is_the_transpose_of_the_way_there(mug: Object3D, model: SamplingModel) -> None:
     geometry, _ = reading(mug, model)
     random = torch.Generator().manual_seed(0)
-    for view in geometry.views:
-        x = torch.randn(geometry.layout.total, 3, generator=random)
-        y = torch.randn(len(view.pixel), 3, generator=random)
-        back = torch.zeros_like(x)
-        view.gather.add_transpose(y, back)
-        there = (view.gather.forward(x).double() * y).sum()
-        torch.testing.assert_close((back.double() * x).sum(), there, rtol=1e-3, atol=1e-2)
-        again = back.clone()
-        view.gather.add_transpose(y, again)
-        torch.testing.assert_close(again, 2 * back)
+    (batch,) = geometry.batches
+    x = torch.randn(n_read(geometry), 3, generator=random)
+    y = torch.randn(len(batch.pixel), 3, generator=random)
+    back = batch.gather.transpose(y)
+    there = (batch.gather.forward(x).double() * y).sum()
+    torch.testing.assert_close((back.double() * x).sum(), there, rtol=1e-3, atol=1e-2)
 
 
 def test_the_last_row_of_the_image_file_is_at_v_zero_and_the_first_column_at_u_zero(
@@ -191,6 +205,6 @@ def test_each_part_reads_its_own_texture(make_object: Make, make_quad: Make) -> 
     obj = make_object((left[0] - [0.11, 0, 0], *left[1:]), (right[0] + [0.11, 0, 0], *right[1:]))
     views = [View(Camera(0.5, 0, 0))]
     geometry, _ = reading(obj, views=views)
-    columns = geometry.views[0].pixel % SIZE[1]
+    columns = geometry.batches[0].pixel % SIZE[1]
     values = read_values(obj, views=views)[0][:, 0] * 255
     torch.testing.assert_close(values, torch.where(columns < 32, 50.0, 150.0), atol=0.1, rtol=0)

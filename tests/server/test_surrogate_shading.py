@@ -10,12 +10,17 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from trompe_server.surrogate.shading import (
+    DIM,
+    ENCODERS,
+    GAIN,
+    GAMMA,
     DiffuseShading,
+    Encoder,
+    Encoding,
     Shading,
     decode,
-    decode_slope,
+    decode_with_slope,
     encode,
-    encode_slope,
     fit_curve,
     lambert,
 )
@@ -24,7 +29,14 @@ GREYS = (0, 64, 128, 191, 255)
 STEP = 1e-6
 
 
-def curve(greys: tuple[int, ...], probes: np.ndarray, *, coverage: float = 1.0, background: float = 0.0) -> Shading:
+def curve(
+    greys: tuple[int, ...],
+    probes: np.ndarray,
+    *,
+    coverage: float = 1.0,
+    background: float = 0.0,
+    encoding: Encoding = "srgb",
+) -> Shading:
     """The colour model through ``probes``, (greys, pixels, 3) in 0..255."""
     pixels = probes.shape[1]
     return fit_curve(
@@ -32,7 +44,7 @@ def curve(greys: tuple[int, ...], probes: np.ndarray, *, coverage: float = 1.0, 
         torch.from_numpy(probes.astype(np.uint8)),
         torch.full((pixels, 1), coverage),
         torch.full((pixels, 3), background),
-        "srgb",
+        encoding,
     )
 
 
@@ -55,7 +67,7 @@ UNIT = torch.linspace(0.001, 0.999, 1000, dtype=torch.float64)
 def test_srgb_follows_the_standard() -> None:
     encoded = torch.tensor([0, 10, 128, 255], dtype=torch.float64) / 255
     linear = torch.tensor([0, 0.003035269835488375, 0.21586050011389926, 1], dtype=torch.float64)
-    torch.testing.assert_close(decode(encoded), linear, atol=1e-9, rtol=1e-6)
+    torch.testing.assert_close(decode(encoded), linear, atol=1e-8, rtol=1e-6)
 
 
 def test_decoding_and_encoding_are_inverse_and_grow() -> None:
@@ -67,15 +79,50 @@ def test_decoding_and_encoding_are_inverse_and_grow() -> None:
 
 def test_slopes_of_srgb_are_those_of_finite_differences() -> None:
     away = UNIT[(UNIT - 0.04045).abs() > 1e-4]
-    torch.testing.assert_close(decode_slope(away, decode(away)), slope_of(decode, away), rtol=1e-4, atol=0)
-    torch.testing.assert_close(encode_slope(decode(away), "srgb"), slope_of(encode, decode(away)), rtol=1e-4, atol=0)
+    knee = torch.where(away < 0.04045, 0.02, 1e-4)
+    rising = decode_with_slope(away)[1] * (GAMMA / GAIN)
+    assert ((rising / slope_of(decode, away) - 1).abs() <= knee).all()
+    light = decode(away)
+    assert ((encode.with_slope(light)[1] / slope_of(encode, light) - 1).abs() <= knee).all()
 
 
-def test_black_and_white_have_finite_slopes() -> None:
+def test_the_power_encoding_is_the_root_and_its_slope_grows_no_further_in_the_dark() -> None:
+    encoder = ENCODERS["power"]
+    torch.testing.assert_close(encoder(UNIT), UNIT ** (1 / 2.2))
+    torch.testing.assert_close(encoder.with_slope(UNIT)[1], slope_of(encoder, UNIT), rtol=1e-4, atol=0)
+    dark = torch.tensor([0.0, DIM / 10, DIM], dtype=torch.float64)
+    torch.testing.assert_close(encoder(dark), dark ** (1 / 2.2), atol=1e-5, rtol=1e-6)
+    slopes = encoder.with_slope(dark)[1]
+    torch.testing.assert_close(slopes, slopes[2].expand(3))
+
+
+def test_black_is_decoded_to_no_less_than_black() -> None:
+    assert 0 <= decode(torch.zeros(9)).min() <= decode(torch.zeros(9)).max() < 1e-8
+
+
+@pytest.mark.parametrize("encoder", ENCODERS.values(), ids=ENCODERS)
+def test_black_and_white_have_finite_slopes(encoder: Encoder) -> None:
     ends = torch.tensor([0.0, 1.0])
-    for slope in (decode_slope(ends, decode(ends)), encode_slope(decode(ends), "srgb")):
+    for slope in (decode_with_slope(ends)[1], encoder.with_slope(ends)[1]):
         assert torch.isfinite(slope).all()
         assert (slope > 0).all()
+
+
+@pytest.mark.parametrize("greys", [(0, 128), GREYS], ids=repr)
+def test_a_black_pixel_that_an_albedo_would_lighten_has_a_slope(greys: tuple[int, ...]) -> None:
+    probes = np.linspace(0, 200, len(greys))[:, None, None] * np.ones((1, 40, 3))
+    colour, slope = curve(greys, probes)(values_of(0))
+    assert colour.max() < 1e-5
+    assert (slope > 0).all()
+
+
+def test_a_segment_that_bends_into_white_stays_white_behind_it() -> None:
+    probes = np.array([0, 120, 200, 255, 255])[:, None, None] * np.ones((1, 1, 3))
+    shading = curve(GREYS, probes)
+    colours, slopes = zip(*(shading(values_of(grey, pixels=1)) for grey in (160, 191, 220, 255)), strict=True)
+    assert [round(float(colour[0, 0]) * 255) for colour in colours[1:]] == [255] * 3
+    assert colours[0][0, 0] < 1 < 2 * colours[0][0, 0]
+    assert [bool(slope[0, 0] > 0) for slope in slopes] == [True, False, False, False]
 
 
 @pytest.mark.parametrize("greys", [(0, 255), (0, 100, 255), GREYS], ids=repr)
@@ -117,9 +164,14 @@ def test_monotone_probes_give_monotone_colours_between_the_first_and_the_last(va
     assert (colours * 255 <= torch.from_numpy(probes[-1]) + 0.3).all()
 
 
+@pytest.mark.parametrize("greys", [(0, 128), GREYS], ids=repr)
+@pytest.mark.parametrize("encoding", ["srgb", "power"])
 @pytest.mark.parametrize("grey", [12, 50, 90, 160, 230])
-def test_slopes_of_a_curve_are_those_of_finite_differences(grey: int) -> None:
-    shading, step = curve(GREYS, random_probes(5)), 2e-3
+def test_slopes_of_a_curve_are_those_of_finite_differences(
+    grey: int, encoding: Encoding, greys: tuple[int, ...]
+) -> None:
+    probes = 20 + random_probes(len(greys)) * (0.4 if len(greys) == 2 else 0.9)
+    shading, step = curve(greys, probes, coverage=0.9, background=0.02, encoding=encoding), 2e-3
     value = values_of(grey)
     slope = shading(value)[1]
     difference = (shading(value + step)[0] - shading(value - step)[0]) / (2 * step)
@@ -141,7 +193,7 @@ def test_the_ends_of_a_curve_are_finite(value: float) -> None:
 
 def test_the_diffuse_model_is_texture_times_shade_over_the_background() -> None:
     shade, coverage = torch.tensor([[0.5], [0.8], [0.8]]), torch.tensor([[1.0], [1.0], [0.25]])
-    shading = DiffuseShading(shade, coverage, torch.tensor([0.0, 0.5, 1.0]))
+    shading = DiffuseShading(shade * coverage, (1 - coverage) * torch.tensor([0.0, 0.5, 1.0]))
     values = torch.tensor([[0.2, 0.4, 0.6], [1.0, 0.5, 0.0], [1.0, 0.5, 0.0]])
     colour, slope = shading(values)
     expected = [[0.1, 0.2, 0.3], [0.8, 0.4, 0.0], [0.2, 0.1 + 0.375, 0.75]]

@@ -67,5 +67,5 @@ def test_it_recognises_the_shipped_objects_from_all_sides(shipped: ShippedObject
     elevations = np.linspace(*shipped.elevation, 4)
     views = [View(Camera(shipped.distance, 80.0 * k + 20.0, float(e))) for k, e in enumerate(elevations)]
     surrogate = diffuse_surrogate(prepare_geometry(obj, views, size=tiny.IMAGE_SIZE, sampling=SamplingModel()), views)
-    images = surrogate.render(surrogate.texels(textures_of(obj)), range(len(views)))
+    images = surrogate.render_all(surrogate.texels(textures_of(obj)))
     assert [CLASSES[k] for k in load_tiny()(images).argmax(dim=1)] == [shipped.label] * len(views)

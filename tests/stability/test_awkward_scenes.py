@@ -62,7 +62,7 @@ def surrogates(obj: Object3D, views: Sequence[View], model: SamplingModel) -> li
 
 def images_of(surrogate: Surrogate, obj: Object3D) -> Tensor:
     with torch.no_grad():
-        return surrogate.render(surrogate.texels(textures_of(obj)), range(surrogate.n_views))
+        return surrogate.render_all(surrogate.texels(textures_of(obj)))
 
 
 def step_from(surrogate: Surrogate, obj: Object3D) -> dict[str, Tensor]:
@@ -79,7 +79,7 @@ def check(obj: Object3D, views: Sequence[View], model: SamplingModel) -> None:
         assert torch.isfinite(images).all()
         assert 0 <= images.min() <= images.max() <= 1
         influence = surrogate.influence()
-        pixels = sum(len(view.pixel) for view in surrogate.geometry.views)
+        pixels = sum(len(batch.pixel) for batch in surrogate.geometry.batches)
         assert all(torch.isfinite(weight).all() for weight in influence.values())
         assert sum(float(weight.sum()) for weight in influence.values()) == pytest.approx(pixels, rel=1e-3, abs=1e-3)
         for name, delta in step_from(surrogate, obj).items():
@@ -143,8 +143,7 @@ def test_a_seam_between_uv_islands_reads_no_texel_of_the_other_side(make_object:
     uvs[0], uvs[1] = [[0.02, 0], [0.3, 0], [0.3, 1]], [[0.7, 0], [0.98, 1], [0.7, 1]]
     obj = make_object((corners, uvs, texture))
     surrogate = diffuse_surrogate(prepare_geometry(obj, FRONT[:1], size=(64, 64), sampling=SamplingModel()), FRONT[:1])
-    view = surrogate.geometry.views[0]
-    values = view.gather.forward(surrogate.texels(textures_of(obj)))[:, 0] * 255
+    values = surrogate.geometry.batches[0].gather.forward(surrogate.texels(textures_of(obj)))[:, 0] * 255
     pure = ((values - 40).abs() < 2) | ((values - 200).abs() < 2)
     assert pure.float().mean() > 0.85
     assert values.min() > 38
@@ -169,7 +168,7 @@ def test_a_view_that_sees_nothing_shows_its_background_and_changes_no_other_view
     check(obj, mixed, model)
     for with_empty, without in zip(surrogates(obj, mixed, model), surrogates(obj, FRONT, model), strict=True):
         images = images_of(with_empty, obj)
-        assert len(with_empty.geometry.views[1].pixel) == 0
+        assert with_empty.geometry.batches[0].counts[1] == 0
         assert (images[1] == 1).all()
         assert torch.equal(images[[0, 2]], images_of(without, obj))
 

@@ -4,7 +4,7 @@ from trompe_server.attack.attack import AttackState, Step, attack, load_state, m
 from trompe_server.attack.budget import Budget
 from trompe_server.attack.goal import fooled, margin, margin_loss
 from trompe_server.attack.saliency import saliency, saliency_masks
-from trompe_server.attack.views import framing_distance, grid_views, held_out_views
+from trompe_server.attack.views import framing_distance, grid_views, random_views
 
 __all__ = [
     "AttackState",
@@ -14,11 +14,11 @@ __all__ = [
     "fooled",
     "framing_distance",
     "grid_views",
-    "held_out_views",
     "load_state",
     "margin",
     "margin_loss",
     "movable",
+    "random_views",
     "saliency",
     "saliency_masks",
     "save_state",

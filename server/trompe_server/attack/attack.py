@@ -6,7 +6,7 @@ state = attack(state, textures, surrogate, classifier, label, budget=budget, ste
 painted = {name: budget.quantise(delta, ...) for name, delta in state.deltas.items()}
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,10 +20,7 @@ from trompe_server.attack.goal import fooled, margin_loss
 from trompe_server.classifiers import WhiteBoxClassifier
 from trompe_server.surrogate import Surrogate
 
-__all__ = ["BATCH", "AttackState", "Step", "attack", "load_state", "movable", "save_state", "start"]
-
-BATCH = 10
-"""Views per forward and backward pass: the fastest on CPUs (larger ones miss the caches)."""
+__all__ = ["AttackState", "Step", "attack", "load_state", "movable", "save_state", "start"]
 
 MOMENTUM = 0.9
 
@@ -81,18 +78,22 @@ def attack(
     total_steps: int | None = None,
     masks: Bool[Tensor, "views H W"] | None = None,
     texels: Mapping[str, Bool[Tensor, "H W"]] | None = None,
+    views_per_step: int | None = None,
+    seed: int = 0,
     on_step: Callable[[Step], None] = lambda _: None,
 ) -> AttackState:
     """``steps`` more steps of projected sign-gradient ascent on the expected margin over the surrogate's views.
 
     Momentum as Dong et al. (2018); the step falls linearly from ``2 alpha`` to 0 over ``total_steps`` (by default those
     that end with this call), so that ``alpha`` is its mean. ``textures`` are sRGB in [0, 1]; ``masks`` (saliency) let
-    only those pixels' gradients through, and only ``texels`` (by default those ``movable``) move. Deterministic.
+    only those pixels' gradients through, and only ``texels`` (by default those ``movable``) move. Each step looks at
+    all views, or at ``views_per_step`` drawn by ``seed`` and the step's number. Deterministic.
     """
     total = state.step + steps if total_steps is None else total_steps
     allowed = movable(surrogate, budget, masks) if texels is None else texels
     for step in range(state.step, state.step + steps):
-        gradients, seen = _gradients(state.deltas, textures, surrogate, classifier, label, masks)
+        batches = _drawn(surrogate, views_per_step, seed, step)
+        gradients, seen = _gradients(state.deltas, textures, surrogate, batches, classifier, label, masks)
         on_step(Step(step, *seen))
         momenta = _accumulated(state.momenta, gradients)
         scale = 2 * (total - step - 0.5) / total
@@ -102,6 +103,16 @@ def attack(
         }
         state = AttackState(step + 1, moved, momenta)
     return state
+
+
+def _drawn(surrogate: Surrogate, views: int | None, seed: int, step: int) -> Sequence[int]:
+    """Batches of the surrogate that a step looks at: all, or as many as hold about ``views`` views."""
+    total = len(surrogate.batches)
+    if views is None or views >= surrogate.n_views:
+        return range(total)
+    count = max(1, round(views * total / surrogate.n_views))
+    drawn = np.random.default_rng([seed, step]).choice(total, count, replace=False)
+    return sorted(drawn.tolist())
 
 
 def _accumulated(momenta: Textures, gradients: Textures) -> Textures:
@@ -114,6 +125,7 @@ def _gradients(
     deltas: Textures,
     textures: Textures,
     surrogate: Surrogate,
+    batches: Sequence[int],
     classifier: WhiteBoxClassifier,
     label: int,
     masks: Bool[Tensor, "views H W"] | None,
@@ -122,15 +134,14 @@ def _gradients(
     leaves = {name: (textures[name] + delta).requires_grad_() for name, delta in deltas.items()}
     texels = surrogate.texels(leaves)
     collected = texels.detach().requires_grad_()
-    loss, won = 0.0, 0
-    for first in range(0, surrogate.n_views, BATCH):
-        batch = range(first, min(first + BATCH, surrogate.n_views))
+    loss, won, count = 0.0, 0, sum(len(surrogate.batches[batch]) for batch in batches)
+    for batch in batches:
         logits = classifier.logits(surrogate.render(collected, batch, masks=masks))
         total = margin_loss(logits, label).sum()
         total.backward()  # type: ignore[no-untyped-call]
         loss, won = loss + float(total.detach()), won + int(fooled(logits, label).sum())
     gradients = torch.autograd.grad(texels, list(leaves.values()), collected.grad)
-    return dict(zip(leaves, gradients, strict=True)), (loss / surrogate.n_views, won / surrogate.n_views)
+    return dict(zip(leaves, gradients, strict=True)), (loss / count, won / count)
 
 
 def save_state(state: AttackState) -> bytes:

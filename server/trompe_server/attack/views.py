@@ -7,7 +7,7 @@ import numpy as np
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View
 from trompe_shared.object3d import Object3D
 
-__all__ = ["framing_distance", "grid_views", "held_out_views"]
+__all__ = ["framing_distance", "grid_views", "random_views"]
 
 
 def framing_distance(obj: Object3D) -> float:
@@ -31,7 +31,7 @@ def grid_views(
     ]
 
 
-def held_out_views(
+def random_views(
     n: int,
     *,
     distance: float,
@@ -39,8 +39,10 @@ def held_out_views(
     background: tuple[int, int, int],
     generator: np.random.Generator,
 ) -> Sequence[View]:
-    """``n`` views the attack has not seen: any azimuth, elevations of the range, distance +-10 %, light from azimuth
-    +-70 and elevation 35..88."""
+    """``n`` views as one may meet the object, to be attacked as a pool or to be held out.
+
+    Any azimuth, elevations of the range, distance +-10 %, light from azimuth +-70 and elevation 35..88.
+    """
     draw = generator.uniform
     return [
         View(

@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -116,25 +115,17 @@ def measure_fidelity(
 ) -> Fidelity:
     """Compare ``surrogate`` with the target's images (views, H, W, 3) of ``obj`` (clean) and of ``repainted``."""
     device = surrogate.base.device
+    true = [torch.from_numpy(each).to(device) for each in (clean, images)]
+    rows: list[tuple[float, float, float, float]] = []
     with torch.no_grad():
-        after = surrogate.texels(textures_of(repainted, device=device))
-        before = surrogate.texels(textures_of(obj, device=device))
-        plain = replace(surrogate, anchors=None)
-        rows = [
-            _compare(
-                surrogate.colours(after, index)[0] - surrogate.colours(before, index)[0],
-                plain.colours(before, index)[0],
-                _object_pixels(clean[index], view.pixel),
-                _object_pixels(images[index], view.pixel),
-            )
-            for index, view in enumerate(surrogate.geometry.views)
-            if len(view.pixel)
-        ]
+        texels = [surrogate.texels(textures_of(each, device=device)) for each in (obj, repainted)]
+        for number, batch in enumerate(surrogate.geometry.batches):
+            before, after = (surrogate.colours(each, number)[0] for each in texels)
+            plain = before if surrogate.anchors is None else before - surrogate.anchors[number]
+            columns = (after - before, plain, *(batch.of(each) / 255 for each in true))
+            by_view = zip(*(torch.split(column, list(batch.counts)) for column in columns), strict=True)
+            rows += [_compare(*pixels) for pixels in by_view if len(pixels[0])]
     return Fidelity(*(tuple(column) for column in zip(*rows, strict=True)))
-
-
-def _object_pixels(image: Image8, pixel: Tensor) -> Float[Tensor, "pixels 3"]:
-    return torch.from_numpy(image).to(pixel.device).flatten(0, 1)[pixel].float() / 255
 
 
 def _compare(

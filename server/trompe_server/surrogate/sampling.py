@@ -1,8 +1,8 @@
 """What a renderer reads from a texture for a pixel, as one sparse linear operator.
 
 All mip levels of all textures lie in one flat array of texels. For every pixel the operator holds which texels it reads
-and with which weights (trilinear, per fragment, fragments weighted by the samples they cover), so that a view of a
-repainted object is a single gather, and the gradient its transpose.
+and with which weights (trilinear, per fragment, fragments weighted by the samples they cover), so that some views of a
+repainted object are a single gather, and the gradient its transpose.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,10 +21,11 @@ __all__ = [
     "Gather",
     "MipLayout",
     "SamplingModel",
+    "Taps",
     "fragments_of",
-    "gather_of",
     "mip_layout",
-    "mip_pyramid",
+    "mip_levels",
+    "taps_of",
 ]
 
 
@@ -89,10 +90,10 @@ def mip_layout(sizes: Sequence[tuple[int, int]]) -> MipLayout:
     return MipLayout(tuple(levels), tuple(starts), position)
 
 
-def mip_pyramid(
+def mip_levels(
     textures: Sequence[Float[Tensor, "H W 3"]], layout: MipLayout, *, rounded: bool = False
-) -> Float[Tensor, "texels 3"]:
-    """All mip levels of ``textures`` (row 0 on top), box filtered, as one flat array. Differentiable.
+) -> list[Float[Tensor, "_ 3"]]:
+    """The texels of all mip levels of ``textures`` (row 0 on top), box filtered, in the layout's order. Differentiable.
 
     With ``rounded`` levels are rounded to 8 bits as they are made; the gradient passes as if they were not.
     """
@@ -103,7 +104,7 @@ def mip_pyramid(
         for size in sizes[1:]:
             level = _halve(level, size, _round8 if rounded else _same)
             levels.append(level.reshape(-1, 3))
-    return torch.cat(levels)
+    return levels
 
 
 def _halve(
@@ -112,9 +113,10 @@ def _halve(
     """The next mip level; ``settle`` is applied to the averages of columns, and to those of rows."""
     height, width = size
     if level.shape[:2] == (2 * height, 2 * width):
-        columns = settle((level[:, 0::2] + level[:, 1::2]) / 2)
-        return settle((columns[0::2] + columns[1::2]) / 2)
-    return settle(adaptive_avg_pool2d(level.permute(2, 0, 1), size).permute(1, 2, 0))
+        left, right = level.view(2 * height, width, 2, 3).unbind(2)
+        upper, lower = settle((left + right) / 2).view(height, 2, width, 3).unbind(1)
+        return settle((upper + lower) / 2)
+    return settle(adaptive_avg_pool2d(level.permute(2, 0, 1), size).permute(1, 2, 0).contiguous())
 
 
 def _same(values: Tensor) -> Tensor:
@@ -180,27 +182,46 @@ def _texture_coordinates(
 
 
 @dataclass(frozen=True)
+class Taps:
+    """Which pixel (``entry``, ascending) reads which texel with which weight, int32 and float32; no pair twice."""
+
+    entry: Int[Tensor, " taps"]
+    index: Int[Tensor, " taps"]
+    weight: Float[Tensor, " taps"]
+
+
+@dataclass(frozen=True)
 class Gather:
     """A sparse matrix (pixels x texels) in both directions: ``pixels = forward(texels)`` and its transpose."""
 
     index: Int[Tensor, " taps"]
     weight: Float[Tensor, " taps"]
     offsets: Int[Tensor, " pixels"]
-    touched: Int[Tensor, " texels_read"]
     pixel: Int[Tensor, " taps"]
     transposed_weight: Float[Tensor, " taps"]
-    transposed_offsets: Int[Tensor, " texels_read"]
+    transposed_offsets: Int[Tensor, " texels"]
+
+    @classmethod
+    def of(cls, taps: Taps, n_pixels: int, n_texels: int) -> "Gather":
+        """Order the taps by texel too."""
+        by_texel = taps.index.argsort(stable=True)
+        return cls(
+            taps.index,
+            taps.weight,
+            _starts(taps.entry, n_pixels),
+            taps.entry[by_texel],
+            taps.weight[by_texel],
+            _starts(taps.index, n_texels),
+        )
 
     def forward(self, texels: Float[Tensor, "texels 3"]) -> Float[Tensor, "pixels 3"]:
         """Weighted sums of the texels that each pixel reads."""
         return embedding_bag(self.index, texels, self.offsets, mode="sum", per_sample_weights=self.weight)
 
-    def add_transpose(self, pixels: Float[Tensor, "pixels 3"], texels: Float[Tensor, "texels 3"]) -> None:
-        """Add to ``texels`` what each of them gets from the ``pixels`` that read it: the transpose of ``forward``."""
+    def transpose(self, pixels: Float[Tensor, "pixels 3"]) -> Float[Tensor, "texels 3"]:
+        """What each texel gets from the ``pixels`` that read it: the transpose of ``forward``."""
         offsets, weight = self.transposed_offsets, self.transposed_weight
-        texels.index_add_(
-            0, self.touched, embedding_bag(self.pixel, pixels, offsets, mode="sum", per_sample_weights=weight)
-        )
+        return embedding_bag(self.pixel, pixels, offsets, mode="sum", per_sample_weights=weight)
 
     @property
     def nbytes(self) -> int:
@@ -208,8 +229,14 @@ class Gather:
         return sum(t.nbytes for t in vars(self).values())
 
 
-def gather_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout, model: SamplingModel) -> Gather:
-    """The operator of one view (or several, with ``entry`` counted on) under the hypothesis ``model``.
+def _starts(keys: Int[Tensor, " taps"], n_keys: int) -> Int[Tensor, " keys"]:
+    """Where each key's run would begin if the taps were sorted by key."""
+    counts = torch.bincount(keys, minlength=n_keys)
+    return (counts.cumsum(0) - counts).int()
+
+
+def taps_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout, model: SamplingModel) -> Taps:
+    """What the pixels of one view read under the hypothesis ``model``.
 
     Weights of a pixel sum to one: the share of it that the object covers belongs to the colour model.
     """
@@ -232,7 +259,7 @@ def gather_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout
             entries.append(entry[used, None].expand(-1, 4).reshape(-1))
             indices.append(index.reshape(-1))
             weights.append((weight * (blend * part)[used, None]).reshape(-1))
-    return _compress(torch.cat(entries), torch.cat(indices), torch.cat(weights), n_pixels)
+    return _merged(torch.cat(entries), torch.cat(indices), torch.cat(weights), layout.total)
 
 
 def level_of_detail(duv: Float[Tensor, "n 2 2"], size: tuple[int, int], model: SamplingModel) -> Float[Tensor, " n"]:
@@ -264,23 +291,12 @@ def _bilinear(
     return index, weight
 
 
-def _compress(
-    entry: Int[Tensor, " taps"], index: Int[Tensor, " taps"], weight: Float[Tensor, " taps"], n_pixels: int
-) -> Gather:
-    """Order the taps by pixel for the forward pass and by texel for the backward pass."""
+def _merged(
+    entry: Int[Tensor, " taps"], index: Int[Tensor, " taps"], weight: Float[Tensor, " taps"], n_texels: int
+) -> Taps:
+    """The taps that count, in order, those of the same pixel and texel in one."""
     used = (weight > 1e-6).nonzero()[:, 0]
-    entry, index, weight = entry[used], index[used], weight[used].float()
-    by_pixel = entry.argsort(stable=True)
-    entry, index, weight = entry[by_pixel], index[by_pixel], weight[by_pixel]
-    by_texel = index.argsort(stable=True)
-    touched, counts = torch.unique_consecutive(index[by_texel], return_counts=True)
-    per_pixel = torch.bincount(entry, minlength=n_pixels)
-    return Gather(
-        index.int(),
-        weight,
-        (per_pixel.cumsum(0) - per_pixel).int(),
-        touched,
-        entry[by_texel].int(),
-        weight[by_texel],
-        (counts.cumsum(0) - counts).int(),
-    )
+    pair, order = (entry[used] * n_texels + index[used]).sort(stable=True)
+    pair, which = torch.unique_consecutive(pair, return_inverse=True)
+    total = torch.zeros(len(pair), device=weight.device).index_add_(0, which, weight[used][order].float())
+    return Taps((pair // n_texels).int(), (pair % n_texels).int(), total)

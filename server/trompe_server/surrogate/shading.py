@@ -4,8 +4,9 @@ Each model is a function of one number per pixel and channel, applied elementwis
 its value. sRGB encoding follows IEC 61966-2-1.
 """
 
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final, Literal, Protocol
 
 import torch
 from jaxtyping import Float, UInt8
@@ -16,32 +17,97 @@ Encoding = Literal["srgb", "power"]
 POWER = 2.2
 """Exponent of the plain power-law encoding that some renderers use in place of the sRGB curve."""
 
-__all__ = ["CurveShading", "DiffuseShading", "Shading", "decode", "decode_slope", "encode", "encode_slope", "lambert"]
+__all__ = [
+    "CurveShading",
+    "DiffuseShading",
+    "Encoder",
+    "Shading",
+    "decode",
+    "decode_with_slope",
+    "encode",
+    "fit_curve",
+    "lambert",
+]
 
 
 class Shading(Protocol):
-    """The colour model of one view."""
+    """The colour model of the object's pixels."""
 
     def __call__(
         self, values: Float[Tensor, "pixels 3"]
     ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"]]:
-        """Colours (sRGB in [0, 1]) of pixels that read ``values`` (encoded, in [0, 1]), and d colour / d value."""
+        """Colours (encoded, clipped to [0, 1]) of pixels that read ``values`` (encoded, in [0, 1]), and d colour /
+        d value."""
         ...
+
+
+GAIN, OFFSET, GAMMA = 1.055, 0.055, 2.4
+TOE = 12.92
+KNEE = (0.04045 + OFFSET) / GAIN
+"""sRGB: linear light is ((encoded + OFFSET) / GAIN) ** GAMMA, and encoded / TOE where that base is below the KNEE."""
 
 
 def decode(encoded: Tensor) -> Tensor:
     """sRGB-encoded values in [0, 1] to linear light."""
-    return torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055).clamp(min=0) ** 2.4)
+    return decode_with_slope(encoded)[0]
 
 
-def encode(linear: Tensor) -> Tensor:
-    """Linear light in [0, 1] to sRGB-encoded values."""
-    return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
+def decode_with_slope(encoded: Tensor) -> tuple[Tensor, Tensor]:
+    """Linear light of sRGB-encoded values, and its derivative in units of GAMMA / GAIN.
+
+    The line below the knee is written as what it lacks of the power there: one power does for both, without branches.
+    Its slope is taken to be that of the power at the knee (they differ by 2 %).
+    """
+    base = encoded.add(OFFSET).mul_(1 / GAIN)
+    bright = base.clamp(min=KNEE)
+    power = bright.pow(GAMMA)
+    return torch.add(power, base - bright, alpha=GAIN / TOE), power.div_(bright)
 
 
-def decode_slope(encoded: Tensor, linear: Tensor) -> Tensor:
-    """Derivative of ``decode`` at ``encoded``, whose decoding is ``linear``."""
-    return torch.where(encoded <= 0.04045, 1 / 12.92, 2.4 * linear / (encoded + 0.055))
+@dataclass(frozen=True)
+class Encoder:
+    """An encoding of linear light: ``gain * (bright ** exponent + toe * (light - bright)) - offset``, where ``bright``
+    is the light, ``dark`` at least. ``steepest`` bounds ``bright ** exponent / bright``, and with it the slope."""
+
+    exponent: float
+    gain: float
+    offset: float
+    toe: float
+    dark: float
+    steepest: float
+
+    @property
+    def steepness(self) -> float:
+        """What turns the slopes of ``decode_with_slope`` times those of ``partly`` into a derivative."""
+        return GAMMA / GAIN * self.exponent * self.gain
+
+    def __call__(self, light: Tensor) -> Tensor:
+        """Linear light in [0, 1] to encoded values."""
+        return self.with_slope(light)[0]
+
+    def with_slope(self, light: Tensor) -> tuple[Tensor, Tensor]:
+        """Encoded values, and their derivative by the light."""
+        part, slope = self.partly(light)
+        return part * self.gain - self.offset, slope * (self.exponent * self.gain)
+
+    def partly(self, light: Tensor) -> tuple[Tensor, Tensor]:
+        """Encoded values before gain and offset, and their derivative in units of the exponent."""
+        bright = light.clamp(min=self.dark)
+        power = bright.pow(self.exponent)
+        return torch.add(power, light - bright, alpha=self.toe), power.div_(bright).clamp_(max=self.steepest)
+
+
+DIM = 1e-4
+"""Linear light below which the slope of the power encoding grows no further: a chord over the first 8-bit steps, not a
+tangent."""
+
+ENCODERS: Final[Mapping[Encoding, Encoder]] = {
+    "srgb": Encoder(1 / GAMMA, GAIN, OFFSET, TOE / GAIN, 0.0031308, 0.0031308 ** (1 / GAMMA - 1)),
+    "power": Encoder(1 / POWER, 1.0, 0.0, 0.0, 1e-12, DIM ** (1 / POWER - 1)),
+}
+
+encode = ENCODERS["srgb"]
+"""Linear light in [0, 1] to sRGB-encoded values."""
 
 
 def decode_as(encoded: Tensor, encoding: Encoding) -> Tensor:
@@ -49,33 +115,21 @@ def decode_as(encoded: Tensor, encoding: Encoding) -> Tensor:
     return decode(encoded) if encoding == "srgb" else encoded**POWER
 
 
-def encode_as(linear: Tensor, encoding: Encoding) -> Tensor:
-    """Linear light in [0, 1] to encoded image values."""
-    return encode(linear) if encoding == "srgb" else linear ** (1 / POWER)
-
-
-def encode_slope(linear: Tensor, encoding: Encoding) -> Tensor:
-    """Derivative of ``encode_as`` at ``linear`` > 0."""
-    encoded = encode_as(linear, encoding)
-    return 1 / decode_slope(encoded, linear) if encoding == "srgb" else encoded / (POWER * linear)
-
-
 @dataclass(frozen=True)
 class DiffuseShading:
     """The paper's surrogate: texture value times (ambient + Lambert), in encoded values, over a known background.
 
-    shade: ambient + diffuse * max(0, n . l) of each pixel. coverage: share of the pixel that the object covers.
+    factor: ambient + diffuse * max(0, n . l) of each pixel, times the share of it that the object covers. shift: what
+    the background adds.
     """
 
-    shade: Float[Tensor, "pixels 1"]
-    coverage: Float[Tensor, "pixels 1"]
-    background: Float[Tensor, "pixels 3"]
+    factor: Float[Tensor, "pixels 1"]
+    shift: Float[Tensor, "pixels 3"]
 
     def __call__(
         self, values: Float[Tensor, "pixels 3"]
     ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"]]:
-        factor = self.shade * self.coverage
-        return values * factor + (1 - self.coverage) * self.background, factor.expand_as(values)
+        return torch.addcmul(self.shift, values, self.factor).clamp_(0, 1), self.factor.expand_as(values)
 
 
 AMBIENT, DIFFUSE = 0.5, 0.3
@@ -96,40 +150,42 @@ class CurveShading:
     the rest shows the background. For one shading point under fixed light that is exact physics whatever the material,
     with two probes; more greys follow what several shading points in one pixel make of saturation.
 
-    nodes: linear albedo at which segments begin, ascending. light, slope: the line of each segment.
+    light, slope: the line that black begins. nodes: linear albedo where the next segments begin, ascending. bends: how
+    much the slope changes there. steepness: share of the pixel that the object covers, times that of the encoder.
+    shift: added to the colour of that share: what the background adds, and what anchors the prediction.
     """
 
-    nodes: Float[Tensor, " segments"]
-    light: Float[Tensor, "segments pixels 3"]
-    slope: Float[Tensor, "segments pixels 3"]
-    coverage: Float[Tensor, "pixels 1"]
-    background: Float[Tensor, "pixels 3"]
+    light: Float[Tensor, "pixels 3"]
+    slope: Float[Tensor, "pixels 3"]
+    nodes: tuple[float, ...]
+    bends: Float[Tensor, "nodes pixels 3"]
+    steepness: Float[Tensor, "pixels 3"]
+    shift: Float[Tensor, "pixels 3"]
     encoding: Encoding
 
     def __call__(
         self, values: Float[Tensor, "pixels 3"]
     ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"]]:
-        linear = decode(values)
-        start, light, slope = self._segment(linear)
-        exact = torch.addcmul(light, slope, linear - start)
-        shown = exact.clamp(0, 1)
-        colour = encode_as(shown, self.encoding)
-        steepness = slope * decode_slope(values, linear) * encode_slope(shown.clamp(min=DIM), self.encoding)
-        steepness = steepness * ((exact >= 0) & (exact < 1))
-        return self.coverage * colour + (1 - self.coverage) * self.background, self.coverage * steepness
+        encoder = ENCODERS[self.encoding]
+        linear, decoding = decode_with_slope(values)
+        light, slope = torch.addcmul(self.light, self.slope, linear), self.slope
+        for node, bend in zip(self.nodes, self.bends, strict=True):
+            beyond = (linear - node).relu_()
+            light.addcmul_(bend, beyond)
+            slope = torch.addcmul(slope, bend, beyond.sign_())
+        lit = light.clamp(0, 1)
+        encoded, encoding = encoder.partly(lit)
+        colour = torch.addcmul(self.shift, self.steepness, encoded, value=encoder.gain / encoder.steepness)
+        inside = (lit == light).logical_and_(colour.clamp(-ROUNDING, 1 + ROUNDING) == colour)
+        return colour.clamp_(0, 1), decoding.mul_(encoding).mul_(slope).mul_(self.steepness).mul_(inside)
 
-    def _segment(self, linear: Float[Tensor, "pixels 3"]) -> tuple[Tensor, Tensor, Tensor]:
-        """(albedo where it begins, light there, slope) of the segment that each value lies in."""
-        if len(self.nodes) == 1:
-            return self.nodes[0], self.light[0].float(), self.slope[0].float()
-        segment = torch.bucketize(linear, self.nodes[1:].contiguous())
-        light, slope = (table.gather(0, segment[None])[0].float() for table in (self.light, self.slope))
-        return self.nodes[segment], light, slope
+    def anchored(self, anchor: Float[Tensor, "pixels 3"]) -> "CurveShading":
+        """The same with ``anchor`` added to all colours."""
+        return replace(self, shift=self.shift + anchor)
 
 
-DIM = 1e-4
-"""Linear light below which the slope of the encoding grows no further: a chord over the first 8-bit steps, not a
-tangent."""
+ROUNDING = 1e-5
+"""A colour so little below black or above white is not clipped, just rounded."""
 
 WHITE = 0.996
 """Encoded values from here on may be clipped."""
@@ -144,13 +200,25 @@ def fit_curve(
 ) -> CurveShading:
     """The colour model through the target's own images of the object painted in K greys (encoded, ascending, from 0).
 
-    A segment that ends in white may bend on the way there: it takes the slope of the one before it and is clipped.
+    A segment that ends in white may bend on the way there: it takes the slope of the one before it, if that is steeper,
+    and is clipped.
     """
+    uncovered = (1 - coverage) * background
     nodes = decode(greys.float() / 255)
-    shown = ((probes.float() / 255 - (1 - coverage) * background) / coverage).clamp(0, 1)
+    shown = ((probes.float() / 255 - uncovered) / coverage).clamp(0, 1)
     light = decode_as(shown, encoding)
     slope = light.diff(dim=0) / nodes.diff()[:, None, None]
     bends = (shown[1:] >= WHITE) & (shown[:-1] < WHITE)
     for segment in range(1, len(slope)):
-        slope[segment] = torch.where(bends[segment], slope[segment - 1], slope[segment])
-    return CurveShading(nodes[:-1], light[:-1].half(), slope.half(), coverage, background, encoding)
+        steeper = slope[segment].maximum(slope[segment - 1])
+        slope[segment] = torch.where(bends[segment], steeper, slope[segment])
+    encoder = ENCODERS[encoding]
+    return CurveShading(
+        light[0],
+        slope[0],
+        tuple(nodes[1:-1].tolist()),
+        slope.diff(dim=0),
+        (coverage * encoder.steepness).expand_as(background).contiguous(),
+        uncovered - coverage * encoder.offset,
+        encoding,
+    )

@@ -2,7 +2,8 @@
 
 geometry = prepare_geometry(obj, views, size=(224, 224), sampling=SamplingModel())
 surrogate = curve_surrogate(geometry, obj, views, clean, greys, probes)  # or diffuse_surrogate(geometry, views)
-images = surrogate.render(surrogate.texels(textures), batch=[0, 1])  # differentiable in the textures
+texels = surrogate.texels(textures)
+images = surrogate.render(texels, batch=0)  # of the views surrogate.batches[0]; differentiable in the textures
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import Function
@@ -21,19 +22,21 @@ from trompe_server.surrogate.sampling import (
     Gather,
     MipLayout,
     SamplingModel,
+    Taps,
     fragments_of,
-    gather_of,
     mip_layout,
-    mip_pyramid,
+    mip_levels,
+    taps_of,
 )
-from trompe_server.surrogate.shading import DiffuseShading, Shading, decode, decode_slope, encode, fit_curve, lambert
+from trompe_server.surrogate.shading import CurveShading, DiffuseShading, Shading, decode, encode, fit_curve, lambert
 from trompe_shared.geometry import View, spherical
 from trompe_shared.object3d import Object3D
 
 __all__ = [
+    "BATCH",
     "Geometry",
     "Surrogate",
-    "ViewGeometry",
+    "ViewBatch",
     "curve_surrogate",
     "diffuse_surrogate",
     "prepare_geometry",
@@ -43,31 +46,58 @@ __all__ = [
 Image8 = NDArray[np.uint8]
 
 
-@dataclass(frozen=True)
-class ViewGeometry:
-    """One view, rasterised: its object pixels (row * W + column), what they read, and how the paper's light shades
-    them."""
+BATCH = 10
+"""Views that are one operator: the fastest on CPUs (larger batches miss the caches)."""
 
+
+@dataclass(frozen=True)
+class ViewBatch:
+    """Some successive views, rasterised: their object pixels, what they read, and how the paper's light shades them.
+
+    pixel: (view * H + row) * W + column, the views of the batch counted from 0. counts: object pixels of each view.
+    """
+
+    views: range
     pixel: Int[Tensor, " pixels"]
+    counts: tuple[int, ...]
     gather: Gather
     coverage: Float[Tensor, "pixels 1"]
     shade: Float[Tensor, "pixels 1"]
 
+    def of(self, images: Shaped[Tensor, "views H W ..."]) -> Shaped[Tensor, "pixels ..."]:
+        """What ``images`` of all views show at the object's pixels of these, (pixels, ...)."""
+        return images[self.views.start : self.views.stop].flatten(0, 2).index_select(0, self.pixel)
+
 
 @dataclass(frozen=True)
 class Geometry:
-    """All views of one object under one sampling hypothesis. ``size`` is (H, W)."""
+    """All views of one object under one sampling hypothesis. ``size`` is (H, W).
+
+    reads: of each mip level in the layout's order, the texels that some view reads, ascending. These alone, one level
+    after the other, are what the operators know as ``texels``.
+    """
 
     textures: tuple[str, ...]
     layout: MipLayout
+    reads: tuple[Int[Tensor, " _"], ...]
     sampling: SamplingModel
     size: tuple[int, int]
-    views: tuple[ViewGeometry, ...]
+    batches: tuple[ViewBatch, ...]
+
+    def texels(self, textures: Sequence[Float[Tensor, "H W 3"]], *, rounded: bool = False) -> Float[Tensor, "texels 3"]:
+        """The texels that some view reads of the mip levels of ``textures``. Differentiable."""
+        levels = mip_levels(textures, self.layout, rounded=rounded)
+        return torch.cat([level.index_select(0, reads) for level, reads in zip(levels, self.reads, strict=True)])
+
+    @property
+    def device(self) -> torch.device:
+        """Where the operators lie."""
+        return self.reads[0].device
 
     @property
     def nbytes(self) -> int:
         """Memory of the operators."""
-        return sum(view.gather.nbytes + view.pixel.nbytes for view in self.views)
+        return sum(batch.gather.nbytes + batch.pixel.nbytes for batch in self.batches)
 
 
 def prepare_geometry(
@@ -81,13 +111,29 @@ def prepare_geometry(
     """Rasterise ``obj`` once for all ``views`` and images of ``size`` (H, W)."""
     mesh = mesh_of(obj, device=device)
     layout = mip_layout([obj.textures[name].shape[:2] for name in mesh.textures])
-    prepared = tuple(_prepare_view(mesh, layout, view, size, sampling) for view in views)
-    return Geometry(mesh.textures, layout, sampling, size, prepared)
+    prepared = [_prepare_view(mesh, layout, view, size, sampling) for view in views]
+    read = torch.zeros(layout.total, dtype=torch.bool, device=device)
+    for view in prepared:
+        read[view.taps.index] = True
+    place = read.cumsum(0, dtype=torch.int32) - 1
+    by_level = torch.split(read, [h * w for sizes in layout.sizes for h, w in sizes])
+    reads = tuple(level.nonzero()[:, 0] for level in by_level)
+    numbers = [range(first, min(first + BATCH, len(views))) for first in range(0, len(views), BATCH)]
+    batches = tuple(_joined(some, prepared[some.start : some.stop], place, size) for some in numbers)
+    return Geometry(mesh.textures, layout, reads, sampling, size, batches)
 
 
-def _prepare_view(
-    mesh: Mesh, layout: MipLayout, view: View, size: tuple[int, int], sampling: SamplingModel
-) -> ViewGeometry:
+@dataclass(frozen=True)
+class _View:
+    """One view, as ``ViewBatch`` has several."""
+
+    pixel: Int[Tensor, " pixels"]
+    taps: Taps
+    coverage: Float[Tensor, "pixels 1"]
+    shade: Float[Tensor, "pixels 1"]
+
+
+def _prepare_view(mesh: Mesh, layout: MipLayout, view: View, size: tuple[int, int], sampling: SamplingModel) -> _View:
     planes = project(mesh, view.camera, size, cull=sampling.cull)
     visibility = rasterize(planes, size, sampling.positions)
     fragments = fragments_of(visibility, mesh, size[1], samples=sampling.positions, shade_at=sampling.shade_at)
@@ -97,16 +143,30 @@ def _prepare_view(
     shade = torch.zeros(n_pixels, 1, device=normals.device)
     shade.index_add_(0, fragments.entry, lambert(normals, towards) * fragments.weight[:, None])
     coverage = torch.zeros_like(shade).index_add_(0, fragments.entry, fragments.weight[:, None])
-    return ViewGeometry(
-        visibility.pixel,
-        gather_of(fragments, n_pixels, mesh, layout, sampling),
-        coverage,
-        shade / coverage.clamp(min=1e-6),
+    taps = taps_of(fragments, n_pixels, mesh, layout, sampling)
+    return _View(visibility.pixel, taps, coverage, shade / coverage.clamp(min=1e-6))
+
+
+def _joined(numbers: range, views: Sequence[_View], place: Int[Tensor, " texels"], size: tuple[int, int]) -> ViewBatch:
+    """``views``, which are those of ``numbers``, as one operator that finds texel ``t`` at ``place[t]``."""
+    counts = tuple(len(view.pixel) for view in views)
+    taps = Taps(
+        torch.cat([view.taps.entry + sum(counts[:k]) for k, view in enumerate(views)]),
+        place.index_select(0, torch.cat([view.taps.index for view in views])),
+        torch.cat([view.taps.weight for view in views]),
+    )
+    return ViewBatch(
+        numbers,
+        torch.cat([view.pixel + k * size[0] * size[1] for k, view in enumerate(views)]),
+        counts,
+        Gather.of(taps, sum(counts), int(place[-1]) + 1),
+        torch.cat([view.coverage for view in views]),
+        torch.cat([view.shade for view in views]),
     )
 
 
 class _RenderViews(Function):
-    """Images of some views from the flat texel array, with the gradient's way back.
+    """Images of a batch of views from the texels, with the gradient's way back.
 
     ``masks`` (saliency), where given, multiplies the image gradient before it flows into the texture (the paper's
     equation 4).
@@ -117,31 +177,23 @@ class _RenderViews(Function):
         ctx: FunctionCtx,
         texels: Float[Tensor, "texels 3"],
         surrogate: "Surrogate",
-        batch: Sequence[int],
+        batch: int,
         masks: Bool[Tensor, "views H W"] | None,
     ) -> Float[Tensor, "batch 3 H W"]:
-        images = surrogate.base[list(batch)].float().div_(255).flatten(1, 2)  # (batch, H * W, 3)
-        slopes = []
-        for image, index in zip(images, batch, strict=True):
-            colour, slope = surrogate.colours(texels, index)
-            image[surrogate.geometry.views[index].pixel] = colour
-            slopes.append(slope)
-        ctx.surrogate, ctx.batch, ctx.masks, ctx.slopes = surrogate, batch, masks, slopes  # type: ignore[attr-defined]
-        ctx.n_texels = len(texels)  # type: ignore[attr-defined]
-        return images.view(len(batch), *surrogate.geometry.size, 3).permute(0, 3, 1, 2)
+        some = surrogate.geometry.batches[batch]
+        colours, slopes = surrogate.colours(texels.detach(), batch)
+        images = surrogate.base[some.views.start : some.views.stop].div(255)
+        images.view(-1, 3).index_copy_(0, some.pixel, colours)
+        if masks is not None:
+            slopes = slopes * some.of(masks)[:, None]
+        ctx.some, ctx.slopes = some, slopes  # type: ignore[attr-defined]
+        return images.permute(0, 3, 1, 2)
 
     @staticmethod
     def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[Tensor, None, None, None]:
-        surrogate, masks = ctx.surrogate, ctx.masks  # type: ignore[attr-defined]
-        per_view = gradient.permute(0, 2, 3, 1).flatten(1, 2)
-        total = gradient.new_zeros(ctx.n_texels, 3)  # type: ignore[attr-defined]
-        for image, index, slope in zip(per_view, ctx.batch, ctx.slopes, strict=True):  # type: ignore[attr-defined]
-            view = surrogate.geometry.views[index]
-            pixels = image[view.pixel] * slope
-            if masks is not None:
-                pixels *= masks[index].flatten()[view.pixel, None]
-            view.gather.add_transpose(pixels, total)
-        return total, None, None, None
+        some: ViewBatch = ctx.some  # type: ignore[attr-defined]
+        pixels = gradient.permute(0, 2, 3, 1).reshape(-1, 3).index_select(0, some.pixel)
+        return some.gather.transpose(pixels.mul_(ctx.slopes)), None, None, None  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True)
@@ -149,8 +201,8 @@ class Surrogate:
     """A differentiable model of the target renderer for fixed views.
 
     base: (views, H, W, 3) uint8, what every pixel shows that the object does not touch.
-    shadings: the colour model of each view. anchors: per view, added to the predicted colours of the object's pixels,
-    so that the unpainted object is predicted as the target shows it; ``None`` where the target has not been asked.
+    shadings: the colour model of each batch of views. anchors: what it adds to the colours of the object's pixels, so
+    that the unpainted object is predicted as the target shows it; ``None`` where the target has not been asked.
     """
 
     geometry: Geometry
@@ -162,59 +214,59 @@ class Surrogate:
     @property
     def n_views(self) -> int:
         """How many views it knows."""
-        return len(self.geometry.views)
+        return len(self.base)
+
+    @property
+    def batches(self) -> tuple[range, ...]:
+        """The views of each batch."""
+        return tuple(batch.views for batch in self.geometry.batches)
 
     def texels(self, textures: Mapping[str, Float[Tensor, "H W 3"]]) -> Float[Tensor, "texels 3"]:
-        """The flat mip pyramids of ``textures`` (sRGB in [0, 1], row 0 on top). Differentiable; do it once a step."""
+        """What the views read of ``textures`` (sRGB in [0, 1], row 0 on top). Differentiable; do it once a step."""
         ordered = [textures[name] for name in self.geometry.textures]
-        linear = self.geometry.sampling.filtered == "linear"
-        if linear:
-            return mip_pyramid([decode(texture) for texture in ordered], self.geometry.layout)
-        return mip_pyramid(ordered, self.geometry.layout, rounded=self.geometry.sampling.mips == "rounded")
+        if self.geometry.sampling.filtered == "linear":
+            return self.geometry.texels([decode(texture) for texture in ordered])
+        return self.geometry.texels(ordered, rounded=self.geometry.sampling.mips == "rounded")
 
     def render(
-        self,
-        texels: Float[Tensor, "texels 3"],
-        batch: Sequence[int],
-        *,
-        masks: Bool[Tensor, "views H W"] | None = None,
+        self, texels: Float[Tensor, "texels 3"], batch: int, *, masks: Bool[Tensor, "views H W"] | None = None
     ) -> Float[Tensor, "batch 3 H W"]:
-        """Images of the views ``batch`` (sRGB in [0, 1]; channels last in memory), differentiable in ``texels``.
+        """Images of the views ``batches[batch]`` (sRGB in [0, 1]; channels last in memory), differentiable in
+        ``texels``.
 
         ``masks`` has a row for every view of the surrogate; pixels outside of it pass no gradient.
         """
-        images: Tensor = _RenderViews.apply(texels, self, list(batch), masks)  # type: ignore[no-untyped-call]
+        images: Tensor = _RenderViews.apply(texels, self, batch, masks)  # type: ignore[no-untyped-call]
         return images
+
+    def render_all(
+        self, texels: Float[Tensor, "texels 3"], *, masks: Bool[Tensor, "views H W"] | None = None
+    ) -> Float[Tensor, "views 3 H W"]:
+        """The images of all views at once."""
+        return torch.cat([self.render(texels, batch, masks=masks) for batch in range(len(self.batches))])
 
     def influence(self, masks: Bool[Tensor, "views H W"] | None = None) -> dict[str, Float[Tensor, "H W"]]:
         """Total weight with which the pixels of all views (those of ``masks`` alone, where given) read each texel."""
-        layout = self.geometry.layout
-        device = self.base.device
-        ones = [torch.ones(*sizes[0], 3, device=device, requires_grad=True) for sizes in layout.sizes]
-        texels = mip_pyramid(ones, layout)
+        geometry, device = self.geometry, self.base.device
+        ones = [torch.ones(*sizes[0], 3, device=device, requires_grad=True) for sizes in geometry.layout.sizes]
+        texels = geometry.texels(ones)
         total = torch.zeros_like(texels)
-        for index, view in enumerate(self.geometry.views):
-            seen = torch.ones(len(view.pixel), 3, device=device)
-            if masks is not None:
-                seen *= masks[index].flatten()[view.pixel, None]
-            view.gather.add_transpose(seen, total)
+        for batch in geometry.batches:
+            seen = torch.ones(len(batch.pixel), 3, device=device)
+            total += batch.gather.transpose(seen if masks is None else seen * batch.of(masks)[:, None])
         weights = torch.autograd.grad(texels, ones, total)
-        return {name: weight[..., 0] for name, weight in zip(self.geometry.textures, weights, strict=True)}
+        return {name: weight[..., 0] for name, weight in zip(geometry.textures, weights, strict=True)}
 
     def colours(
-        self, texels: Float[Tensor, "texels 3"], view: int
+        self, texels: Float[Tensor, "texels 3"], batch: int
     ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"]]:
-        """Colours of a view's object pixels, and their derivative by the texture value each pixel reads."""
-        values = self.geometry.views[view].gather.forward(texels)
-        if self.geometry.sampling.filtered == "linear":
-            values = encode(values.clamp(0, 1))
-        colour, slope = self.shadings[view](values.clamp(0, 1))
-        if self.geometry.sampling.filtered == "linear":
-            slope = slope / decode_slope(values, decode(values)).clamp(min=1e-6)
-        if self.anchors is not None:
-            colour = colour + self.anchors[view]
-            slope = slope * ((colour >= 0) & (colour <= 1))
-        return colour.clamp(0, 1), slope
+        """Colours of a batch's object pixels, and their derivative by the texture value each pixel reads."""
+        values = self.geometry.batches[batch].gather.forward(texels)
+        if self.geometry.sampling.filtered != "linear":
+            return self.shadings[batch](values)
+        encoded, rate = encode.with_slope(values.clamp_(0, 1))
+        colour, slope = self.shadings[batch](encoded)
+        return colour, slope * rate
 
 
 def diffuse_surrogate(geometry: Geometry, views: Sequence[View], *, backdrop: Image8 | None = None) -> Surrogate:
@@ -224,8 +276,8 @@ def diffuse_surrogate(geometry: Geometry, views: Sequence[View], *, backdrop: Im
     """
     base = _behind(geometry, views, backdrop)
     shadings = tuple(
-        DiffuseShading(view.shade, view.coverage, behind.flatten(0, 1)[view.pixel].float() / 255)
-        for view, behind in zip(geometry.views, base, strict=True)
+        DiffuseShading(batch.shade * batch.coverage, (1 - batch.coverage) * (batch.of(base) / 255))
+        for batch in geometry.batches
     )
     return Surrogate(geometry, "diffuse", base, shadings)
 
@@ -234,7 +286,7 @@ def _behind(geometry: Geometry, views: Sequence[View], backdrop: Image8 | None) 
     """What each view shows where there is no object."""
     colours = np.array([view.background for view in views], np.uint8)[:, None, None, :]
     full = np.broadcast_to(colours if backdrop is None else backdrop, (len(views), *geometry.size, 3))
-    return torch.from_numpy(full.copy()).to(geometry.views[0].pixel.device)
+    return torch.from_numpy(full.copy()).to(geometry.device)
 
 
 def curve_surrogate(
@@ -253,35 +305,34 @@ def curve_surrogate(
     probes: the target's images of ``obj`` painted in each grey, (greys, views, H, W, 3) uint8. ``backdrop`` as for
     ``diffuse_surrogate``.
     """
-    device = geometry.views[0].pixel.device
-    levels = torch.tensor(list(greys), dtype=torch.uint8, device=device)
-    images = torch.from_numpy(probes).to(device).flatten(2, 3)
-    behind = _behind(geometry, views, backdrop).flatten(1, 2)
-    shadings = tuple(
+    base = torch.from_numpy(clean).to(geometry.device)
+    levels = torch.tensor(list(greys), dtype=torch.uint8, device=base.device)
+    behind = _behind(geometry, views, backdrop)
+    shadings = [
         fit_curve(
             levels,
-            images[:, index, view.pixel],
-            view.coverage,
-            behind[index, view.pixel].float() / 255,
+            torch.stack([batch.of(torch.from_numpy(probe).to(base.device)) for probe in probes]),
+            batch.coverage,
+            batch.of(behind) / 255,
             geometry.sampling.encoding,
         )
-        for index, view in enumerate(geometry.views)
+        for batch in geometry.batches
+    ]
+    plain = Surrogate(geometry, "calibrated" if len(greys) == 2 else "curve", base, tuple(shadings))
+    return _anchored(plain, obj, shadings)
+
+
+def _anchored(plain: Surrogate, obj: Object3D, shadings: Sequence[CurveShading]) -> Surrogate:
+    """``plain``, whose ``shadings`` these are, with true minus predicted colours of the unpainted object added."""
+    texels = plain.texels(textures_of(obj, device=plain.base.device))
+    anchors = tuple(
+        batch.of(plain.base) / 255 - plain.colours(texels, number)[0]
+        for number, batch in enumerate(plain.geometry.batches)
     )
-    base = torch.from_numpy(clean).to(device)
-    plain = Surrogate(geometry, "calibrated" if len(greys) == 2 else "curve", base, shadings)
-    return replace(plain, anchors=_anchors(plain, obj))
+    anchored = tuple(shading.anchored(anchor) for shading, anchor in zip(shadings, anchors, strict=True))
+    return replace(plain, shadings=anchored, anchors=anchors)
 
 
 def textures_of(obj: Object3D, *, device: torch.device | str = "cpu") -> dict[str, Float[Tensor, "H W 3"]]:
     """The albedo textures of ``obj`` as sRGB floats in [0, 1], row 0 on top."""
     return {name: torch.from_numpy(image).to(device).float() / 255 for name, image in obj.textures.items()}
-
-
-def _anchors(surrogate: Surrogate, obj: Object3D) -> tuple[Float[Tensor, "pixels 3"], ...]:
-    """True minus predicted colours of the unpainted object."""
-    texels = surrogate.texels(textures_of(obj, device=surrogate.base.device))
-    true = surrogate.base.flatten(1, 2)
-    return tuple(
-        true[index, view.pixel].float() / 255 - surrogate.colours(texels, index)[0]
-        for index, view in enumerate(surrogate.geometry.views)
-    )
