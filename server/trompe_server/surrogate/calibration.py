@@ -265,17 +265,17 @@ def calibrate(
             reason = "asked for" if wanted == "diffuse" else f"good enough without probes: {_said(fidelity)}"
             nothing = np.zeros((0, *clean.shape), np.uint8)
             return Calibration("diffuse", reason, SamplingModel(), (), nothing, fidelity, trial.renders)
-    trial = trial.with_probes(ask)
-    sampling = find_sampling(lambda model: trial.fidelity("curve", model, CURVE_GREYS).score)
+    sampling = find_sampling(lambda model: trial.fidelity("calibrated", model, CALIBRATED_GREYS).score)
     model, reason, fidelity = _cheapest(trial, sampling, wanted)
     greys = CALIBRATED_GREYS if model == "calibrated" else CURVE_GREYS
-    probes, renders = _probe_all(trial, obj, views, greys, ask)
-    return Calibration(model, reason, sampling, greys, probes, fidelity, trial.renders + renders)
+    probes = np.stack([trial.probe_all(grey, views) for grey in greys])
+    renders = trial.renders + len(greys) * (len(views) - len(trial.views))
+    return Calibration(model, reason, sampling, greys, probes, fidelity, renders)
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """The trial views, and what the target showed there: unpainted, repainted at random, and in each grey."""
+    """The trial views, and what the target showed there: unpainted, repainted at random, and in greys as needed."""
 
     obj: Object3D
     index: tuple[int, ...]
@@ -284,7 +284,9 @@ class _Trial:
     repainted: Object3D
     images: Image8
     backdrop: Image8 | None
-    probes: Image8 | None = None
+    ask: Ask
+    probes: dict[int, Image8] = field(default_factory=dict)
+    """What was asked for so far, by grey."""
     geometries: dict[SamplingModel, Geometry] = field(default_factory=dict)
     """Under each hypothesis that was tried; those that differ in colours alone share one."""
 
@@ -301,19 +303,30 @@ class _Trial:
         index = tuple(sorted({round(k) for k in np.linspace(0, len(views) - 1, TRIAL_VIEWS + 2)[1:-1]}))
         few = tuple(views[k] for k in index)
         repainted = painted_noise(obj, generator)
-        return cls(obj, index, few, clean[list(index)], repainted, ask(repainted, few), backdrop)
+        return cls(obj, index, few, clean[list(index)], repainted, ask(repainted, few), backdrop, ask)
 
     @property
     def renders(self) -> int:
-        return len(self.views) * (1 + (0 if self.probes is None else len(self.probes)))
+        return len(self.views) * (1 + len(self.probes))
 
-    def with_probes(self, ask: Ask) -> "_Trial":
-        return replace(self, probes=np.stack([ask(painted_grey(self.obj, grey), self.views) for grey in CURVE_GREYS]))
+    def probe(self, grey: int) -> Image8:
+        """The trial views painted in a grey."""
+        if grey not in self.probes:
+            self.probes[grey] = self.ask(painted_grey(self.obj, grey), self.views)
+        return self.probes[grey]
+
+    def probe_all(self, grey: int, views: Sequence[View]) -> Image8:
+        """All ``views`` painted in a grey; the trial views are not asked for again."""
+        others = [k for k in range(len(views)) if k not in self.index]
+        images = np.zeros((len(views), *self.clean.shape[1:]), np.uint8)
+        images[list(self.index)] = self.probe(grey)
+        if others:
+            images[others] = self.ask(painted_grey(self.obj, grey), [views[k] for k in others])
+        return images
 
     def fidelity(self, model: str, sampling: SamplingModel, greys: tuple[int, ...]) -> Fidelity:
         """Fidelity of a colour model under a sampling hypothesis, on the trial views."""
-        rows = [CURVE_GREYS.index(grey) for grey in greys]
-        probes = np.zeros((0, *self.clean.shape), np.uint8) if self.probes is None else self.probes[rows]
+        probes = np.array([self.probe(grey) for grey in greys], np.uint8).reshape(-1, *self.clean.shape)
         nothing = Fidelity((), (), (), ())
         calibration = Calibration(model, "", sampling, greys, probes, nothing, 0)
         geometry = replace(self._geometry(sampling), sampling=sampling)
@@ -344,17 +357,3 @@ def _cheapest(trial: _Trial, sampling: SamplingModel, wanted: SurrogateModel) ->
 def _said(fidelity: Fidelity) -> str:
     mean = fidelity.mean()
     return f"error {mean['error'] * 255:.1f}/255, {mean['explained']:.0%} of a random repaint's effect explained"
-
-
-def _probe_all(
-    trial: _Trial, obj: Object3D, views: Sequence[View], greys: tuple[int, ...], ask: Ask
-) -> tuple[Image8, int]:
-    """Probes (greys, views, H, W, 3) of all views and how many had to be asked for; the trial's are used again."""
-    assert trial.probes is not None
-    others = [k for k in range(len(views)) if k not in trial.index]
-    probes = np.zeros((len(greys), len(views), *trial.clean.shape[1:]), np.uint8)
-    for row, grey in enumerate(greys):
-        probes[row, list(trial.index)] = trial.probes[CURVE_GREYS.index(grey)]
-        if others:
-            probes[row, others] = ask(painted_grey(obj, grey), [views[k] for k in others])
-    return probes, len(greys) * len(others)
