@@ -44,6 +44,8 @@ SHEET_VIEWS: Final = 12
 SALIENCY_VIEWS: Final = 6
 DIFFERENCE_VIEWS: Final = 4
 FEW_RECOGNISED: Final = 0.3
+POOR_VIEW: Final = 3.0 / 255
+NAMED_VIEWS: Final = 5
 
 
 @dataclass(frozen=True)
@@ -183,7 +185,25 @@ def _warnings(evidence: Evidence, target: Accuracy) -> list[str]:
             f"(at most {MAX_ERROR * 255:.1f}), "
             f"{mean['explained']:.0%} of a random repaint's effect explained (at least {MIN_EXPLAINED:.0%})."
         )
-    return found
+    return found + _poor_views(evidence)
+
+
+def _poor_views(evidence: Evidence) -> list[str]:
+    """Names the views on which the surrogate is far off, worst first."""
+    if evidence.surrogate is None:
+        return []
+    errors = evidence.surrogate.clean_errors()
+    poor = sorted((index for index, error in enumerate(errors) if error > POOR_VIEW), key=lambda index: -errors[index])
+    if not poor:
+        return []
+    named = []
+    for index in poor[:NAMED_VIEWS]:
+        camera = evidence.scene.views[index].camera
+        named.append(
+            f"{index} (azimuth {camera.azimuth:.0f}, elevation {camera.elevation:.0f}): {255 * errors[index]:.1f}"
+        )
+    more = f", and {len(poor) - NAMED_VIEWS} more" if len(poor) > NAMED_VIEWS else ""
+    return [f"The surrogate is off by more than {255 * POOR_VIEW:.0f}/255 on views {'; '.join(named)}{more}."]
 
 
 def _pictures(evidence: Evidence) -> dict[str, bytes]:

@@ -480,3 +480,19 @@ def test_a_plain_photograph_is_the_same_as_a_uniform_background_at_soft_edges_to
     picture = np.full((5, 5, 3), views[0].background, np.uint8)
     composed = BackdropTarget(target, picture).render(mug, views, size=size)
     assert np.abs(composed.astype(int) - target.render(mug, views, size=size)).max() <= 2
+
+
+class PatchyTarget(FakeTarget):
+    """A target whose probes of one view are darker than what it shows else."""
+
+    def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
+        images = super().render(obj, views, **options)
+        images[1] = images[1] // 2 if obj.textures[next(iter(obj.textures))].shape == (4, 4, 3) else images[1]
+        return images
+
+
+def test_views_on_which_the_surrogate_is_far_off_are_named(library: Library) -> None:
+    spec = SPEC.model_copy(update={"steps": 1})
+    (warning,) = [w for w in run(spec, library, target=PatchyTarget()).artifacts.result().warnings if "views" in w]
+    view = open_scene(spec, library=library, target=FakeTarget()).views[1].camera
+    assert f"1 (azimuth {view.azimuth:.0f}, elevation {view.elevation:.0f})" in warning

@@ -247,3 +247,22 @@ def test_a_photograph_behind_the_object_is_behind_every_surrogate(mug: Object3D)
     corner = np.s_[:, :4, :4]
     assert outside[corner].all()
     assert (images[corner] == photo[:4, :4]).all()
+
+
+def test_the_error_of_each_view_is_told(mug: Object3D) -> None:
+    ask = KnownTarget(SamplingModel())
+    clean = ask(mug, VIEWS)
+    calibration = found(mug, ask, "calibrated")
+    honest = build_surrogate(calibration, mug, VIEWS, clean).clean_errors()
+    assert len(honest) == len(VIEWS)
+    assert max(honest) < 2 / 255
+    lied = clean.copy()
+    lied[1] = 255 - lied[1]
+    errors = build_surrogate(calibration, mug, VIEWS, lied).clean_errors()
+    assert errors[1] > 20 / 255
+    assert errors[:1] + errors[2:] == pytest.approx(honest[:1] + honest[2:])
+
+
+def test_a_surrogate_that_asked_nothing_knows_no_error(mug: Object3D) -> None:
+    geometry = prepare_geometry(mug, VIEWS, size=SIZE, sampling=SamplingModel())
+    assert diffuse_surrogate(geometry, VIEWS).clean_errors() == (0.0,) * len(VIEWS)

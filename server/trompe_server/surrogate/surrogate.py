@@ -245,6 +245,20 @@ class Surrogate:
         """The images of all views at once."""
         return torch.cat([self.render(texels, batch, masks=masks) for batch in range(len(self.batches))])
 
+    def clean_errors(self) -> tuple[float, ...]:
+        """Per view the mean error of the unpainted object's pixels before anchoring, sRGB in [0, 1] units.
+
+        Zero where a view shows no object, and where the target has not been asked.
+        """
+        if self.anchors is None:
+            return (0.0,) * self.n_views
+        per_view = [
+            part.abs().mean() if len(part) else part.new_zeros(())
+            for batch, anchors in zip(self.geometry.batches, self.anchors, strict=True)
+            for part in torch.split(anchors, list(batch.counts))
+        ]
+        return tuple(float(error) for error in per_view)
+
     def influence(self, masks: Bool[Tensor, "views H W"] | None = None) -> dict[str, Float[Tensor, "H W"]]:
         """Total weight with which the pixels of all views (those of ``masks`` alone, where given) read each texel."""
         geometry, device = self.geometry, self.base.device
