@@ -95,10 +95,10 @@ def attack(
         batches = _drawn(surrogate, views_per_step, seed, step)
         gradients, seen = _gradients(state.deltas, textures, surrogate, batches, classifier, label, masks)
         on_step(Step(step, *seen))
-        momenta = _accumulated(state.momenta, gradients)
+        momenta = _accumulated(state.momenta, {name: gradients[name] * allowed[name][..., None] for name in gradients})
         scale = 2 * (total - step - 0.5) / total
         moved = {
-            name: budget.ascend(delta, momenta[name] * allowed[name][..., None], textures[name], scale=scale)
+            name: budget.ascend(delta, momenta[name], textures[name], scale=scale)
             for name, delta in state.deltas.items()
         }
         state = AttackState(step + 1, moved, momenta)
@@ -117,8 +117,11 @@ def _drawn(surrogate: Surrogate, views: int | None, seed: int, step: int) -> Seq
 
 def _accumulated(momenta: Textures, gradients: Textures) -> Textures:
     """The running mean of the gradients with one more, scaled to an L1 norm of 1 over all textures."""
-    norm = sum(float(gradient.abs().sum()) for gradient in gradients.values())
-    return {name: MOMENTUM * momenta[name] + gradient / max(norm, 1e-30) for name, gradient in gradients.items()}
+    norm = sum(float(torch.linalg.vector_norm(gradient, ord=1)) for gradient in gradients.values())
+    return {
+        name: (MOMENTUM * momenta[name]).add_(gradient, alpha=1 / max(norm, 1e-30))
+        for name, gradient in gradients.items()
+    }
 
 
 def _gradients(

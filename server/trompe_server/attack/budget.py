@@ -31,7 +31,7 @@ class Budget:
 
     def project(self, delta: Float[Tensor, "H W 3"], texture: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
         """The nearest change that keeps ``|delta| <= epsilon`` and ``0 <= texture + delta <= 1``."""
-        return (texture + delta.clamp(-self.epsilon, self.epsilon)).clamp(0, 1) - texture
+        return delta.clamp(-self.epsilon, self.epsilon).add_(texture).clamp_(0, 1).sub_(texture)
 
     def ascend(
         self,
@@ -42,7 +42,7 @@ class Budget:
         scale: float = 1.0,
     ) -> Float[Tensor, "H W 3"]:
         """One projected step of ``scale * alpha`` along the sign of ``direction``; texels where it is zero stay."""
-        return self.project(delta + scale * self.alpha * direction.sign(), texture)
+        return self.project(direction.sign().mul_(scale * self.alpha).add_(delta), texture)
 
     def quantise(self, delta: Float[Tensor, "H W 3"], texture: UInt8[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
         """The 8-bit texture that is saved: ``texture + delta`` rounded, never further than epsilon off."""
