@@ -8,11 +8,22 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 from urllib.parse import quote
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from trompe_client._errors import APIError, BadRequest, Conflict, ContractError, NotFound, ServerFault
 from trompe_client._plan import Upload
-from trompe_shared.api import ClassifierInfo, Event, Job, JobList, JobSpec, JobState, ObjectInfo, Problem, Result
+from trompe_shared.api import (
+    BackgroundInfo,
+    ClassifierInfo,
+    Event,
+    Job,
+    JobList,
+    JobSpec,
+    JobState,
+    ObjectInfo,
+    Problem,
+    Result,
+)
 
 T = TypeVar("T")
 
@@ -31,13 +42,6 @@ class Request(Generic[T]):
     job_id: str | None = None
 
 
-class StoredBackground(BaseModel):
-    """A stored background picture; a job names it by ``id``."""
-
-    id: str
-    name: str
-
-
 def upload_object(upload: Upload) -> Request[ObjectInfo]:
     return Request("POST", "/v1/objects", _reader(ObjectInfo), upload=upload)
 
@@ -46,8 +50,8 @@ def upload_classifier(upload: Upload) -> Request[ClassifierInfo]:
     return Request("POST", "/v1/classifiers", _reader(ClassifierInfo), upload=upload)
 
 
-def upload_background(upload: Upload) -> Request[StoredBackground]:
-    return Request("POST", "/v1/backgrounds", _reader(StoredBackground), upload=upload)
+def upload_background(upload: Upload) -> Request[BackgroundInfo]:
+    return Request("POST", "/v1/backgrounds", _reader(BackgroundInfo), upload=upload)
 
 
 def objects() -> Request[list[ObjectInfo]]:

@@ -122,9 +122,10 @@ class AttackJob:
             found = self._known_calibration(name)
             if found is None:
                 found = self._ask_the_target(clean, on_progress)
-            self.artifacts.write("calibration.npz", pack_calibration(found))
+            packed = pack_calibration(found)
+            self.artifacts.write("calibration.npz", packed)
             if found.renders:
-                self.calibrations.write(name, pack_calibration(found))
+                self.calibrations.write(name, packed)
         return PhaseReport(_progress("calibrate", 1.0))
 
     def _calibration_key(self, clean: Image8) -> str:

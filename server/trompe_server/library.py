@@ -16,28 +16,19 @@ from functools import cache
 from pathlib import Path
 from typing import BinaryIO, Final, Generic, TypeVar
 
-from pydantic import BaseModel
-
 from trompe_server.artifacts import LocalArtifacts
 from trompe_server.errors import AmbiguousError, NotFoundError
 from trompe_server.files import write_whole
-from trompe_shared.api import ClassifierInfo, ObjectInfo
+from trompe_shared.api import BackgroundInfo, ClassifierInfo, ObjectInfo
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
 from trompe_shared.object3d import decode_rgb, load_object
 from trompe_shared.shipped import shipped_objects
 
-__all__ = ["BackgroundInfo", "Library"]
+__all__ = ["Library"]
 
 INSPECTION_TIMEOUT: Final = 300.0
 _INFO: Final = "info.json"
 _PART: Final = 2**20
-
-
-class BackgroundInfo(BaseModel):
-    """A stored picture that views can have behind the object."""
-
-    id: str
-    name: str
 
 
 Info = TypeVar("Info", ObjectInfo, ClassifierInfo, BackgroundInfo)

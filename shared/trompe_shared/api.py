@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 __all__ = [
     "Accuracy",
+    "BackgroundInfo",
     "ClassifierInfo",
     "Event",
     "Job",
@@ -52,6 +53,13 @@ class ClassifierInfo(_Schema):
     n_classes: int
     classes: list[str] | None = Field(None, description="class names in the order of the logits, where known")
     shipped: bool = False
+
+
+class BackgroundInfo(_Schema):
+    """A stored picture that views can have behind the object; a job names it by ``id``."""
+
+    id: str
+    name: str
 
 
 class JobSpec(_Schema):

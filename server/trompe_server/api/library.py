@@ -7,8 +7,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from trompe_server.api.problems import PROBLEMS
 from trompe_server.api.services import LibraryDep
-from trompe_server.library import BackgroundInfo
-from trompe_shared.api import ClassifierInfo, ObjectInfo
+from trompe_shared.api import BackgroundInfo, ClassifierInfo, ObjectInfo
 from trompe_shared.errors import SpecError
 
 __all__ = ["router"]
