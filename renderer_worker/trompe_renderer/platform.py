@@ -4,6 +4,7 @@ pyrender was last released in 2021: it reads the PyOpenGL platform from the envi
 dropped, and imports its window, which wants an X library. All of it is set right before the import below.
 """
 
+import ctypes
 import os
 import sys
 from types import ModuleType
@@ -13,7 +14,11 @@ import numpy as np
 
 from trompe_shared.errors import RendererError
 
-__all__ = ["GL", "create_context", "pyrender"]
+__all__ = ["GL", "create_context", "give_memory_back", "pyrender"]
+
+_M_TRIM_THRESHOLD: Final = -1
+_M_MMAP_THRESHOLD: Final = -3
+_LARGE_BLOCK: Final = 2**20
 
 _EGL_REMEDY: Final = (
     "Install EGL and Mesa (Debian and Ubuntu: apt-get install libegl1 libgl1 libgl1-mesa-dri), or choose another GPU "
@@ -23,6 +28,8 @@ _EGL_REMEDY: Final = (
 
 def _prepare() -> None:
     os.environ["PYOPENGL_PLATFORM"] = "egl"
+    # Software GL would filter textures in 8 bits; no graphics card does, and it costs nothing.
+    os.environ.setdefault("GALLIVM_PERF", "no_aos_sampling")
     vars(np).setdefault("infty", np.inf)
     viewer = ModuleType("pyrender.viewer")
     viewer.Viewer = None  # type: ignore[attr-defined]
@@ -36,6 +43,14 @@ try:
     from pyrender.platforms import egl as _egl
 except (ImportError, AttributeError, OSError) as error:
     raise RendererError(f"OpenGL cannot be loaded ({error}). {_EGL_REMEDY}") from error
+
+
+def give_memory_back() -> None:
+    """Have glibc return large blocks to the system at once: left alone it soon keeps those of the largest pictures."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallopt"):
+        for parameter in (_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD):
+            libc.mallopt(parameter, _LARGE_BLOCK)
 
 
 def create_context() -> Any:

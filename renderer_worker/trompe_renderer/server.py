@@ -3,17 +3,18 @@
 Each agent has a thread; one more thread owns the OpenGL context and renders for all of them, in turn.
 """
 
-import fcntl
+import contextlib
 import io
 import itertools
 import logging
 import math
 import socket
-import struct
-import termios
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
 from select import select
 from typing import Any, Final
 
@@ -21,135 +22,185 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from trompe_renderer.engine import Engine
+from trompe_renderer.link import Link, Memory
 from trompe_renderer.model import Library
+from trompe_renderer.options import Options
+from trompe_renderer.render_thread import Renderer
 from trompe_renderer.scenery import Scenery
 from trompe_renderer.session import Session
+from trompe_renderer.views import flat, label_views
 from trompe_shared.errors import ProtocolError, RendererError, TrompeError
-from trompe_shared.sailenv import MAX_SIDE, REGISTER, Request, decode_request, encode_frame, views_of
+from trompe_shared.sailenv import (
+    MAX_SIDE,
+    REGISTER,
+    Request,
+    decode_request,
+    encode_frame,
+    encode_status,
+    views_of,
+)
 
-__all__ = ["Server"]
+__all__ = ["MAX_AGENTS", "Server"]
 
 MAX_AGENTS: Final = 64
-REQUEST_TIMEOUT: Final = 60.0
-"""Seconds that an agent may take to finish a request it has begun, or to take an answer."""
+PATIENCE: Final = 600.0
+"""Seconds for which an agent may be idle and keep its place when others have none."""
+GRACE: Final = 5.0
+"""Seconds that agents have, when the worker stops, to take the replies they wait for."""
 DIALECT_WAIT: Final = 0.3
 """Seconds of silence after a short SPAWN_OBJECT that tell the short dialect from the long one."""
-LONG_ONLY: Final = {"spawn_view_frustum", "move_object"}
+LONG_ONLY: Final = {"spawn_view_frustum", "load_scenario", "move_object"}
+AHEAD: Final = 2
+"""Pictures of one agent that may be in line or drawn and not yet sent."""
+
+Changes = Sequence[tuple[str, Mapping[str, Any]]]
+Picture = NDArray[np.uint8]
 
 log = logging.getLogger(__name__)
 
 
-class Renderer:
-    """The engine behind the one thread that may touch it."""
+@dataclass(frozen=True)
+class Shared:
+    """What the agents have in common."""
 
-    def __init__(self, *, shadows: bool) -> None:
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="render")
-        self._engine = self._thread.submit(Engine, shadows=shadows).result()
-
-    def render(self, scenery: Scenery, *, width: int, height: int) -> NDArray[np.uint8]:
-        """As ``Engine.render``, from any thread."""
-        return self._thread.submit(self._engine.render, scenery, width=width, height=height).result()
+    renderer: Renderer
+    options: Options
+    library: Library = field(default_factory=Library)
+    memory: Memory = field(default_factory=Memory)
+    stopping: threading.Event = field(default_factory=threading.Event)
 
 
 class Server:
-    """A renderer worker that listens on ``address`` once it exists. Raises ``RendererError`` if it cannot."""
+    """A renderer worker behind a listening socket, which it owns from now on.
 
-    def __init__(self, host: str, port: int, *, shadows: bool = True) -> None:
-        try:
-            self._listener = socket.create_server((host, port), backlog=MAX_AGENTS)
-        except OSError as error:
-            raise RendererError(
-                f"Cannot listen on {host}:{port} ({error}). Choose another --host or --port."
-            ) from error
-        self._renderer = Renderer(shadows=shadows)
-        self._library = Library()
-        self._places = threading.BoundedSemaphore(MAX_AGENTS)
-        self.address: tuple[str, int] = self._listener.getsockname()[:2]
+    Raises ``RendererError`` where nothing can be rendered.
+    """
+
+    def __init__(self, listener: socket.socket, options: Options | None = None) -> None:
+        options = options or Options()
+        self._listener = listener
+        self._shared = Shared(Renderer(options.quality), options)
+        self._agents: dict[int, tuple[Link, threading.Thread]] = {}
+        self._left = threading.Condition()
+        self._waker, self._wake = socket.socketpair()
+        self._waker.setblocking(False)
+        self.address: tuple[str, int] = listener.getsockname()[:2]
 
     def serve_forever(self) -> None:
-        """Accept agents until the process ends."""
+        """Accept agents until ``stop``, then let each take the reply it waits for."""
         for agent in itertools.count():
+            if self._wake in select([self._listener, self._wake], [], [])[0]:
+                break
             connection, peer = self._listener.accept()
-            if not self._places.acquire(blocking=False):
+            if not self._make_room():
                 log.warning("agent %d from %s: turned away, %d agents are served already", agent, peer[0], MAX_AGENTS)
                 connection.close()
                 continue
-            threading.Thread(target=self._serve, args=(connection, agent), daemon=True, name=f"agent-{agent}").start()
+            link = Link(connection, self._shared.memory)
+            thread = threading.Thread(target=self._serve, args=(link, agent), daemon=True, name=f"agent-{agent}")
+            self._agents[agent] = link, thread
+            thread.start()
+        self._finish()
 
-    def _serve(self, connection: socket.socket, agent: int) -> None:
+    def stop(self) -> None:
+        """Make ``serve_forever`` return. A signal's handler may call it, however often: it takes no lock."""
+        with contextlib.suppress(BlockingIOError):
+            self._waker.send(b"!")
+
+    def _finish(self) -> None:
+        self._shared.stopping.set()
+        self._listener.close()
+        agents = [*self._agents.values()]
+        for link, _ in agents:
+            link.hang_up()
+        until = time.monotonic() + GRACE
+        for _, thread in agents:
+            thread.join(max(0.0, until - time.monotonic()))
+
+    def _make_room(self) -> bool:
+        """Whether there is a place for one more; if need be the place of the agent that has been idle for longest."""
+        with self._left:
+            if len(self._agents) < MAX_AGENTS:
+                return True
+            idle = [(link.idle_since, link) for link, _ in self._agents.values() if link.idle_since is not None]
+            since, link = min(idle, key=lambda item: item[0], default=(math.inf, None))
+            if link is None or time.monotonic() - since < PATIENCE:
+                return False
+            link.hang_up()
+            return self._left.wait_for(lambda: len(self._agents) < MAX_AGENTS, timeout=1.0)
+
+    def _serve(self, link: Link, agent: int) -> None:
         try:
-            with connection:
-                _Agent(connection, agent, self._renderer, Session(self._library)).serve()
+            _Agent(link, agent, self._shared).serve()
         except ProtocolError as error:
             log.warning("agent %d: closed, what it sent is malformed: %s", agent, error)
+        except TimeoutError as error:
+            log.warning("agent %d: closed, %s", agent, error)
         except (EOFError, OSError) as error:
             log.info("agent %d: gone (%s)", agent, error)
         except Exception:
             log.exception("agent %d: closed after an error of the worker", agent)
         finally:
-            self._places.release()
+            link.close()
+            with self._left:
+                del self._agents[agent]
+                self._left.notify_all()
 
 
 class _Agent:
     """One connection."""
 
-    def __init__(self, connection: socket.socket, agent: int, renderer: Renderer, session: Session) -> None:
-        self._socket, self._id, self._renderer, self._session = connection, agent, renderer, session
+    def __init__(self, link: Link, number: int, shared: Shared) -> None:
+        self._link, self._id, self._shared = link, number, shared
+        self._renderer, self._options = shared.renderer, shared.options
+        self._session = Session(shared.library)
+        self._seen: Scenery | None = None
         self._long: bool | None = None
         self._width = self._height = 1
         self._gzip = False
         self._last_frame = time.monotonic()
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        connection.settimeout(REQUEST_TIMEOUT)
 
     def serve(self) -> None:
         """Shake hands and answer requests until DELETE or until the agent hangs up."""
         self._register()
         while True:
-            select([self._socket], [], [])
-            request = decode_request(self._read, is_long=self._is_long)
+            self._link.wait()
+            request = decode_request(self._link.read, is_long=self._is_long)
             if request.command.name == "delete":
                 return
-            self._long = self._long or request.command.name in LONG_ONLY or None
+            if request.command.name in LONG_ONLY:
+                self._long = True
             self._answer(request)
 
     def _register(self) -> None:
-        fields = REGISTER.decode_fields(self._read)
+        fields = REGISTER.decode_fields(self._link.read)
         self._width, self._height, self._gzip = fields["width"], fields["height"], fields["gzip"]
         if not (0 < self._width <= MAX_SIDE and 0 < self._height <= MAX_SIDE):
             raise ProtocolError(f"Images of {self._width} x {self._height} are asked for; a side is 1 to {MAX_SIDE}.")
-        self._socket.sendall(REGISTER.encode_reply(self._id, self._session.scenes))
-
-    def _read(self, count: int) -> bytes:
-        parts = bytearray()
-        while len(parts) < count:
-            if hasattr(socket, "TCP_QUICKACK"):  # without it each small field of a client waits 40 ms for its ACK
-                self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
-            part = self._socket.recv(min(count - len(parts), 2**20))
-            if not part:
-                raise EOFError("the connection was closed")
-            parts += part
-        return bytes(parts)
+        self._session.size = self._width, self._height
+        self._link.send(REGISTER.encode_reply(self._id, self._session.scenes))
 
     def _is_long(self) -> bool:
         if self._long is None:
-            self._long = bool(select([self._socket], [], [], DIALECT_WAIT)[0])
+            self._long = self._link.says_more(DIALECT_WAIT)
         return self._long
 
     def _answer(self, request: Request) -> None:
         command = request.command
         if command.name == "frame":
             self._send_frame(request.values["flags"])
-            return
-        try:
-            values = getattr(self._session, command.name)(**request.values)
-        except TrompeError as error:
-            self._note(command.name, str(error))
-            self._socket.sendall(command.encode_refusal(str(error)))
+        elif command.name == "render_views":
+            self._send_pictures(request.values["views"])
         else:
-            self._socket.sendall(command.encode_reply(*values))
+            try:
+                values = getattr(self._session, command.name)(**request.values)
+            except TrompeError as error:
+                self._note(command.name, str(error))
+                self._link.send(command.encode_refusal(str(error)))
+            else:
+                for reason in self._session.take_refusals():
+                    self._note(command.name, reason)
+                self._link.send(command.encode_reply(*values))
 
     def _note(self, command: str, reason: str) -> None:
         log.warning("agent %d: refused %s: %s", self._id, command, reason)
@@ -157,44 +208,77 @@ class _Agent:
 
     def _send_frame(self, flags: int) -> None:
         """A frame whose rendering fails is sent flat: the client would wait for ever for one that does not come."""
-        now = time.monotonic()
-        delta_time, self._last_frame = now - self._last_frame, now
-        views = {name: _flat(name, self._width, self._height) for name in views_of(flags)}
+        delta_time = self._time_step()
+        self._session.advance(delta_time)
+        views = {name: flat(name, self._width, self._height) for name in views_of(flags)}
         try:
-            if "main" in views:
-                views["main"] = self._main_view()
+            views |= self._views([*views])
         except Exception as error:
             log.exception("agent %d: rendering failed", self._id)
             self._session.note_refusal(f"Rendering failed: {error!r}")
             delta_time = math.nan
         for number, piece in enumerate(encode_frame([*views.values()], delta_time=delta_time, compress=self._gzip)):
             if number:
-                self._drain()
-            self._socket.sendall(piece)
+                self._link.drain()
+            self._link.send(piece)
 
-    def _main_view(self) -> bytes:
-        """The picture as Unity shows it: the mirror image of the right-handed one."""
-        image = self._renderer.render(self._session.scenery(), width=self._width, height=self._height)
-        return _png(image[:, ::-1])
+    def _send_pictures(self, views: Sequence[Changes]) -> None:
+        """Draw a picture while the one before travels."""
+        drawn: deque[Future[Picture]] = deque()
+        for changes in views:
+            drawn.append(self._start_picture(changes))
+            if len(drawn) == AHEAD and not self._send_picture(drawn.popleft()):
+                return
+        while drawn and self._send_picture(drawn.popleft()):
+            pass
 
-    def _drain(self) -> None:
-        """Wait until all that was sent has arrived, so that the next piece starts a segment of its own."""
-        until = time.monotonic() + REQUEST_TIMEOUT
-        while struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, b"\0" * 4))[0]:
-            if time.monotonic() > until:
-                raise TimeoutError("the agent does not take its frame")
-            time.sleep(0.0005)
+    def _start_picture(self, changes: Changes) -> "Future[Picture]":
+        try:
+            if self._shared.stopping.is_set():
+                raise RendererError("The worker is about to stop.")
+            for name, values in changes:
+                getattr(self._session, name)(**values)
+            self._session.advance(self._time_step())
+            self._seen = self._session.scenery()
+            return self._renderer.start(self._seen, width=self._width, height=self._height)
+        except TrompeError as error:
+            refused: Future[Picture] = Future()
+            refused.set_exception(error)
+            return refused
+
+    def _send_picture(self, drawn: "Future[Picture]") -> bool:
+        """Send it once it is ready; whether it is one, for after a refusal nothing may follow."""
+        try:
+            picture = np.ascontiguousarray(drawn.result())
+        except Exception as error:
+            reason = str(error) if isinstance(error, TrompeError) else f"Rendering failed: {error!r}"
+            self._note("render_views", reason)
+            self._link.send(encode_status(reason))
+            return False
+        self._link.send(encode_status(), picture.data.cast("B"))
+        return True
+
+    def _time_step(self) -> float:
+        """Seconds from the frame before to this one."""
+        now = time.monotonic()
+        passed, self._last_frame = now - self._last_frame, now
+        return passed if self._options.time_step is None else self._options.time_step
+
+    def _views(self, names: list[str]) -> dict[str, bytes]:
+        """Payloads of the views, as the session stands; flow is what changed since this was called last."""
+        scenery, size = self._session.scenery(), {"width": self._width, "height": self._height}
+        views = {}
+        if "main" in names:
+            views["main"] = _png(self._renderer.render(scenery, **size)[:, ::-1])  # as Unity shows it: mirrored
+        labels = [name for name in names if name != "main"]
+        if labels:
+            survey = self._renderer.survey(scenery, self._seen or scenery, **size)
+            views |= label_views(labels, survey, scenery, depth_range=self._options.depth_range)
+        self._seen = scenery
+        return views
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(image)).save(buffer, "PNG", compress_level=1)
     return buffer.getvalue()
-
-
-def _flat(view: str, width: int, height: int) -> bytes:
-    """A view that shows nothing, in the form that the protocol gives it."""
-    raw: dict[str, Any] = {"category": 3, "optical": 8}
-    if view in raw:
-        return bytes(width * height * raw[view])
-    return _png(np.zeros((height, width) if view == "depth" else (height, width, 3), np.uint8))

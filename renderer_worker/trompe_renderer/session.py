@@ -1,104 +1,87 @@
-"""One agent's state: where its camera is, what it has lit, uploaded and spawned. No sockets, no OpenGL.
+"""One agent's state: its scene, its camera, what stands behind all. No sockets, no OpenGL, no clock.
 
 Each method answers the command of its name in ``trompe_shared.sailenv.COMMANDS`` with the values of the reply, and
-refuses by raising a ``TrompeError`` whose message becomes the reason.
+refuses by raising a ``TrompeError`` whose message becomes the reason. Lights and objects have files of their own.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from PIL import Image, ImageOps
 
-from trompe_renderer.model import Library, Model, content_key
-from trompe_renderer.scenery import Color, DirectionalLight, Placement, Scenery
-from trompe_shared.errors import RendererError
-from trompe_shared.geometry import Light, euler_to_matrix, light_travel_direction, unity_to_opengl_rotation
-from trompe_shared.sailenv import LIGHT_NOT_FOUND, MAIN_LIGHT, RIM_LIGHT
+from trompe_renderer.dynamics import frustum_walls
+from trompe_renderer.lights import LightCommands
+from trompe_renderer.model import Library, content_key
+from trompe_renderer.scenario import Actor, read_script
+from trompe_renderer.scenery import Backdrop, Matrix, Photograph, Scenery, Sky
+from trompe_renderer.scenes import OBJECT_VIEW, SCENES, Scene, scene_named
+from trompe_renderer.values import Ints, Vector, checked_color, checked_vector, unit_color
+from trompe_renderer.world import ObjectCommands, placed
+from trompe_shared.errors import RendererError, TrompeError
+from trompe_shared.geometry import FIELD_OF_VIEW, unity_to_opengl_rotation
+from trompe_shared.object3d import decode_rgb
+from trompe_shared.sailenv import EXTENSIONS
 
 __all__ = ["Session"]
 
-SCENE: Final = "object_view/scene"
-FILE_PREFIX: Final = "file:"
-MAX_SPAWNED: Final = 64
-MAX_STORED_BYTES: Final = 64 * 2**20
-WHITE: Final = (255, 255, 255)
-
-Vector = tuple[float, float, float]
-Ints = tuple[int, int, int]
+FRUSTUM_NEAR: Final = 0.3
+FRUSTUM_FAR: Final = 15.0
+"""Metres; what SAILenv's git client says where it says it."""
 
 
-@dataclass(frozen=True)
-class _Lamp:
-    """A directional light as the protocol speaks of it. ``position`` and ``multiplier`` are kept and change nothing."""
-
-    direction: Vector
-    intensity: float
-    color: Ints = WHITE
-    position: Vector = (0.0, 3.0, 0.0)
-    multiplier: float = 1.0
-
-
-@dataclass(frozen=True)
-class _Instance:
-    model: Model
-    position: Vector
-    rotation: Vector
-    scale: Vector
-
-    def pose(self) -> NDArray[np.float64]:
-        matrix = np.eye(4)
-        matrix[:3, :3] = euler_to_matrix(np.array(self.rotation)) * np.array(self.scale)
-        matrix[:3, 3] = self.position
-        return matrix
-
-
-def _default_lamps() -> dict[str, _Lamp]:
-    main = Light()
-    behind = replace(main, azimuth=180.0, elevation=30.0, intensity=0.0)
-    return {name: _Lamp(_travel(light), light.intensity) for name, light in ((MAIN_LIGHT, main), (RIM_LIGHT, behind))}
-
-
-def _travel(light: Light) -> Vector:
-    return _vector(light_travel_direction(light).tolist(), "direction")
-
-
-class Session:
-    """State and answers for one agent; used by one thread."""
+class Session(LightCommands, ObjectCommands):
+    """State and answers for one agent, used by one thread. ``size`` is its images' (width, height)."""
 
     def __init__(self, library: Library) -> None:
-        self._library = library
-        self._uploads: dict[str, bytes] = {}
+        LightCommands.__init__(self)
+        ObjectCommands.__init__(self, library)
+        self.size = (1, 1)
+        self._take = 0
         self._error = ""
-        self._reset()
+        self._refusals: list[str] = []
+        self._load(scene_named(OBJECT_VIEW))
+        self._stand_at(scene_named(OBJECT_VIEW))
 
-    def _reset(self) -> None:
-        self._position: Vector = (0.0, 0.0, 0.0)
-        self._rotation: Vector = (0.0, 0.0, 0.0)
-        self._clear: Ints = WHITE
-        self._ambient: Ints = (128, 128, 128)
-        self._lamps = _default_lamps()
-        self._spawned: dict[int, _Instance] = {}
-        self._spawns = 0
+    def _load(self, scene: Scene) -> None:
+        """Start anew in ``scene``; the camera stays where it is."""
+        self._take += 1
+        self._light_up(scene.lamps, scene.ambient)
+        self._furnish(scene.fixtures, scene.walls)
+        self._backdrop: Backdrop = scene.backdrop if isinstance(scene.backdrop, Sky) else unit_color(scene.backdrop)
+
+    def _stand_at(self, scene: Scene) -> None:
+        self._position, self._rotation = scene.position, scene.rotation
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass for what moves by itself."""
+        self._let_pass(seconds)
 
     def scenery(self) -> Scenery:
         """What the agent's camera sees, for the engine."""
+        return Scenery(
+            placements=self._placements(),
+            camera=self._camera(),
+            lights=tuple(lamp.light() for lamp in self._lamps.values() if lamp.intensity > 0),
+            ambient=unit_color(self._ambient),
+            backdrop=self._backdrop,
+            take=self._take,
+        )
+
+    def _camera(self) -> Matrix:
         camera = np.eye(4)
         camera[:3, :3] = unity_to_opengl_rotation(np.array(self._rotation))
         camera[:3, 3] = self._position
-        lit = [lamp for lamp in self._lamps.values() if lamp.intensity > 0]
-        return Scenery(
-            placements=tuple(Placement(item.model, item.pose()) for item in self._spawned.values()),
-            camera=camera,
-            lights=tuple(DirectionalLight(np.array(x.direction), _unit(x.color), x.intensity) for x in lit),
-            ambient=_unit(self._ambient),
-            background=_unit(self._clear),
-        )
+        return camera
 
     def note_refusal(self, reason: str) -> None:
         """Keep the reason of a refusal for ``last_error``."""
         self._error = reason
+
+    def take_refusals(self) -> list[str]:
+        """What the last command refused while it did the rest."""
+        refusals, self._refusals = self._refusals, []
+        return refusals
 
     def last_error(self) -> tuple[str]:
         reason, self._error = self._error, ""
@@ -107,163 +90,78 @@ class Session:
     @property
     def scenes(self) -> list[str]:
         """Names of the scenes there are."""
-        return [SCENE]
+        return list(SCENES)
 
     def change_scene(self, *, scene: str) -> tuple[()]:
-        if scene != SCENE:
-            raise RendererError(f"There is no scene {scene!r}; choose {SCENE!r}.")
-        self._reset()
+        wanted = scene_named(scene)
+        self._load(wanted)
+        self._stand_at(wanted)
         return ()
 
-    def get_categories(self) -> tuple[list[tuple[int, str]]]:
-        return ([(0, "none")],)
+    def load_scenario(self, *, scenario: Mapping[str, Any]) -> tuple[str, ...]:
+        """Load a scene and spawn objects; the camera stays. An id for each, "" for one that is not spawned."""
+        try:
+            script = read_script(scenario)
+            scene = scene_named(script.scene)
+        except TrompeError as error:
+            self._refusals.append(str(error))
+            return ("",) * len(scenario["objects"])
+        self._load(scene)
+        if script.reach is not None:
+            self._see_as_far_as(script.reach)
+        return tuple(self._enter(actor, delay) for actor, delay in zip(script.actors, script.delays, strict=True))
+
+    def _enter(self, actor: Actor | str, delay: float) -> str:
+        try:
+            if isinstance(actor, str):
+                raise RendererError(actor)
+            place = placed(actor.position, actor.rotation)
+            size = (1.0, 1.0, 1.0)
+            return self._spawn(actor.name, place, size, motion=actor.motion, limited=actor.limited, delay=delay)
+        except TrompeError as error:
+            self._refusals.append(str(error))
+            return ""
+
+    def spawn_view_frustum(self) -> tuple[()]:
+        """From now on objects that move by themselves bounce off the edges of what the camera sees at this moment."""
+        self._see_as_far_as(FRUSTUM_FAR)
+        return ()
+
+    def _see_as_far_as(self, far: float) -> None:
+        aspect = self.size[0] / self.size[1]
+        self._frustum = frustum_walls(
+            self._camera(), field_of_view=FIELD_OF_VIEW, aspect=aspect, near=FRUSTUM_NEAR, far=far
+        )
 
     def get_position(self) -> tuple[Vector]:
         return (self._position,)
 
     def set_position(self, *, position: Vector) -> tuple[()]:
-        self._position = _vector(position, "position")
+        self._position = checked_vector(position, "position")
         return ()
 
     def get_rotation(self) -> tuple[Vector]:
         return (self._rotation,)
 
     def set_rotation(self, *, rotation: Vector) -> tuple[()]:
-        self._rotation = _vector(rotation, "rotation")
+        self._rotation = checked_vector(rotation, "rotation")
         return ()
 
     def toggle_follow(self) -> tuple[()]:
-        return ()
-
-    def send_obj_zip(self, *, file: tuple[str, bytes]) -> tuple[str]:
-        """Keep an archive and answer a path that SPAWN_OBJECT takes; the oldest go when an agent keeps too much."""
-        data = file[1]
-        path = content_key(data)
-        self._uploads.pop(path, None)
-        self._uploads[path] = data
-        while len(self._uploads) > 1 and sum(map(len, self._uploads.values())) > MAX_STORED_BYTES:
-            self._uploads.pop(next(iter(self._uploads)))
-        return (path,)
-
-    def spawn_object(
-        self, *, name: str, position: Vector, rotation: Vector, scale: Vector, **_dynamics: Any
-    ) -> tuple[str]:
-        """Put an uploaded object into the world. Nothing moves here: what a client says of dynamics is ignored."""
-        path = name.removeprefix(FILE_PREFIX)
-        if not name.startswith(FILE_PREFIX) or path not in self._uploads:
-            raise RendererError(
-                f"There is no object {name!r}; send a zip and spawn '{FILE_PREFIX}' + the path answered."
-            )
-        if len(self._spawned) >= MAX_SPAWNED:
-            raise RendererError(f"{MAX_SPAWNED} objects are spawned; despawn one first.")
-        if not all(0 < x < 1e6 for x in scale):
-            raise RendererError(f"A scale must be positive, got {scale}.")
-        placed = _vector(position, "position"), _vector(rotation, "rotation"), _vector(scale, "scale")
-        instance = _Instance(self._library.read(path, self._uploads[path]), *placed)
-        self._spawns += 1
-        self._spawned[self._spawns] = instance
-        return (str(self._spawns),)
-
-    def despawn_object(self, *, instance: int) -> tuple[()]:
-        self._spawned_object(instance)
-        del self._spawned[instance]
-        return ()
-
-    def move_object(self, *, instance: int, position: Vector, rotation: Vector) -> tuple[()]:
-        self._spawned[instance] = replace(
-            self._spawned_object(instance),
-            position=_vector(position, "position"),
-            rotation=_vector(rotation, "rotation"),
-        )
-        return ()
-
-    def _spawned_object(self, instance: int) -> _Instance:
-        if instance not in self._spawned:
-            raise RendererError(f"No object {instance} is spawned; there are {sorted(self._spawned)}.")
-        return self._spawned[instance]
-
-    def get_spawnable_objects_names(self) -> tuple[Sequence[str]]:
-        return ([],)
-
-    def spawn_view_frustum(self) -> tuple[()]:
+        """In Unity the window on the screen follows the agent, or no longer does; here there is no window."""
         return ()
 
     def set_clear_color(self, *, color: Ints) -> tuple[()]:
-        """Background colour; any negative number asks for a sky, which is white here."""
-        self._clear = WHITE if min(color) < 0 else _color(color)
+        """A colour behind all objects; any negative number asks for the sky."""
+        self._backdrop = Sky() if min(color) < 0 else unit_color(checked_color(color))
         return ()
 
-    def get_ambient_light_color(self) -> tuple[Ints]:
-        return (self._ambient,)
-
-    def set_ambient_light_color(self, *, color: Ints) -> tuple[()]:
-        self._ambient = _color(color)
+    def set_background_picture(self, *, file: tuple[str, bytes]) -> tuple[()]:
+        """A picture behind all objects, cropped and scaled to the image, as the main view is sent."""
+        picture = Image.fromarray(decode_rgb(file[1], file[0]))
+        fitted = np.asarray(ImageOps.fit(picture, self.size, Image.Resampling.LANCZOS))[:, ::-1]
+        self._backdrop = Photograph(content_key(repr(self.size).encode(), fitted), fitted)
         return ()
-
-    def get_lights_names(self) -> tuple[list[str]]:
-        return (list(self._lamps),)
 
     def get_light_type(self, *, light: str) -> tuple[str]:
-        self._lamp(light)
-        return ("Directional",)
-
-    def get_light_color(self, *, light: str) -> tuple[Ints]:
-        return (self._lamp(light).color,)
-
-    def set_light_color(self, *, light: str, color: Ints) -> tuple[()]:
-        return self._change(light, color=_color(color))
-
-    def get_light_intensity(self, *, light: str) -> tuple[float]:
-        return (self._lamp(light).intensity,)
-
-    def set_light_intensity(self, *, light: str, intensity: float) -> tuple[()]:
-        if not 0 <= intensity < 1e6:
-            raise RendererError(f"A light's intensity must be 0 or more, got {intensity}.")
-        return self._change(light, intensity=intensity)
-
-    def get_light_indirect_multiplier(self, *, light: str) -> tuple[float]:
-        return (self._lamp(light).multiplier,)
-
-    def set_light_indirect_multiplier(self, *, light: str, multiplier: float) -> tuple[()]:
-        return self._change(light, multiplier=multiplier)
-
-    def get_light_position(self, *, light: str) -> tuple[Vector]:
-        return (self._lamp(light).position,)
-
-    def set_light_position(self, *, light: str, position: Vector) -> tuple[()]:
-        return self._change(light, position=_vector(position, "position"))
-
-    def get_light_direction(self, *, light: str) -> tuple[Vector]:
-        return (self._lamp(light).direction,)
-
-    def set_light_direction(self, *, light: str, direction: Vector) -> tuple[()]:
-        if np.linalg.norm(_vector(direction, "direction")) < 1e-6:
-            raise RendererError("A light's direction must not be zero.")
-        return self._change(light, direction=direction)
-
-    def _lamp(self, light: str) -> _Lamp:
-        if light not in self._lamps:
-            raise RendererError(f"{LIGHT_NOT_FOUND}: there is no light {light!r}; choose one of {list(self._lamps)}.")
-        return self._lamps[light]
-
-    def _change(self, light: str, **values: Any) -> tuple[()]:
-        self._lamps[light] = replace(self._lamp(light), **values)
-        return ()
-
-
-def _vector(values: Sequence[float], what: str) -> Vector:
-    x, y, z = (float(value) for value in values)
-    if not all(abs(value) < 1e6 for value in (x, y, z)):
-        raise RendererError(f"A {what} must be three finite numbers, got {tuple(values)}.")
-    return (x, y, z)
-
-
-def _color(values: Ints) -> Ints:
-    if not all(0 <= value <= 255 for value in values):
-        raise RendererError(f"A colour must be three integers from 0 to 255, got {tuple(values)}.")
-    return values
-
-
-def _unit(color: Ints) -> Color:
-    red, green, blue = (value / 255.0 for value in color)
-    return (red, green, blue)
+        return (EXTENSIONS,) if light == EXTENSIONS else super().get_light_type(light=light)

@@ -2,83 +2,178 @@
 
 import io
 from collections import OrderedDict
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from trompe_renderer import cutout  # noqa: F401 (makes pyrender test alpha)
 from trompe_renderer.model import Model, content_key
-from trompe_renderer.platform import pyrender
+from trompe_renderer.platform import GL, pyrender
 from trompe_shared.object3d import Material, Part, decode_rgb
+from trompe_shared.opacity import opacity_of
 
 __all__ = ["Uploads"]
 
-CAPACITY: Final = 16
+MAX_SHAPES: Final = 32  # twice what a furnished room needs
+MAX_TEXTURES: Final = 256
+MAX_TEXTURE_BYTES: Final = 512 * 2**20
+OLD: Final = 64
+"""Pictures after which a texture that was on none of them may be painted over with another of its size."""
 PLAIN_ROUGHNESS: Final = 0.9
 """Roughness of a material whose maps do not give one."""
 
+_MATERIAL_TEXTURES: Final = {
+    "albedo": "baseColorTexture",
+    "normal": "normalTexture",
+    "metallic": "metallicRoughnessTexture",
+}
+
+Pixels = NDArray[np.uint8]
+
 
 class Uploads:
-    """Meshes and textures of the models drawn last.
+    """Meshes and textures of what was drawn last, found by their content.
 
-    Textures are found by their content, so that models that differ in their albedo share all the rest.
+    A mesh serves all models of its shape: it is given the textures of the one that is drawn next.
     """
 
     def __init__(self) -> None:
-        self._meshes: OrderedDict[str, Any] = OrderedDict()
-        self._textures: dict[tuple[str, str], Any] = {}
+        self._shapes: list[_Shape] = []
+        self._textures: OrderedDict[str, _Texture] = OrderedDict()
+        self._pictures = 0
 
     def mesh(self, model: Model) -> Any:
-        """The model as a ``pyrender.Mesh``, one primitive for each part."""
-        mesh = self._meshes.pop(model.key, None) or self._build(model)
-        self._meshes[model.key] = mesh
-        return mesh
+        """The model as a ``pyrender.Mesh``, one primitive for each part; it stays as it is until ``trim``."""
+        shape = self._shape(model)
+        if shape.shows is None:
+            for material, primitive in shape.painted:
+                for use, attribute in _MATERIAL_TEXTURES.items():
+                    setattr(primitive.material, attribute, self._texture(use, getattr(material, use), model))
+            shape.shows = model.key
+        return shape.mesh
 
     def trim(self) -> None:
         """Free what has not been drawn for long. Not to be called while a scene holds a mesh that it will draw."""
-        while len(self._meshes) > CAPACITY:
-            _, mesh = self._meshes.popitem(last=False)
-            for primitive in mesh.primitives:
-                primitive.delete()
-        used = {texture for mesh in self._meshes.values() for p in mesh.primitives for texture in p.material.textures}
-        for key in [key for key, texture in self._textures.items() if texture not in used]:
-            self._textures.pop(key).delete()
+        self._pictures += 1
+        for shape in self._shapes:
+            shape.shows = None
+        for shape in self._shapes[:-MAX_SHAPES]:
+            shape.delete()
+        del self._shapes[:-MAX_SHAPES]
+        size = sum(texture.nbytes for texture in self._textures.values())
+        while size > MAX_TEXTURE_BYTES or len(self._textures) > MAX_TEXTURES:
+            _, texture = self._textures.popitem(last=False)
+            size -= texture.nbytes
+            texture.delete()
 
-    def _build(self, model: Model) -> Any:
+    def _shape(self, model: Model) -> "_Shape":
+        """A shape that shows the model already, or that shows nothing in this scene; the one used last comes last."""
+        alike = [shape for shape in self._shapes if shape.key == model.shape and shape.shows in {None, model.key}]
+        shape = max(alike, key=lambda shape: shape.shows is not None, default=None) or _Shape(model)
+        self._shapes = [other for other in self._shapes if other is not shape] + [shape]
+        return shape
+
+    def _texture(self, use: str, name: str | None, model: Model) -> "_Texture | None":
+        if name is None:
+            return None
+        key = model.albedos.get(name) or f"{model.shape} {use} {name}"
+        if use == "albedo":
+            key += _opacity(model.obj.files[name])[0]
+        if key not in self._textures:
+            pixels = _pixels(use, name, model)
+            self._textures[key] = self._repainted(pixels) or _Texture(pixels)
+        self._textures.move_to_end(key)
+        self._textures[key].drawn = self._pictures
+        return self._textures[key]
+
+    def _repainted(self, pixels: Pixels) -> "_Texture | None":
+        """An old texture, now with these ``pixels``: half the time of making a new one."""
+        for key, texture in self._textures.items():
+            if self._pictures - texture.drawn < OLD:
+                return None  # and those that follow are younger
+            if texture.shape == pixels.shape:
+                texture.repaint(pixels)
+                return self._textures.pop(key)
+        return None
+
+
+class _Shape:
+    """A mesh on the card. ``painted`` are its primitives with what they are to look like."""
+
+    def __init__(self, model: Model) -> None:
         obj = model.obj
-        return pyrender.Mesh([_primitive(p, self._material(obj.materials[p.material], model)) for p in obj.parts])
+        self.key = model.shape
+        self.shows: str | None = None
+        looks = [obj.materials[part.material] for part in obj.parts]
+        self.painted = [(look, _primitive(part, look)) for look, part in zip(looks, obj.parts, strict=True)]
+        self.mesh = pyrender.Mesh([primitive for _, primitive in self.painted])
 
-    def _material(self, material: Material, model: Model) -> Any:
-        """Unity's MetallicSmoothness in pyrender's terms: a texture (roughness, metallic), factors 1."""
-        maps = {
-            "baseColorTexture": self._texture("RGB", material.albedo, model),
-            "normalTexture": self._texture("RGB", material.normal, model),
-            "metallicRoughnessTexture": self._texture("RG", material.metallic, model),
-        }
-        plain = material.metallic is None
-        return pyrender.MetallicRoughnessMaterial(
-            **maps,
+    def delete(self) -> None:
+        for primitive in self.mesh.primitives:
+            primitive.delete()
+
+
+class _Texture(pyrender.Texture):  # type: ignore[misc]
+    """A texture with mipmaps whose pixels (H, W, channels) can be replaced by others of the same shape."""
+
+    def __init__(self, pixels: Pixels) -> None:
+        super().__init__(sampler=_trilinear())
+        self.shape, self.nbytes = pixels.shape, pixels.nbytes
+        self.drawn = 0  # the number of the picture
+        self._format = {2: GL.GL_RG, 3: GL.GL_RGB, 4: GL.GL_RGBA}[pixels.shape[2]]
+        self._waiting: Pixels | None = pixels
+
+    def repaint(self, pixels: Pixels) -> None:
+        if not self._in_context():
+            self._waiting = pixels
+            return
+        self._bind()
+        height, width, _ = self.shape
+        rows = np.ascontiguousarray(pixels[::-1])
+        GL.glTexSubImage2D(self.tex_type, 0, 0, 0, width, height, self._format, GL.GL_UNSIGNED_BYTE, rows)
+        GL.glGenerateMipmap(self.tex_type)
+        self._unbind()
+
+    def _add_to_context(self) -> None:
+        """As pyrender does it, without its four copies of the pixels, of which none is kept."""
+        if self._waiting is None:
+            raise ValueError("the texture was deleted")
+        self._texid = GL.glGenTextures(1)
+        self._bind()
+        height, width, _ = self.shape
+        rows = np.ascontiguousarray(self._waiting[::-1])
+        kind = self._format, GL.GL_UNSIGNED_BYTE
+        GL.glTexImage2D(self.tex_type, 0, self._format, width, height, 0, *kind, rows)
+        GL.glGenerateMipmap(self.tex_type)
+        sampler = self.sampler
+        for name, value in (
+            (GL.GL_TEXTURE_MAG_FILTER, sampler.magFilter),
+            (GL.GL_TEXTURE_MIN_FILTER, sampler.minFilter),
+            (GL.GL_TEXTURE_WRAP_S, sampler.wrapS),
+            (GL.GL_TEXTURE_WRAP_T, sampler.wrapT),
+        ):
+            GL.glTexParameteri(self.tex_type, name, value)
+        self._unbind()
+        self._waiting = None
+
+
+def _primitive(part: Part, material: Material) -> Any:
+    """A part without textures yet. Unity's MetallicSmoothness becomes a texture (roughness, metallic), factors 1."""
+    plain = material.metallic is None
+    return pyrender.Primitive(
+        positions=part.vertices,
+        normals=part.normals,
+        texcoord_0=part.uvs,
+        indices=part.faces,
+        material=pyrender.MetallicRoughnessMaterial(
             metallicFactor=0.0 if plain else 1.0,
             roughnessFactor=PLAIN_ROUGHNESS if plain else 1.0,
             alphaMode="OPAQUE",
             doubleSided=False,
-        )
-
-    def _texture(self, channels: str, name: str | None, model: Model) -> Any:
-        if name is None:
-            return None
-        data = model.obj.files[name]
-        key = (channels, content_key(data))
-        if key not in self._textures:
-            image = decode_rgb(data, name) if channels == "RGB" else _roughness_metallic(data)
-            self._textures[key] = pyrender.Texture(source=image, source_channels=channels, sampler=_trilinear())
-        return self._textures[key]
-
-
-def _primitive(part: Part, material: Any) -> Any:
-    return pyrender.Primitive(
-        positions=part.vertices, normals=part.normals, texcoord_0=part.uvs, indices=part.faces, material=material
+        ),
     )
 
 
@@ -89,7 +184,25 @@ def _trilinear() -> Any:
     )
 
 
-def _roughness_metallic(data: bytes) -> NDArray[np.uint8]:
+def _pixels(use: str, name: str, model: Model) -> Pixels:
+    """A texture as the card wants it, (H, W, channels), row 0 on top: RGB, RGBA to cut out, roughness and metal."""
+    if use == "albedo":
+        texture, opacity = model.obj.textures[name], _opacity(model.obj.files[name])[1]
+        if opacity is None or opacity.shape != texture.shape[:2]:
+            return texture
+        return np.dstack([texture, opacity])
+    data = model.obj.files[name]
+    return decode_rgb(data, name) if use == "normal" else _roughness_metallic(data)
+
+
+@lru_cache(maxsize=32)
+def _opacity(data: bytes) -> tuple[str, Pixels | None]:
+    """What an albedo file cuts out of its surfaces, with a name for it (none for nothing)."""
+    opacity = opacity_of(data)
+    return ("", None) if opacity is None else (f" cut out by {content_key(opacity)}", opacity)
+
+
+def _roughness_metallic(data: bytes) -> Pixels:
     """(H, W, 2) uint8 from a MetallicSmoothness file: 1 - alpha (smoothness), red."""
     with Image.open(io.BytesIO(data)) as image:
         smoothness = image.getchannel("A") if "A" in image.getbands() else None

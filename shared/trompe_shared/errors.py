@@ -6,6 +6,7 @@
     ├── ClassifierError      a classifier cannot be loaded or does not keep the contract
     ├── LabelError           a label is not one of the classifier's classes
     ├── RendererError        a renderer worker is unreachable or answered with an error
+    │   └── RendererLostError    it is not there, hangs, or talks nonsense; another one may do what this one did not
     └── SpecError            the options of a job contradict each other or are out of range
 
 Each message says what was wrong, what was expected and what to do about it.
@@ -17,6 +18,7 @@ __all__ = [
     "ObjectError",
     "ProtocolError",
     "RendererError",
+    "RendererLostError",
     "SpecError",
     "TrompeError",
 ]
@@ -56,6 +58,10 @@ class RendererError(TrompeError):
     """A renderer worker is unreachable or answered with an error."""
 
     code = "renderer"
+
+
+class RendererLostError(RendererError):
+    """A renderer worker is not there, hangs, or talks nonsense; another one may do what this one did not."""
 
 
 class SpecError(TrompeError):

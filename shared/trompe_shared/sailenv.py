@@ -10,6 +10,7 @@ Readers are callables: ``read(n)`` returns exactly n bytes, or raises (``EOFErro
 
 import codecs
 import gzip
+import json
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,12 +19,15 @@ from types import MappingProxyType
 from typing import Any, Final, Protocol
 
 from trompe_shared.errors import ProtocolError, RendererError
+from trompe_shared.object3d import MAX_TEXTURE_SIDE
 
 __all__ = [
     "COMMANDS",
+    "EXTENSIONS",
     "LIGHT_NOT_FOUND",
     "MAIN_LIGHT",
     "MAX_SIDE",
+    "MAX_VIEWS",
     "REGISTER",
     "RIM_LIGHT",
     "VIEW_FLAGS",
@@ -33,6 +37,8 @@ __all__ = [
     "decode_frame",
     "decode_request",
     "encode_frame",
+    "encode_status",
+    "take_status",
     "views_of",
 ]
 
@@ -40,11 +46,19 @@ MAX_TEXT: Final = 64 * 2**10
 MAX_JSON: Final = 2**20
 MAX_FILE: Final = 256 * 2**20
 MAX_VIEW: Final = 256 * 2**20
+_MAX_TEXTURES: Final = 256
+_FIRST_EXTENSION: Final = 0xE0
 MAX_LIST: Final = 4096
 _GZIP_WINDOW: Final = 31  # zlib's word for gzip data
 MAX_SIDE: Final = 4096
 """Largest width or height of an image, pixels."""
+MAX_VIEWS: Final = 256
+"""Most views in one RENDER_VIEWS."""
+_MAX_CHANGES: Final = 64
 
+EXTENSIONS: Final = "trompe extensions 1"
+"""A Trompe worker that has the commands from 0xE1 on answers GET_LIGHT_TYPE for a light of this name with the name
+itself; every other SAILenv says that there is no such light, and both ends stay in step."""
 MAIN_LIGHT: Final = "Main Light"
 RIM_LIGHT: Final = "Rim Light"
 LIGHT_NOT_FOUND: Final = "light_not_found"
@@ -149,14 +163,15 @@ class _List:
     """An int with the number of items, then the items; an item of one kind is the value itself, of more a tuple."""
 
     kinds: tuple[Kind, ...]
+    limit: int = MAX_LIST
 
     def pack(self, value: Sequence[Any]) -> bytes:
         rows = [(item,) if len(self.kinds) == 1 else item for item in value]
         body = b"".join(kind.pack(cell) for row in rows for kind, cell in zip(self.kinds, row, strict=True))
-        return _INT.pack(_within(len(rows), MAX_LIST, "list")) + body
+        return _INT.pack(_within(len(rows), self.limit, "list")) + body
 
     def take(self, read: Reader) -> list[Any]:
-        count = _within(_INT.take(read), MAX_LIST, "list")
+        count = _within(_INT.take(read), self.limit, "list")
         rows = [tuple(kind.take(read) for kind in self.kinds) for _ in range(count)]
         return [row[0] for row in rows] if len(self.kinds) == 1 else rows
 
@@ -172,6 +187,60 @@ class _Dynamic:
 
     def take(self, read: Reader) -> tuple[str, str] | None:
         return (_CLIENT_TEXT.take(read), _JSON.take(read)) if _BOOL.take(read) else None
+
+
+@dataclass(frozen=True)
+class _Scenario:
+    """JSON text of an object that has a list "objects": the reply's length is that list's. The value is the object."""
+
+    def pack(self, value: Mapping[str, Any]) -> bytes:
+        return _JSON.pack(json.dumps(value))
+
+    def take(self, read: Reader) -> dict[str, Any]:
+        text = _JSON.take(read)
+        try:
+            value = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise ProtocolError(f"A scenario of {len(text)} characters is not JSON ({error}).") from error
+        if not isinstance(value, dict) or not isinstance(value.get("objects"), list):
+            raise ProtocolError('A scenario must be a JSON object with a list "objects"; its reply depends on it.')
+        _within(len(value["objects"]), MAX_LIST, "list of objects")
+        return value
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """An 8-bit RGB picture: two ints height and width, then its rows, top row first. The value is those three."""
+
+    def pack(self, value: tuple[int, int, bytes]) -> bytes:
+        height, width, data = value
+        if len(data) != height * width * 3:
+            raise ProtocolError(f"{height} x {width} RGB pixels are {height * width * 3} bytes, not {len(data)}.")
+        return b"".join([_INT.pack(height), _INT.pack(width), data])
+
+    def take(self, read: Reader) -> tuple[int, int, bytes]:
+        height, width = (_within(_INT.take(read), MAX_TEXTURE_SIDE, "side of a texture") for _ in range(2))
+        return height, width, read(height * width * 3)
+
+
+@dataclass(frozen=True)
+class _Changes:
+    """Commands that are answered by a status alone, each a code byte and its fields: (name, fields) pairs."""
+
+    def pack(self, value: Sequence[tuple[str, Mapping[str, Any]]]) -> bytes:
+        body = b"".join(COMMANDS[name].encode_request(**fields) for name, fields in value)
+        return _INT.pack(_within(len(value), _MAX_CHANGES, "list of changes")) + body
+
+    def take(self, read: Reader) -> list[tuple[str, dict[str, Any]]]:
+        count = _within(_INT.take(read), _MAX_CHANGES, "list of changes")
+        return [self._take_one(read) for _ in range(count)]
+
+    def _take_one(self, read: Reader) -> tuple[str, dict[str, Any]]:
+        code = _BYTE.take(read)
+        command = _BY_CODE.get(code) if code < _FIRST_EXTENSION else None
+        if command is None or not command.status or command.reply:
+            raise ProtocolError("A view may only be preceded by commands that are answered by a status alone.")
+        return command.name, command.decode_fields(read)
 
 
 def _within(length: int, limit: int, what: str) -> int:
@@ -211,6 +280,7 @@ class Command:
     ``request`` names the fields the client sends after the code byte; ``tail`` those that only the longer dialect
     (v0.6) adds. ``reply`` holds the kinds of the answer's values. With ``status`` a text "ok" stands before them, and
     any other text is the reason of a refusal, after which nothing follows; else the values ``refused`` stand for one.
+    The reply of a ``repeated`` command is its one kind any number of times, which only the request tells.
     """
 
     code: int | None
@@ -220,6 +290,7 @@ class Command:
     status: bool = False
     refused: tuple[Any, ...] | None = None
     tail: Mapping[str, Kind] = field(default_factory=_nothing)
+    repeated: bool = False
 
     def encode_request(self, **values: Any) -> bytes:
         """Bytes a client sends. The fields of ``tail`` go out if they are among ``values``: all of them or none."""
@@ -236,21 +307,25 @@ class Command:
 
     def encode_reply(self, *values: Any) -> bytes:
         """Bytes a server answers when it did what was asked."""
-        status = _SERVER_TEXT.pack("ok") if self.status else b""
-        return status + b"".join(kind.pack(value) for kind, value in zip(self.reply, values, strict=True))
+        status = encode_status() if self.status else b""
+        kinds = self.reply * len(values) if self.repeated else self.reply
+        return status + b"".join(kind.pack(value) for kind, value in zip(kinds, values, strict=True))
 
     def encode_refusal(self, reason: str) -> bytes:
         """Bytes a server answers when it refuses: ``reason`` where the protocol has room for one."""
         if self.status:
-            shortened = reason.encode("utf-8", "replace")[: MAX_TEXT // 2].decode("utf-8", "ignore")
-            return _SERVER_TEXT.pack("refused" if shortened in {"", "ok"} else shortened)
+            return encode_status(reason)
         return b"".join(kind.pack(value) for kind, value in zip(self.reply, self.refused or (), strict=True))
 
-    def decode_reply(self, read: Reader) -> tuple[Any, ...]:
-        """The values of an answer. Raises ``RendererError`` with the server's reason for a refusal by status."""
-        if self.status and (status := _SERVER_TEXT.take(read)) != "ok":
-            raise RendererError(f"The renderer refused {self.name}: {status}")
-        return tuple(kind.take(read) for kind in self.reply)
+    def decode_reply(self, read: Reader, *, count: int = 1) -> tuple[Any, ...]:
+        """The values of an answer. Raises ``RendererError`` with the server's reason for a refusal by status.
+
+        ``count`` is how many values a ``repeated`` command answers.
+        """
+        if self.status:
+            take_status(read, self.name)
+        kinds = self.reply * count if self.repeated else self.reply
+        return tuple(kind.take(read) for kind in kinds)
 
 
 @dataclass(frozen=True)
@@ -315,9 +390,17 @@ _ROWS: Final = (
     _status(0x1A, "get_ambient_light_color", {}, _REPLY_COLOR),
     _status(0x1B, "set_ambient_light_color", _COLOR_FIELD),
     Command(0x1C, "spawn_view_frustum"),
+    Command(0x1D, "load_scenario", {"scenario": _Scenario()}, (_SERVER_TEXT,), refused=("",), repeated=True),
     _status(0x1E, "move_object", {"instance": _INT, "position": _VEC3, "rotation": _VEC3}),
     # Trompe's own, far from SAILenv's codes: why the last command of this agent was refused; "" if none was.
     _getter(0xE0, "last_error", {}, _SERVER_TEXT, ""),
+    # Other albedo textures for a spawned object, by file name; the rest of it stays.
+    _status(0xE1, "repaint_object", {"instance": _INT, "textures": _List((_CLIENT_TEXT, _Pixels()), _MAX_TEXTURES)}),
+    # For each view: changes of the state, then its picture. Its reply: a status for each view (encode_status), and
+    # after "ok" height x width RGB bytes, top row first, not mirrored; after any other status nothing more.
+    Command(0xE2, "render_views", {"views": _List((_Changes(),), MAX_VIEWS)}),
+    # An image file that stands behind all objects, as the main view is sent, until another background is set.
+    _status(0xF0, "set_background_picture", {"file": _File()}),
 )
 
 COMMANDS: Final[Mapping[str, Command]] = MappingProxyType({row.name: row for row in _ROWS})
@@ -336,10 +419,27 @@ def decode_request(read: Reader, *, is_long: Callable[[], bool]) -> Request:
     command = _BY_CODE.get(code)
     if command is None:
         raise ProtocolError(f"There is no command {code:#04x}; its length is unknown, so the stream is lost.")
-    values = command.decode_fields(read)
-    if command.tail and is_long():
-        values |= {name: kind.take(read) for name, kind in command.tail.items()}
+    try:
+        values = command.decode_fields(read)
+        if command.tail and is_long():
+            values |= {name: kind.take(read) for name, kind in command.tail.items()}
+    except ProtocolError as error:
+        raise ProtocolError(f"{command.name}: {error}") from error
     return Request(command, values)
+
+
+def encode_status(refusal: str | None = None) -> bytes:
+    """A status: "ok", or the reason of a refusal."""
+    if refusal is None:
+        return _SERVER_TEXT.pack("ok")
+    shortened = refusal.encode("utf-8", "replace")[: MAX_TEXT // 2].decode("utf-8", "ignore")
+    return _SERVER_TEXT.pack("refused" if shortened in {"", "ok"} else shortened)
+
+
+def take_status(read: Reader, asked: str) -> None:
+    """Read a status. Raises ``RendererError`` with the server's reason for any but "ok"; ``asked`` says for what."""
+    if (status := _SERVER_TEXT.take(read)) != "ok":
+        raise RendererError(f"The renderer refused {asked}: {status}")
 
 
 def encode_frame(views: Sequence[bytes], *, delta_time: float, compress: bool) -> list[bytes]:

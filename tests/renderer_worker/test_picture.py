@@ -96,6 +96,42 @@ def test_corners_are_within_a_pixel_of_where_the_camera_puts_them(
     assert np.abs(np.concatenate([corners.min(axis=0), corners.max(axis=0)]) - seen).max() < 1
 
 
+def outline(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The convex polygon (N, 2) around points (K, 2), in order."""
+    ordered = sorted(map(tuple, points))
+    chains = []
+    for row in (ordered, ordered[::-1]):
+        chain: list[tuple[float, ...]] = []
+        for point in row:
+            while len(chain) > 1 and np.linalg.det(np.array([chain[-1], point]) - chain[-2]) <= 0:
+                chain.pop()
+            chain.append(point)
+        chains += chain[:-1]
+    return np.array(chains)
+
+
+def area_and_middle(polygon: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    following = np.roll(polygon, -1, axis=0)
+    cross = polygon[:, 0] * following[:, 1] - polygon[:, 1] * following[:, 0]
+    return float(cross.sum() / 2), ((polygon + following) * cross[:, None]).sum(axis=0) / (3 * cross.sum())
+
+
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(st.floats(0.3, 0.6), st.floats(-180, 180), st.floats(-90, 90))
+def test_a_cubes_corners_are_where_the_camera_puts_them_to_a_fraction_of_a_pixel(
+    target: SailenvTarget, make_boxes: Boxes, distance: float, azimuth: float, elevation: float
+) -> None:
+    white = {name: np.full((4, 4, 3), 255, np.uint8) for name in ("right", "left", "top", "bottom", "front", "back")}
+    cube, camera = make_boxes(((0, 0, 0), (0.06, 0.06, 0.06)), textures=white), Camera(distance, azimuth, elevation)
+    cover = show(target, cube, camera, background=(0, 0, 0))[..., 0] / 255.0
+    corners = np.array([(x, y, z) for x in (-0.06, 0.06) for y in (-0.06, 0.06) for z in (-0.06, 0.06)])
+    area, middle = area_and_middle(outline(on_screen(camera, corners)))
+    rows, columns = np.mgrid[0 : SIZE[0], 0 : SIZE[1]] + 0.5
+    assert abs(cover.sum() - area) < 0.02 * area
+    seen = np.array([(cover * columns).sum(), (cover * rows).sum()]) / cover.sum()
+    assert np.abs(seen - middle).max() < 0.1
+
+
 @settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(st.tuples(*[st.integers(0, 255)] * 3))
 def test_the_background_is_exactly_the_colour_asked_for(
@@ -124,6 +160,19 @@ def test_at_intensity_one_a_white_wall_that_faces_the_light_is_white(target: Sai
         for intensity in (0.0, 0.25, 0.5, 1.0)
     ]
     assert np.allclose(centres, [0, 0.25, 0.5, 1.0], atol=0.06)
+
+
+def test_what_a_surface_reflects_is_linear_in_the_lights_intensity(target: SailenvTarget, make_boxes: Boxes) -> None:
+    box = make_boxes(maps={"metallic": np.full((4, 4, 4), (80, 80, 80, 128), np.uint8)})
+    intensities = np.linspace(0, 0.8, 9)
+    levels = [
+        linear(show(target, box, Camera(0.3, 20, 20), Light(40, 40, float(intensity), 0.1)))[30, 40]
+        for intensity in intensities
+    ]
+    assert np.ptp(levels, axis=0).max() > 0.1
+    for channel in np.transpose(levels):
+        line = np.polyval(np.polyfit(intensities, channel, 1), intensities)
+        assert np.abs(channel - line).max() < 0.005  # a level of 255 in the middle of the range
 
 
 def test_ambient_light_reaches_every_side(target: SailenvTarget, make_boxes: Boxes) -> None:
@@ -165,6 +214,38 @@ def test_a_normal_maps_green_leans_towards_growing_v(
     assert (levels[1] > 1.2 * levels[0]) if brighter else (levels[1] < 0.8 * levels[0])
 
 
+@pytest.mark.parametrize(("red", "brighter"), [(200, True), (56, False)])
+def test_a_normal_maps_red_leans_towards_growing_u(
+    target: SailenvTarget, make_boxes: Boxes, red: int, brighter: bool
+) -> None:
+    light, camera = Light(60, 0, 1.0, 0.0), Camera(0.3, 0, 0)
+    flat, leaning = (np.full((4, 4, 3), color, np.uint8) for color in ((128, 128, 255), (red, 128, 200)))
+    levels = [
+        linear(show(target, make_boxes(maps={"normal": normal}), camera, light))[30, 40, 0]
+        for normal in (flat, leaning)
+    ]
+    assert (levels[1] > 1.2 * levels[0]) if brighter else (levels[1] < 0.8 * levels[0])
+
+
+def test_metallic_is_read_from_red_and_smoothness_from_alpha_and_nothing_from_the_rest(
+    target: SailenvTarget, make_boxes: Boxes
+) -> None:
+    def picture(*color: int) -> Picture:
+        texture = np.full((4, 4, len(color)), color, np.uint8)
+        return show(target, make_boxes(maps={"metallic": texture}), Camera(0.3, 0, 0), Light(0, 20, 0.5, 0.2))
+
+    base = picture(100, 100, 100, 128)
+    assert (picture(100, 255, 0, 128) == base).all()
+    assert (picture(200, 100, 100, 128) != base).any()
+    assert (picture(100, 100, 100, 200) != base).any()
+    assert (picture(100, 100, 100) != base).any()  # without alpha the surface is as rough as one without a map
+    assert np.abs(picture(0, 0, 0).astype(int) - show_plain(target, make_boxes())).max() <= 1
+
+
+def show_plain(target: SailenvTarget, box: Object3D) -> Picture:
+    return show(target, box, Camera(0.3, 0, 0), Light(0, 20, 0.5, 0.2))
+
+
 def test_metal_has_no_matt_colour_and_gloss_has_a_highlight(target: SailenvTarget, make_boxes: Boxes) -> None:
     def level(metallic: int, smoothness: int, elevation: float) -> float:
         texture = np.full((4, 4, 4), metallic, np.uint8)
@@ -188,6 +269,28 @@ def test_what_stands_in_the_way_of_the_light_casts_a_shadow(
     covered, free = (int(with_shadows[row, column, 2]) for column, row in spots)
     assert covered < 0.7 * free
     assert [int(without[row, column, 2]) for column, row in spots] == [free, free]
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 60), (90, 50), (-60, 70)])
+def test_a_shadow_lies_where_the_light_throws_it(
+    target: SailenvTarget, make_boxes: Boxes, azimuth: float, elevation: float
+) -> None:
+    height, half = 0.1, 0.04
+    boxes = make_boxes(((0, -0.01, 0), (0.25, 0.01, 0.25)), ((0, height, 0), (half, 0.001, half)))
+    light, camera = Light(azimuth, elevation, 0.8, 0.2), Camera(0.7, 20, 75)
+    a, e = np.radians(azimuth), np.radians(elevation)
+    shift = -height / np.tan(e) * np.array([np.sin(a), 0, np.cos(a)])
+    picture = show(target, boxes, camera, light)[..., 2].astype(int)
+    offsets = np.array([(x, 0, z) for x in (-1, 0, 1) for z in (-1, 0, 1)], float)
+    inside, outside = (
+        [picture[row, column] for column, row in on_screen(camera, shift + reach * offsets * half).astype(int)]
+        for reach in (0.6, 1.6)
+    )
+    lit = picture[tuple(on_screen(camera, np.array([[0.2, 0, 0.2]])).astype(int)[0, ::-1])]
+    shaded = np.array(inside) < 0.75 * lit
+    covered = np.abs(on_screen(camera, shift + 0.6 * offsets * half) - on_screen(camera, np.array([[0, height, 0]])))
+    assert shaded[(covered > 12).any(axis=1)].all()  # the plate itself hides what is nearer to it in the picture
+    assert (np.array(outside)[[0, 2, 6, 8]] > 0.9 * lit).sum() >= 3
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 20.0])

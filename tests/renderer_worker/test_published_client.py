@@ -13,30 +13,139 @@ import pytest
 from trompe_server.target import SailenvTarget
 from trompe_shared.geometry import Camera, Light, View, light_travel_direction, sailenv_pose
 from trompe_shared.object3d import Object3D
+from trompe_shared.shipped import shipped_objects
 
 
 @pytest.fixture
-def agent(worker: tuple[str, int]) -> Iterator[Any]:
+def connect(worker: tuple[str, int]) -> Iterator[Callable[..., Any]]:
+    """Registers agents of the published client, and deletes them in the end."""
     pytest.importorskip("PIL")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the client imports typing.io
         module = pytest.importorskip("sailenv", reason="pip install sailenv==0.5b0 (Python 3.12 at most)")
         module = importlib.import_module("sailenv.agent")
-    agent = module.Agent(host=worker[0], port=worker[1], width=48, height=32)
-    agent.socket.settimeout(60)
-    agent.register()
-    yield agent
-    agent.delete()
-    agent.socket.close()
+    agents: list[Any] = []
+
+    def register(**options: Any) -> Any:
+        agent = module.Agent(host=worker[0], port=worker[1], **({"width": 48, "height": 32} | options))
+        agent.socket.settimeout(60)
+        agent.register()
+        agents.append(agent)
+        return agent
+
+    yield register
+    for agent in agents:
+        agent.delete()
+        assert agent.socket.recv(1) == b""  # the worker hangs up
+        agent.socket.close()
+
+
+@pytest.fixture
+def agent(connect: Callable[..., Any]) -> Any:
+    return connect()
+
+
+def zipped(obj: Object3D, folder: Path) -> str:
+    path = folder / "box.zip"
+    path.write_bytes(obj.to_zip())
+    return str(path)
+
+
+LIGHT_VALUES = {
+    "color": (10, 20, 30),
+    "intensity": (0.5,),
+    "indirect_multiplier": (2.0,),
+    "position": ((1.0, 2.0, 3.0),),
+    "direction": ((0.0, -1.0, 0.5),),
+}
+"""What each light command is given, as the client's method takes it."""
+
+
+@pytest.mark.parametrize("gzip", [False, True], ids=["plain", "gzip"])
+def test_a_whole_script_of_the_published_client_runs(
+    connect: Callable[..., Any],
+    make_boxes: Callable[..., Object3D],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    gzip: bool,
+) -> None:
+    agent = connect(use_gzip=gzip)
+    assert agent.id >= 0
+    for scene in reversed(agent.scenes):
+        agent.change_scene(scene)
+        assert agent.categories[0] == "none"
+        assert "mug" in agent.spawnable_objects_names
+    path = agent.send_obj_zip(zipped(make_boxes(), tmp_path))
+    instances = [agent.spawn_object(f"file:{path}"), agent.spawn_object("ball", position=(0.2, 0, 0))]
+    assert list(agent.spawned_objects_idstr_names_table) == instances
+    _see_sixty_poses(agent)
+    for light in agent.lights_names:
+        for name, values in LIGHT_VALUES.items():
+            getattr(agent, f"set_light_{name}")(light, *values)
+            read = getattr(agent, f"get_light_{name}")(light)
+            assert np.allclose(read, values[0] if len(values) == 1 else values)
+        assert agent.get_light_type(light) == "Directional"
+    agent.set_ambient_light_color(40, 50, 60)
+    assert agent.get_ambient_light_color() == (40, 50, 60)
+    agent.toggle_follow()
+    agent.change_main_camera_clear_flags(-1, -1, -1)
+    assert not np.allclose(agent.get_frame()["main"][0, 0], 1)
+    for instance in instances:
+        agent.despawn_object(instance)
+    frame = agent.get_frame()
+    assert not frame["object"].any()
+    assert not frame["category"].any()
+    assert capsys.readouterr().out == ""  # the client prints what goes wrong
+
+
+def _see_sixty_poses(agent: Any) -> None:
+    """60 cameras around the origin, all five views of each; every pose shows something else."""
+    mains = set()
+    for azimuth in np.linspace(0, 360, 6, endpoint=False):
+        for elevation in np.linspace(-60, 60, 10):
+            position, rotation = sailenv_pose(Camera(0.5, float(azimuth), float(elevation)))
+            agent.set_position(position)
+            agent.set_rotation(rotation)
+            frame = agent.get_frame()
+            shown = frame["object"].any(axis=-1)
+            assert shown.any()
+            assert (frame["category"][shown] > 0).all()
+            assert (frame["depth"][shown] < 1).all()
+            assert (frame["depth"][~shown] == 1).all()
+            assert (frame["flow"][~shown] == 0).all()
+            assert all((size > 0) for size in frame["sizes"].values())
+            assert 0 <= frame["deltaTime"] < 60
+            assert frame["main"].shape == (32, 48, 3)
+            mains.add(frame["main"].tobytes())
+    assert len(mains) == 60
+
+
+def test_only_the_views_that_the_published_client_wants_are_sent(connect: Callable[..., Any]) -> None:
+    agent = connect(main_frame_active=False, flow_frame_active=False)
+    frame = agent.get_frame()
+    assert frame["main"] is None
+    assert frame["flow"] is None
+    assert frame["category"].shape == frame["depth"].shape == (32, 48)
+
+
+def test_the_published_client_is_told_of_what_was_refused(agent: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    agent.change_scene("moon/scene")
+    agent.set_rotation((np.inf, 0, 0))
+    assert agent.get_light_type("Sun") is None
+    assert agent.spawn_object("yeti") == ""
+    agent.despawn_object("77")
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 5
+    assert "There is no scene 'moon/scene'" in said[0]
+    assert "finite" in said[1]
+    assert agent.get_frame()["main"].shape == (32, 48, 3)
 
 
 def test_the_published_client_sees_what_our_own_sees(
     agent: Any, target: SailenvTarget, make_boxes: Callable[..., Object3D], tmp_path: Path
 ) -> None:
     box, view = make_boxes(), View(Camera(0.3, 40, 25), Light(30, 60, 0.75, 0.2), (10, 20, 30))
-    path = tmp_path / "box.zip"
-    path.write_bytes(box.to_zip())
-    instance = agent.spawn_object("file:" + agent.send_obj_zip(str(path)))
+    instance = agent.spawn_object("file:" + agent.send_obj_zip(zipped(box, tmp_path)))
     position, rotation = sailenv_pose(view.camera)
     agent.set_position(position)
     agent.set_rotation(rotation)
@@ -57,7 +166,8 @@ def test_the_published_client_sees_what_our_own_sees(
 def test_the_published_client_can_change_the_scene_and_is_told_what_there_is(agent: Any) -> None:
     agent.change_scene(agent.scenes[0])
     assert agent.lights_names == ["Main Light", "Rim Light"]
-    assert agent.spawnable_objects_names == []
+    assert agent.spawnable_objects_names == sorted(shipped_objects())
+    assert set(agent.spawnable_objects_names) < set(agent.categories.values())
     assert agent.get_light_color("Main Light") is not None
 
 

@@ -1,27 +1,32 @@
-"""What every target renderer promises, asked of the fake and of a worker behind its socket."""
+"""What every target renderer promises: the fake, a worker with our extensions and one without, and a pool of two."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing
 
 import numpy as np
 import pytest
 
-from trompe_server.target import FakeTarget, SailenvTarget, TargetRenderer
+from trompe_server.target import FakeTarget, RendererPool, SailenvTarget, TargetRenderer
 from trompe_shared.errors import RendererError
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import Object3D
+from trompe_shared.object3d import Object3D, object_from_files
 
 SIZE = (40, 56)
 VIEWS = [View(Camera(0.3, azimuth, elevation)) for azimuth, elevation in ((0, 0), (60, 30), (0, 90), (10, -90))]
 Boxes = Callable[..., Object3D]
 
 
-@pytest.fixture(params=["fake", "sailenv"])
-def renderer(request: pytest.FixtureRequest) -> TargetRenderer:
-    if request.param == "fake":
-        return FakeTarget()
-    target: SailenvTarget = request.getfixturevalue("target")
-    return target
+@pytest.fixture(params=["fake", "one worker", "a worker without extensions", "pool"])
+def renderer(request: pytest.FixtureRequest) -> Iterator[TargetRenderer]:
+    makers: dict[str, Callable[[], TargetRenderer]] = {
+        "fake": FakeTarget,
+        "one worker": lambda: SailenvTarget(*request.getfixturevalue("worker"), timeout=60),
+        "a worker without extensions": lambda: SailenvTarget(*request.getfixturevalue("plain_worker"), timeout=60),
+        "pool": lambda: RendererPool([request.getfixturevalue(name) for name in ("worker", "second_worker")]),
+    }
+    with closing(makers[request.param]()) as renderer:
+        yield renderer
 
 
 def test_images_have_the_size_asked_for_one_for_each_view(renderer: TargetRenderer, make_boxes: Boxes) -> None:
@@ -65,6 +70,58 @@ def test_right_is_right_and_up_is_up(renderer: TargetRenderer, make_boxes: Boxes
     rows, columns = np.nonzero((image != 255).any(axis=-1))
     assert rows.max() < SIZE[0] / 2
     assert columns.min() > SIZE[1] / 2
+
+
+def test_every_way_to_a_worker_shows_exactly_the_same_bytes(
+    worker: tuple[str, int], plain_worker: tuple[str, int], second_worker: tuple[str, int], make_boxes: Boxes
+) -> None:
+    box = make_boxes(textures={"front": np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)})
+    random = np.random.default_rng(1)
+    objects = [
+        box,
+        box.with_textures({"front_albedo.png": random.integers(0, 256, (37, 53, 3), dtype=np.uint8)}),
+        box.with_textures({"front_albedo.png": random.integers(0, 256, (64, 8, 3), dtype=np.uint8)}),
+        box.with_textures({name: np.full((5, 5, 3), 99, np.uint8) for name in box.textures}),
+        box,
+    ]
+    views = [View(Camera(0.3, 20 * k, 3 * k), Light(10 * k, 40, 0.5 + k / 20, 0.3), (k, 0, 9)) for k in range(10)]
+    expected = []
+    for obj in objects:  # a fresh connection for each: nothing repainted, every view asked for by itself
+        with closing(SailenvTarget(*plain_worker)) as fresh:
+            expected.append(fresh.render(obj, views, size=SIZE))
+    assert not any((image == expected[0]).all() for image in expected[1:4])
+    targets = [SailenvTarget(*worker), SailenvTarget(*plain_worker), RendererPool([worker, second_worker])]
+    for target in targets:
+        with closing(target):
+            for obj, images in zip(objects, expected, strict=True):
+                assert (target.render(obj, views, size=SIZE) == images).all()
+
+
+def test_many_textures_one_after_the_other_are_all_shown_right(target: SailenvTarget, make_boxes: Boxes) -> None:
+    box, view = make_boxes(), View(Camera(0.3, 0, 0), Light(0, 0, 0.0, 1.0))
+    greys = range(20, 230, 2)
+
+    def shown(grey: int) -> int:
+        painted = box.with_textures({"front_albedo.png": np.full((8, 8, 3), grey, np.uint8)})
+        return int(target.render(painted, [view], size=SIZE)[0, SIZE[0] // 2, SIZE[1] // 2, 0])
+
+    rising = [shown(grey) for grey in greys]
+    assert (np.diff(rising) >= 0).all()
+    assert rising[0] + 150 < rising[-1]
+    assert [shown(grey) for grey in greys[::-1]] == rising[::-1]
+
+
+def test_a_texture_that_is_an_albedo_and_a_normal_map_is_changed_in_both_places(
+    worker: tuple[str, int], make_boxes: Boxes
+) -> None:
+    box = make_boxes(maps={"normal": np.full((4, 4, 3), (128, 128, 255), np.uint8)})
+    table = box.files["box_mat_def.json"].replace(b"front_albedo.png", b"normal.png")
+    both = object_from_files({**box.files, "box_mat_def.json": table})
+    leaning = both.with_textures({"normal.png": np.full((4, 4, 3), (128, 200, 200), np.uint8)})
+    view = View(Camera(0.3, 0, 0), Light(0, 60, 1.0, 0.0))
+    with closing(SailenvTarget(*worker)) as used, closing(SailenvTarget(*worker)) as fresh:
+        used.render(both, [view], size=SIZE)
+        assert (used.render(leaning, [view], size=SIZE) == fresh.render(leaning, [view], size=SIZE)).all()
 
 
 def test_fake_and_worker_show_the_same_shape_and_colours(target: SailenvTarget, make_boxes: Boxes) -> None:

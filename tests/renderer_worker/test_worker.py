@@ -8,19 +8,19 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from trompe_renderer.model import Library
-from trompe_renderer.server import MAX_AGENTS, _Agent
-from trompe_renderer.session import Session
-from trompe_shared.errors import RendererError
-from trompe_shared.object3d import Object3D, pack_zip
+from trompe_renderer.link import Link, Memory
+from trompe_renderer.options import Options
+from trompe_renderer.server import MAX_AGENTS, Shared, _Agent
+from trompe_shared.errors import ProtocolError, RendererError
+from trompe_shared.object3d import Object3D, encode_png, pack_zip
 from trompe_shared.sailenv import COMMANDS, VIEW_FLAGS, Command
 
 Connect = Callable[..., Any]
@@ -44,6 +44,9 @@ SAMPLES: dict[str, dict[str, Any]] = {
     "set_clear_color": {"color": (1, 2, 3)},
     "set_ambient_light_color": {"color": (1, 2, 3)},
     "move_object": {"instance": 7, "position": (0, 0, 0), "rotation": (0, 0, 0)},
+    "load_scenario": {"scenario": {"objects": [{}]}},
+    "repaint_object": {"instance": 7, "textures": []},
+    "set_background_picture": {"file": ("x.png", encode_png(np.zeros((4, 4, 3), np.uint8)))},
 }
 """Field values of each command that has fields; those of the lights are made in ``sample``."""
 
@@ -66,12 +69,12 @@ def is_closed(connection: socket.socket) -> bool:
 def test_every_command_is_answered_in_full(wire: Connect) -> None:
     agent = wire()
     for command in COMMANDS.values():
-        if command.name in {"frame", "delete"}:
+        if command.name in {"frame", "delete", "render_views"}:
             continue
         try:
             agent.ask(command.name, **sample(command))
         except RendererError:
-            assert command.name in {"despawn_object", "move_object"}
+            assert command.name in {"despawn_object", "move_object", "repaint_object"}
         agent.socket.setblocking(False)
         with pytest.raises(BlockingIOError):
             agent.socket.recv(1)
@@ -94,10 +97,35 @@ def test_a_frame_without_views_is_a_delta_time(wire: Connect) -> None:
     assert wire().views(0)[0] == {}
 
 
-def test_the_handshake_names_the_agent_and_the_scene_of_single_objects(wire: Connect) -> None:
+@pytest.mark.parametrize("unused", [2, 64, 128, 2 + 64 + 128])
+def test_bits_that_stand_for_no_view_add_none(wire: Connect, unused: int) -> None:
+    agent = wire()
+    agent.socket.sendall(COMMANDS["frame"].encode_request(flags=unused + 32))
+    length = int.from_bytes(agent.read(4), "little")
+    assert Image.open(io.BytesIO(agent.read(length))).mode == "L"
+    assert struct.unpack("<f", agent.read(4))[0] >= 0
+    assert agent.ask("get_position") == (0, 0, 0)
+
+
+@pytest.mark.parametrize("gzip", [False, True])
+def test_each_length_of_a_large_frame_can_be_read_at_once(wire: Connect, make_boxes: Boxes, gzip: bool) -> None:
+    agent = wire(size=(301, 503), gzip=gzip)
+    agent.spawn(make_boxes())
+    agent.ask("set_position", position=(0, 0, 0.3))
+    agent.ask("set_rotation", rotation=(180, 0, 180))
+    for _ in range(4):
+        agent.socket.sendall(COMMANDS["frame"].encode_request(flags=ALL_VIEWS))
+        for _view in VIEW_FLAGS:
+            length = agent.socket.recv(4)  # as the published client does: without a loop
+            assert len(length) == 4
+            agent.read(int.from_bytes(length, "little"))
+        agent.read(4)
+
+
+def test_the_handshake_names_the_agent_and_the_scenes(wire: Connect) -> None:
     first, second = wire(), wire()
     assert first.agent != second.agent
-    assert first.scenes == ["object_view/scene"]
+    assert first.scenes[0] == "object_view/scene"
 
 
 @pytest.mark.parametrize("tail", [{}, {"frustum_limited": True, "dynamic": None}], ids=["short", "long"])
@@ -174,7 +202,10 @@ def test_the_rim_light_lights_once_it_has_an_intensity(wire: Connect, make_boxes
         pytest.param("set_light_intensity", {"light": "Main Light", "intensity": -1}, id="negative light"),
         pytest.param("set_light_direction", {"light": "Main Light", "direction": (0, 0, 0)}, id="no direction"),
         pytest.param("set_light_color", {"light": "Sun", "color": (0, 0, 0)}, id="no such light"),
+        pytest.param("set_light_indirect_multiplier", {"light": "Sun", "multiplier": 1.0}, id="no such light either"),
+        pytest.param("get_light_direction", {"light": "Sun"}, id="no direction of no light"),
         pytest.param("change_scene", {"scene": "room"}, id="no such scene"),
+        pytest.param("move_object", SAMPLES["move_object"], id="no such instance to move"),
         pytest.param("despawn_object", {"instance": 99}, id="no such instance"),
     ],
 )
@@ -238,6 +269,7 @@ def test_agents_do_not_see_each_others_objects(wire: Connect, make_boxes: Boxes)
     [
         pytest.param(bytes([0xAA]) * 100, id="unknown command"),
         pytest.param(b"\x02" + struct.pack("<i", -5), id="negative length"),
+        pytest.param(b"\x1d" + struct.pack("<i", 2) + b"{}", id="a scenario whose reply has no length"),
         pytest.param(b"\x0c" + struct.pack("<i", 2**31 - 1), id="huge length"),
         pytest.param(bytes(np.random.default_rng(5).integers(0x20, 0xDF, 1000, dtype=np.uint8)), id="noise"),
     ],
@@ -286,24 +318,61 @@ class _BrokenRenderer:
     def render(self, *_args: object, **_sizes: int) -> None:
         raise RuntimeError("out of memory")
 
+    survey = render
 
-def test_a_frame_that_cannot_be_rendered_is_sent_flat_and_marked(wire_to: Connect) -> None:
+
+@contextmanager
+def agent_of_a_broken_renderer(wire_to: Connect) -> Iterator[Any]:
+    """Agent 3 of a server in this process, which can answer everything but draw nothing."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def serve() -> None:
-            with listener.accept()[0] as connection:
-                _Agent(connection, 3, _BrokenRenderer(), Session(Library())).serve()  # type: ignore[arg-type]
+            connection = listener.accept()[0]
+            with connection:
+                shared = Shared(_BrokenRenderer(), Options())  # type: ignore[arg-type]
+                with suppress(ProtocolError):
+                    _Agent(Link(connection, Memory()), 3, shared).serve()
 
         thread = threading.Thread(target=serve)
         thread.start()
         agent = wire_to(listener.getsockname())
-        views, delta_time = agent.views(ALL_VIEWS)
-        assert math.isnan(delta_time)
-        assert np.array(Image.open(io.BytesIO(views["main"]))).shape == (32, 48, 3)
-        assert "out of memory" in agent.ask("last_error")
-        agent.socket.sendall(COMMANDS["delete"].encode_request())
+        yield agent
+        with suppress(OSError):
+            agent.socket.sendall(COMMANDS["delete"].encode_request())
         thread.join(timeout=30)
         agent.socket.close()
+
+
+@pytest.mark.parametrize("flags", [1, 4, 32, ALL_VIEWS])
+def test_a_frame_that_cannot_be_rendered_is_sent_flat_and_marked(wire_to: Connect, flags: int) -> None:
+    with agent_of_a_broken_renderer(wire_to) as agent:
+        views, delta_time = agent.views(flags)
+        assert math.isnan(delta_time)
+        assert list(views) == [name for name, bit in VIEW_FLAGS.items() if flags & bit]
+        if "main" in views:
+            assert np.array(Image.open(io.BytesIO(views["main"]))).shape == (32, 48, 3)
+        assert "out of memory" in agent.ask("last_error")
+
+
+@pytest.mark.parametrize(
+    ("command", "values", "reason"),
+    [
+        pytest.param("change_scene", {"scene": "moon/scene"}, "moon/scene", id="with a status"),
+        pytest.param("get_light_color", {"light": "Sun"}, "Sun", id="instead of a value"),
+        pytest.param("get_light_type", {"light": "Sun"}, "Sun", id="by a word of its own"),
+        pytest.param("spawn_object", SAMPLES["spawn_object"] | {"name": "yeti"}, "yeti", id="by an empty text"),
+        pytest.param("load_scenario", SAMPLES["load_scenario"], "None", id="by ids that are missing"),
+    ],
+)
+def test_every_refusal_is_logged_with_the_agent_the_command_and_the_reason(
+    wire_to: Connect, caplog: pytest.LogCaptureFixture, command: str, values: dict[str, Any], reason: str
+) -> None:
+    with agent_of_a_broken_renderer(wire_to) as agent:
+        with suppress(RendererError):
+            agent.ask(command, **values)
+        assert reason in agent.ask("last_error")
+    messages = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert any(text.startswith(f"agent 3: refused {command}: ") and reason in text for text in messages)
 
 
 def test_more_agents_than_there_are_places_are_turned_away_until_one_leaves(

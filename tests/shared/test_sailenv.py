@@ -49,6 +49,15 @@ def values_of(kind: Any) -> st.SearchStrategy[Any]:
         return st.tuples(texts, st.binary(max_size=50))
     if isinstance(kind, sailenv._Dynamic):
         return st.none() | st.tuples(texts, texts)
+    if isinstance(kind, sailenv._Scenario):
+        return st.fixed_dictionaries({"objects": st.lists(st.dictionaries(texts, texts), max_size=3)})
+    if isinstance(kind, sailenv._Pixels):
+        sides = st.tuples(st.integers(0, 3), st.integers(0, 3))
+        return sides.flatmap(
+            lambda s: st.binary(min_size=3 * s[0] * s[1], max_size=3 * s[0] * s[1]).map(lambda b: (*s, b))
+        )
+    if isinstance(kind, sailenv._Changes):
+        return st.lists(st.tuples(st.just("set_position"), requests_of(COMMANDS["set_position"])), max_size=3)
     cells = [values_of(cell) for cell in kind.kinds]
     return st.lists(cells[0] if len(cells) == 1 else st.tuples(*cells), max_size=5)
 
@@ -101,6 +110,30 @@ def test_a_clients_text_counts_code_points_and_a_servers_counts_bytes(text: str,
     assert decode_request(read, is_long=lambda: False).values == {"scene": text}
     assert rest(read) == after
     assert COMMANDS["send_obj_zip"].encode_reply(text) == struct.pack("<i", len(utf8)) + utf8
+
+
+@given(st.lists(texts, max_size=5), st.binary(max_size=4))
+def test_a_scenarios_reply_has_as_many_texts_as_the_request_asks_for(ids: list[str], after: bytes) -> None:
+    command = COMMANDS["load_scenario"]
+    read = reader(command.encode_reply(*ids) + after)
+    assert command.decode_reply(read, count=len(ids)) == tuple(ids)
+    assert rest(read) == after
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"objects": 3}', "[" * 100_000, '{"objects": [' + "0," * 5000 + "0]}"]
+)
+def test_a_scenario_without_a_list_of_objects_of_reasonable_length_is_refused(text: str) -> None:
+    data = b"\x1d" + struct.pack("<i", len(text)) + text.encode()
+    with pytest.raises(ProtocolError, match="load_scenario"):
+        decode_request(reader(data), is_long=lambda: True)
+
+
+@pytest.mark.parametrize("command", ["get_categories", "get_light_color"])
+def test_no_negative_number_is_answered_because_the_client_would_read_another(command: str) -> None:
+    value = [(-1, "x")] if command == "get_categories" else (-1, 0, 0)
+    with pytest.raises(ProtocolError):
+        COMMANDS[command].encode_reply(value)
 
 
 SPAWN = {

@@ -1,0 +1,249 @@
+"""How spawned objects move by themselves: the paths alone, and on the wire with a clock that ticks once a frame."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trompe_renderer.dynamics import NO_WALLS, Motion, Place, frustum_walls, motion_of, room_walls
+from trompe_renderer.rotation import between, from_euler, product, to_matrix
+from trompe_shared.errors import RendererError
+from trompe_shared.geometry import FIELD_OF_VIEW, Camera, euler_to_matrix, look_rotation
+from trompe_shared.object3d import Object3D
+
+Boxes = Callable[..., Object3D]
+angles = st.tuples(*[st.floats(-400, 400)] * 3)
+HERE = Place(np.zeros(3), from_euler((0, 0, 0)))
+ROOM = room_walls(np.array([-1.0, -1, -1]), np.array([1.0, 1, 1]))
+
+
+def xyz(x: float, y: float, z: float) -> dict[str, float]:
+    return {"x": x, "y": y, "z": z}
+
+
+def waypoints(*points: tuple[float, float, float], total_time: float = 4.0, turn: float = 0.0) -> dict[str, Any]:
+    """As the git client describes it; each point is turned by ``turn`` degrees more about y."""
+    rows = [{"position": xyz(*point), "rotation": xyz(0, turn * k, 0)} for k, point in enumerate(points)]
+    return {"waypoints": rows, "total_time": total_time}
+
+
+def bouncing(speed: float = 1.0, seed: int = 42, direction: tuple[float, float, float] = (0, 0, 1)) -> dict[str, Any]:
+    return {"start_direction": xyz(*direction), "speed": speed, "angular_speed": 2.0, "seed": seed}
+
+
+def after(motion: Motion, seconds: float, *, steps: int = 1, walls: Any = NO_WALLS, radius: float = 0.1) -> list[Place]:
+    """Places after each of ``steps`` even steps."""
+    place, places, going = HERE, [], motion
+    for _ in range(steps):
+        if going is not None:
+            place, going = going.moved(place, seconds / steps, radius=radius, walls=walls)  # type: ignore[assignment]
+        places.append(place)
+    return places
+
+
+# --- rotations ---
+
+
+@given(angles)
+def test_a_quaternion_of_euler_angles_is_their_matrix(degrees: tuple[float, float, float]) -> None:
+    assert np.allclose(to_matrix(from_euler(degrees)), euler_to_matrix(np.array(degrees)), atol=1e-12)
+
+
+@given(angles, angles)
+def test_a_product_of_rotations_does_the_second_first(one: Any, other: Any) -> None:
+    first, second = from_euler(one), from_euler(other)
+    assert np.allclose(to_matrix(product(second, first)), to_matrix(second) @ to_matrix(first), atol=1e-12)
+
+
+@given(angles, angles, st.floats(0, 1))
+def test_between_two_rotations_the_way_is_even_and_ends_at_both(one: Any, other: Any, share: float) -> None:
+    start, end = from_euler(one), from_euler(other)
+    whole = np.trace(to_matrix(start).T @ to_matrix(end))
+    part = np.trace(to_matrix(start).T @ to_matrix(between(start, end, share)))
+    turned, of = (math.acos(np.clip((x - 1) / 2, -1, 1)) for x in (part, whole))
+    assert turned == pytest.approx(share * of, abs=1e-5)
+    assert np.allclose(to_matrix(between(start, end, 1.0)), to_matrix(end), atol=1e-5)
+
+
+# --- waypoints ---
+
+
+def test_linear_waypoints_are_reached_in_turn_at_even_times_and_the_last_is_the_end() -> None:
+    motion = motion_of("linear_waypoints", waypoints((0, 0, 0), (1, 0, 0), (1, 2, 0), turn=90))
+    places = after(motion, 6.0, steps=6)
+    expected = [(0.5, 0, 0), (1, 0, 0), (1, 1, 0), (1, 2, 0), (1, 2, 0), (1, 2, 0)]
+    assert np.allclose([place.position for place in places], expected)
+    assert np.allclose(to_matrix(places[0].turn), euler_to_matrix(np.array([0, 45, 0])))
+    assert np.allclose(to_matrix(places[-1].turn), euler_to_matrix(np.array([0, 180, 0])))
+    assert motion.duration == 4.0
+
+
+def test_catmull_waypoints_go_through_every_point_without_a_corner() -> None:
+    points = [(0.0, 0, 0), (1.0, 1, 0), (2.0, 0, 1), (3.0, 0, 0)]
+    motion = motion_of("catmull_waypoints", waypoints(*points, total_time=3.0))
+    track = np.array([place.position for place in after(motion, 3.0, steps=300)])
+    assert np.allclose(track[[99, 199, 299]], points[1:], atol=1e-9)
+    assert np.abs(np.diff(track, n=2, axis=0)).max() < 0.002  # speed changes by little from step to step
+    straight = motion_of("catmull_waypoints", waypoints((0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0), total_time=3.0))
+    assert np.allclose(after(straight, 1.5)[0].position, (1.5, 0, 0))
+
+
+@given(st.floats(0.01, 20), st.integers(1, 50))
+def test_where_a_waypoint_movement_is_depends_on_the_time_alone(seconds: float, steps: int) -> None:
+    motion = motion_of("catmull_waypoints", waypoints((0, 0, 0), (1, 1, 0), (2, 0, 1), turn=50))
+    at_once, stepwise = after(motion, seconds)[-1], after(motion, seconds, steps=steps)[-1]
+    assert np.allclose(at_once.position, stepwise.position, atol=1e-6)
+
+
+def test_a_single_waypoint_is_where_the_object_goes_at_once() -> None:
+    place = after(motion_of("linear_waypoints", waypoints((1, 2, 3))), 0.1)[0]
+    assert np.allclose(place.position, (1, 2, 3))
+
+
+# --- uniform movement ---
+
+
+def test_without_walls_a_uniform_movement_is_straight_and_turns_evenly() -> None:
+    places = after(motion_of("uniform_movement_random_bounce", bouncing(speed=2.0, direction=(0, 3, 4))), 3.0, steps=3)
+    assert np.allclose([p.position for p in places], np.outer([2, 4, 6], (0, 0.6, 0.8)))
+    turns = [to_matrix(place.turn) for place in places]
+    assert np.allclose([np.trace(turns[k].T @ turns[k + 1]) for k in (0, 1)], 1 + 2 * math.cos(2.0))
+
+
+@given(st.integers(0, 2**40), st.floats(0.1, 30), st.floats(0.05, 0.4))
+def test_a_ball_never_leaves_its_room_and_bounces_at_its_surface(seed: int, speed: float, radius: float) -> None:
+    motion = motion_of("uniform_movement_random_bounce", bouncing(speed, seed, (1, 2, 3)))
+    places = after(motion, 5.0, steps=50, walls=ROOM, radius=radius)
+    assert max(np.abs(place.position).max() for place in places) <= 1 - radius + 1e-6
+    assert len({tuple(place.position.round(6)) for place in places}) > 25
+
+
+def test_the_same_seed_bounces_the_same_way_and_another_seed_another() -> None:
+    tracks = [
+        [
+            place.position
+            for place in after(motion_of("uniform_movement_random_bounce", bouncing(3, seed)), 4, steps=20, walls=ROOM)
+        ]
+        for seed in (1, 1, 2)
+    ]
+    assert np.array_equal(tracks[0], tracks[1])
+    assert not np.allclose(tracks[0], tracks[2])
+
+
+def test_between_bounces_the_speed_is_the_one_asked_for() -> None:
+    places = after(motion_of("uniform_movement_random_bounce", bouncing(1.0)), 2.0, steps=2000, walls=ROOM)
+    steps = np.linalg.norm(np.diff([place.position for place in places], axis=0), axis=1)
+    assert np.median(steps) == pytest.approx(0.001)
+    assert steps.max() < 0.001 + 1e-9
+
+
+@given(st.floats(-180, 180), st.floats(-89, 89), st.floats(0.5, 2.0), st.tuples(*[st.floats(-3, 3)] * 3))
+def test_a_view_frustum_holds_what_the_camera_sees_from_near_to_far(
+    azimuth: float, elevation: float, aspect: float, point: tuple[float, float, float]
+) -> None:
+    camera = np.eye(4)
+    camera[:3, :3], camera[:3, 3] = look_rotation(azimuth, elevation), (0.3, -0.2, 0.1)
+    walls = frustum_walls(camera, field_of_view=FIELD_OF_VIEW, aspect=aspect, near=0.3, far=2.0)
+    x, y, z = camera[:3, :3].T @ (np.array(point) - camera[:3, 3])
+    slope = math.tan(math.radians(FIELD_OF_VIEW / 2))
+    seen = 0.3 <= -z <= 2.0 and abs(y) <= -z * slope and abs(x) <= -z * slope * aspect
+    assert bool((walls[:, :3] @ point + walls[:, 3] >= 0).all()) == seen
+
+
+@pytest.mark.parametrize(
+    ("kind", "description", "reason"),
+    [
+        pytest.param("fly", {}, "no movement 'fly'", id="unknown"),
+        pytest.param("linear_waypoints", "no json", "JSONDecodeError", id="not JSON"),
+        pytest.param("linear_waypoints", "[" * 100_000, "RecursionError", id="nested without end"),
+        pytest.param("linear_waypoints", {"waypoints": [], "total_time": 1}, "at least one", id="no points"),
+        pytest.param("catmull_waypoints", waypoints((0, 0, 0), total_time=0), "total_time", id="no time"),
+        pytest.param("catmull_waypoints", waypoints((0, math.nan, 0)), "finite", id="not a number"),
+        pytest.param("catmull_waypoints", {"waypoints": [{}], "total_time": 1}, "KeyError", id="no position"),
+        pytest.param("uniform_movement_random_bounce", bouncing(direction=(0, 0, 0)), "zero", id="no direction"),
+        pytest.param("uniform_movement_random_bounce", bouncing(speed=-1), "speed", id="negative speed"),
+        pytest.param("uniform_movement_random_bounce", {"speed": 1}, "KeyError", id="fields are missing"),
+        pytest.param("uniform_movement_random_bounce", [], "TypeError", id="not an object"),
+    ],
+)
+def test_a_movement_that_makes_no_sense_is_refused(kind: str, description: Any, reason: str) -> None:
+    with pytest.raises(RendererError, match=reason):
+        motion_of(kind, description)
+
+
+# --- on the wire ---
+
+
+@pytest.fixture
+def ticking(ticking_worker: tuple[str, int], wire_to: Callable[..., Any]) -> Iterator[Any]:
+    agent = wire_to(ticking_worker, size=(48, 64), long=True)
+    agent.look(Camera(1.0, 0, 0))
+    yield agent
+    agent.socket.close()
+
+
+def middle(agent: Any) -> tuple[float, float]:
+    """Row and column of the middle of what is seen in the next frame."""
+    rows, columns = np.nonzero(agent.labels()["object"].any(axis=-1))
+    assert len(rows), "nothing is seen"
+    return float(rows.mean()), float(columns.mean())
+
+
+def test_an_object_follows_its_waypoints_as_frames_go_by_and_its_flow_says_so(ticking: Any, make_boxes: Boxes) -> None:
+    path = waypoints((0, -0.2, 0), (0, 0.2, 0), total_time=2.0)
+    ticking.spawn(make_boxes(), position=(0.5, 0.5, 0.5), dynamic=("linear_waypoints", json.dumps(path)))
+    frames = [ticking.labels() for _ in range(5)]
+    masks = [views["object"].any(axis=-1) for views in frames]
+    pixels = 0.1 * 48 / 2 / math.tan(math.radians(30)) / 0.96  # of the side that faces the camera
+    rows = [np.nonzero(mask)[0].mean() for mask in masks]
+    assert np.allclose(np.diff(rows), [-pixels, -pixels, -pixels, 0], atol=0.6)
+    flows = [views["optical"][mask].mean(axis=0) for views, mask in zip(frames, masks, strict=True)]
+    assert np.allclose(flows[1:], [(0, -pixels)] * 3 + [(0, 0)], atol=0.2)
+
+
+def test_a_frame_says_how_much_time_has_passed(ticking: Any, wire: Callable[..., Any]) -> None:
+    assert ticking.views(0)[1] == 0.5
+    agent = wire()
+    agent.views(0)
+    assert 0 < agent.views(0)[1] < 5
+
+
+def test_what_is_moved_by_hand_moves_no_more_by_itself(ticking: Any, make_boxes: Boxes) -> None:
+    path = waypoints((0, -0.3, 0), (0, 0.3, 0))
+    ticking.spawn(make_boxes(), dynamic=("catmull_waypoints", json.dumps(path)))
+    ticking.views(0)
+    ticking.ask("move_object", instance=1, position=(0, 0, 0), rotation=(0, 0, 0))
+    assert middle(ticking) == middle(ticking)
+
+
+def flying_ball(*, limited: bool, frustum: dict[str, Any] | None) -> dict[str, Any]:
+    dynamic = {"type": "uniform_movement_random_bounce", "description": bouncing(0.7, direction=(1, 0.3, 0))}
+    ball = {"id": "a", "prefab": "ball", "position": xyz(0, 0, 0), "rotation": xyz(0, 0, 0), "dynamic": dynamic}
+    return {"scene_name": "object_view/scene", "objects": [ball | {"frustum_limited": limited}], "frustum": frustum}
+
+
+def test_in_a_view_frustum_a_limited_object_stays_in_sight_and_another_flies_off(ticking: Any) -> None:
+    ticking.load(flying_ball(limited=True, frustum={"spawn": True, "far_clip_plane": 1.5}))
+    assert len({middle(ticking) for _ in range(40)}) > 20
+    for limited, frustum in ((False, {"spawn": True, "far_clip_plane": 1.5}), (True, {"spawn": False}), (True, None)):
+        ticking.load(flying_ball(limited=limited, frustum=frustum))
+        for _ in range(5):
+            ticking.views(0)
+        assert not ticking.labels()["object"].any()
+    ticking.ask("change_scene", scene="object_view/scene")
+    ticking.look(Camera(1.0, 0, 0))
+    ticking.ask("spawn_view_frustum")
+    dynamic = "uniform_movement_random_bounce", json.dumps(bouncing(0.7, direction=(1, 0.3, 0)))
+    ticking.spawn_named("ball", dynamic=dynamic)
+    for _ in range(8):
+        middle(ticking)
+
+
+def test_a_spawn_with_a_movement_that_makes_no_sense_is_refused_with_its_reason(ticking: Any) -> None:
+    assert ticking.spawn_named("mug", dynamic=("fly", "{}")) == ""
+    assert "fly" in ticking.ask("last_error")

@@ -1,0 +1,121 @@
+"""A worker at work for long: many agents at once, many frames, many uploads. The figures: ``--log-cli-level=INFO``.
+
+The slow runs last TROMPE_SOAK_SECONDS (600) with 8 agents, and 10,000 frames and 1,000 uploads.
+"""
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trompe_server.target import SailenvTarget
+from trompe_shared.geometry import Camera, Light, View
+from trompe_shared.object3d import Object3D
+
+Boxes = Callable[..., Object3D]
+Start = Callable[[], Any]
+
+AGENTS = 8
+SIZE = (64, 64)
+VIEWS = [View(Camera(0.3, 30 * k, 5 * k), Light(20 * k, 40, 0.5, 0.3)) for k in range(12)]
+SLOW = [pytest.mark.slow, pytest.mark.timeout(7200)]
+
+log = logging.getLogger(__name__)
+
+
+def marked(box: Object3D, agent: int, turn: int) -> Object3D:
+    """``box`` with textures that no other agent and no other turn has."""
+    random = np.random.default_rng([agent, turn])
+    return box.with_textures({name: random.integers(0, 256, (32, 32, 3), dtype=np.uint8) for name in box.textures})
+
+
+@pytest.mark.parametrize(
+    "seconds",
+    [
+        pytest.param(3.0, id="for a moment"),
+        pytest.param(float(os.environ.get("TROMPE_SOAK_SECONDS", "600")), id="for long", marks=SLOW),
+    ],
+)
+def test_agents_at_work_at_once_get_their_own_pictures_and_none_waits_for_long(
+    seconds: float, own_worker: Start, make_boxes: Boxes
+) -> None:
+    worker, turns = own_worker(), 3
+    objects = [[marked(make_boxes(), agent, turn) for turn in range(turns)] for agent in range(AGENTS)]
+    with closing(SailenvTarget(*worker.address)) as target:
+        expected = [[target.render(obj, VIEWS, size=SIZE) for obj in mine] for mine in objects]
+    waits: list[list[float]] = [[] for _ in range(AGENTS)]
+    wrong: list[tuple[int, int]] = []
+    until = time.monotonic() + seconds
+
+    def work(agent: int) -> None:
+        random = np.random.default_rng(agent)
+        with closing(SailenvTarget(*worker.address)) as target:
+            while time.monotonic() < until:
+                turn, first = (int(number) for number in random.integers((turns, len(VIEWS))))
+                views = slice(first, first + int(random.integers(1, 4)))
+                started = time.monotonic()
+                images = target.render(objects[agent][turn], VIEWS[views], size=SIZE)
+                waits[agent].append((time.monotonic() - started) / len(images))
+                if not (images == expected[agent][turn][views]).all():
+                    wrong.append((agent, turn))
+
+    threads = [threading.Thread(target=work, args=(agent,)) for agent in range(AGENTS)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    middle, late = (float(np.percentile(np.concatenate(waits), share)) for share in (50, 99))
+    counts = [len(mine) for mine in waits]
+    log.info(
+        "%d agents, %.0f s: %d requests, %d to %d an agent; a picture takes %.1f ms (median), %.1f ms (p99)",
+        *(AGENTS, seconds, sum(counts), min(counts), max(counts), 1000 * middle, 1000 * late),
+    )
+    assert wrong == []
+    assert min(counts) > 0.5 * max(counts), "turns are not fair"
+    assert late < 5.0
+
+
+@pytest.mark.parametrize(
+    ("frames", "uploads"),
+    [pytest.param(300, 40, id="some"), pytest.param(10_000, 1_000, id="many", marks=SLOW)],
+)
+def test_memory_stays_flat(
+    frames: int, uploads: int, own_worker: Start, wire_to: Callable[..., Any], make_boxes: Boxes
+) -> None:
+    worker = own_worker()
+    agent = wire_to(worker.address)
+    random = np.random.default_rng(0)
+
+    def upload(count: int) -> None:
+        for _ in range(count):
+            front = random.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+            half = (random.uniform(0.05, 0.1), 0.06, 0.04)  # another mesh each time
+            agent.ask(
+                "despawn_object", instance=int(agent.spawn(make_boxes(((0, 0, 0), half), textures={"front": front})))
+            )
+
+    def draw(count: int) -> None:
+        agent.spawn(make_boxes())
+        for number in range(count):
+            agent.ask("set_position", position=(0, 0, 0.3 + number % 7 / 50))
+            agent.views(1)
+
+    def work(frames: int, uploads: int) -> None:
+        for _ in range(10):
+            upload(uploads // 10)
+            draw(frames // 10)
+            agent.ask("change_scene", scene="object_view/scene")
+
+    work(frames // 2 if frames < 1000 else 2000, uploads // 2 if uploads < 100 else 200)
+    before = worker.memory
+    work(frames, uploads)
+    after = worker.memory
+    agent.socket.close()
+    log.info("%d frames, %d uploads: memory %.1f to %.1f MiB", frames, uploads, before / 2**20, after / 2**20)
+    assert after < before + 24 * 2**20
