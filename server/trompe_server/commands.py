@@ -57,26 +57,41 @@ def _announce(line: str) -> None:
 @click.option(
     "--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="Port; 0 takes a free one."
 )
+@click.option(
+    "--renderers",
+    type=click.IntRange(1, 64),
+    help="Renderer workers, which share each job's images (or TROMPE_RENDERERS). Default: 1.",
+)
 @_data
 @_for_people
-def serve(host: str, port: int, data: Path | None) -> None:
-    """Run the service: REST API, one attack worker, one renderer worker, one folder of data."""
+def serve(host: str, port: int, renderers: int | None, data: Path | None) -> None:
+    """Run the service: REST API, one attack worker, its renderer workers, one folder of data."""
     from trompe_server.serving import run_service
 
     _log_to_stderr()
-    run_service(_settings(data), host=host, port=port, announce=_announce)
+    settings = _settings(data)
+    if renderers is not None:
+        settings = settings.model_copy(update={"renderers": renderers})
+    run_service(settings, host=host, port=port, announce=_announce)
 
 
 @click.command()
 @_data
-@click.option("--renderer", required=True, metavar="HOST:PORT", help="The renderer worker that shows the objects.")
+@click.option(
+    "--renderer",
+    "renderers",
+    required=True,
+    multiple=True,
+    metavar="HOST:PORT",
+    help="A renderer worker that shows the objects. Several share the work.",
+)
 @_for_people
-def worker(data: Path | None, renderer: str) -> None:
+def worker(data: Path | None, renderers: tuple[str, ...]) -> None:
     """Run an attack worker, which takes jobs of a data folder one after the other."""
     from trompe_server.jobs.worker import run_worker
 
     _log_to_stderr()
-    run_worker(_settings(data), _address(renderer), announce=_announce)
+    run_worker(_settings(data), [_address(renderer) for renderer in renderers], announce=_announce)
 
 
 def _address(text: str) -> tuple[str, int]:
@@ -90,7 +105,7 @@ def _address(text: str) -> tuple[str, int]:
 @click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder of the result.")
 def demo(out: Path) -> None:
     """Attack the shipped mug against the shipped classifier, from object to result."""
-    attack = ["attack", "mug", "--label", "mug", "--classifier", "tiny", "--steps", "40", "--out", str(out)]
+    attack = ["attack", "mug", "--label", "mug", "--classifier", "tiny", "--steps", "100", "--out", str(out)]
     sys.exit(subprocess.run([sys.executable, "-m", "trompe_client.cli", *attack], check=False).returncode)
 
 

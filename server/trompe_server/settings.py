@@ -1,7 +1,9 @@
 """What can be set from outside: environment variables that begin with TROMPE_, and the options of the commands."""
 
 from pathlib import Path
+from typing import Annotated
 
+from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 __all__ = ["Settings"]
@@ -20,6 +22,8 @@ class Settings(BaseSettings):
     """Largest upload, bytes."""
     stall_timeout: float = 1800.0
     """Seconds without progress after which a job's worker is stopped."""
+    renderers: Annotated[int, Field(ge=1, le=64)] = 1
+    """Renderer workers that ``serve`` starts."""
     renderer_patience: float = 10.0
     """Seconds a job waits for a renderer that does not answer."""
     pipeline: str = "trompe_server.attack_job:open_pipeline"

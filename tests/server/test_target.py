@@ -68,6 +68,7 @@ def pretend(frame: list[bytes], *, instance: str = "1") -> Callable[[socket.sock
             while True:
                 name = decode_request(read, is_long=lambda: True).command.name
                 values = {"send_obj_zip": ("path",), "spawn_object": (instance,), "last_error": ("lamp is broken",)}
+                values["get_light_type"] = ("light_not_found",)
                 reply = b"".join(frame) if name == "frame" else COMMANDS[name].encode_reply(*values.get(name, ()))
                 connection.sendall(reply)
 

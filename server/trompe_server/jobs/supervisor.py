@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from types import TracebackType
 from typing import Final, Self
 
@@ -115,13 +116,15 @@ class Child:
 
 
 class Supervisor:
-    """The two children of ``trompe serve``; a context manager. The renderer keeps its port when it is started again."""
+    """The children of ``trompe serve``; a context manager. A renderer keeps its port when it is started again."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._port = 0
+        self._ports = [0] * settings.renderers
         listening = re.compile(r"^trompe renderer listening on (\S+):(\d+)$")
-        self.renderer = Child("renderer worker", self._render, listening)
+        self.renderers = [
+            Child("renderer worker", partial(self._render, number), listening) for number in range(settings.renderers)
+        ]
         self.worker = Child("attack worker", self._work, re.compile(f"^{re.escape(READY)}$"))
 
     def __enter__(self) -> Self:
@@ -133,30 +136,33 @@ class Supervisor:
         self.stop()
 
     def start(self, *, timeout: float = 90.0) -> None:
-        """Start both; return once they are up. Raises ``ServiceError`` where one is not up in ``timeout`` seconds."""
+        """Start all; return once they are up. Raises ``ServiceError`` where one is not up in ``timeout`` seconds."""
         deadline = time.monotonic() + timeout
-        self.renderer.start()
-        self._port = int(self.renderer.wait_ready(deadline)[2])
+        for renderer in self.renderers:
+            renderer.start()
+        self._ports = [int(renderer.wait_ready(deadline)[2]) for renderer in self.renderers]
         self.worker.start()
         self.worker.wait_ready(deadline)
 
     def stop(self) -> None:
-        """End both, the worker first."""
+        """End all, the attack worker first."""
         self.worker.stop()
-        self.renderer.stop()
+        for renderer in self.renderers:
+            renderer.stop()
 
     def missing(self) -> list[str]:
         """What is not up right now, in words; empty when all is well."""
-        words = [f"the {child.name} is not up" for child in (self.worker, self.renderer) if not child.up]
-        if not words and not _accepts("127.0.0.1", self._port):
-            words.append("the renderer worker does not answer")
+        words = [f"the {child.name} is not up" for child in (self.worker, *self.renderers) if not child.up]
+        if not words and not all(_accepts("127.0.0.1", port) for port in self._ports):
+            words.append("a renderer worker does not answer")
         return words
 
-    def _render(self) -> list[str]:
-        return ["render", "--host", "127.0.0.1", "--port", str(self._port)]
+    def _render(self, number: int) -> list[str]:
+        return ["render", "--host", "127.0.0.1", "--port", str(self._ports[number])]
 
     def _work(self) -> list[str]:
-        return ["worker", "--data", str(self._settings.data), "--renderer", f"127.0.0.1:{self._port}"]
+        renderers = [word for port in self._ports for word in ("--renderer", f"127.0.0.1:{port}")]
+        return ["worker", "--data", str(self._settings.data), *renderers]
 
 
 def _accepts(host: str, port: int) -> bool:

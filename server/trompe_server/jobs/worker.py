@@ -1,13 +1,14 @@
 """The worker process: takes one job after the other from the queue and runs it. The only process that imports torch."""
 
 import importlib
+import itertools
 import logging
 import os
 import signal
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -19,9 +20,12 @@ from trompe_server.jobs.engine import DbosWorker, migrate_engine
 from trompe_server.jobs.runner import JobRunner, OpenedJob
 from trompe_server.jobs.store import JobStore
 from trompe_server.library import Library
+from trompe_server.memory import keep_freed_memory
 from trompe_server.settings import Settings
 from trompe_shared.api import Job
 from trompe_shared.errors import RendererError
+
+Address = tuple[str, int]
 
 __all__ = ["READY", "prepare_data", "run_worker", "wait_for_renderer"]
 
@@ -48,8 +52,10 @@ def prepare_data(settings: Settings) -> None:
         store.close()
 
 
-def run_worker(settings: Settings, renderer: tuple[str, int], *, announce: Callable[[str], None]) -> None:
-    """Work until SIGTERM or SIGINT. ``announce`` is given the line READY once the worker takes jobs.
+def run_worker(settings: Settings, renderers: Sequence[Address], *, announce: Callable[[str], None]) -> None:
+    """Work until SIGTERM or SIGINT, with the renderer workers at ``renderers``, which share each job's images.
+
+    ``announce`` is given the line READY once the worker takes jobs.
 
     Raises ``ServiceError`` where another worker has the data folder.
     """
@@ -60,7 +66,7 @@ def run_worker(settings: Settings, renderer: tuple[str, int], *, announce: Calla
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: stop.set())
         store = JobStore(settings.database)
-        runner = JobRunner(store, _job_opener(settings, renderer))
+        runner = JobRunner(store, _job_opener(settings, renderers))
         DbosWorker(settings.database, runner).start()
         announce(READY)
         _preload(settings.pipeline)
@@ -70,35 +76,36 @@ def run_worker(settings: Settings, renderer: tuple[str, int], *, announce: Calla
 
 
 def prepare_environment() -> None:
-    """Thread counts for the libraries that are imported later; values that are set already stay."""
+    """Thread counts for the libraries that are imported later (values that are set already stay), and memory."""
+    keep_freed_memory()
     os.environ.setdefault("OMP_NUM_THREADS", str(len(os.sched_getaffinity(0))))
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
-def wait_for_renderer(renderer: tuple[str, int], *, seconds: float) -> None:
-    """Return once something accepts connections at ``renderer``. Raises ``RendererError`` after ``seconds``."""
+def wait_for_renderer(renderers: Sequence[Address], *, seconds: float) -> None:
+    """Return once one of ``renderers`` accepts connections. Raises ``RendererError`` after ``seconds``."""
     deadline = time.monotonic() + seconds
-    while True:
+    for host, port in itertools.cycle(renderers):
         try:
-            socket.create_connection(renderer, timeout=2.0).close()
+            socket.create_connection((host, port), timeout=2.0).close()
             return
         except OSError as error:
             if time.monotonic() > deadline:
                 raise RendererError(
-                    f"No renderer answers at {renderer[0]}:{renderer[1]} ({error}). Start one with: trompe render "
-                    f"--host {renderer[0]} --port {renderer[1]}; `trompe doctor` says whether this machine can render."
+                    f"No renderer answers at {host}:{port} ({error}). Start one with: trompe render "
+                    f"--host {host} --port {port}; `trompe doctor` says whether this machine can render."
                 ) from error
             time.sleep(0.3)
 
 
-def _job_opener(settings: Settings, renderer: tuple[str, int]) -> Callable[[Job], OpenedJob]:
+def _job_opener(settings: Settings, renderers: Sequence[Address]) -> Callable[[Job], OpenedJob]:
     library = Library(settings.library)
 
     def open_job(job: Job) -> OpenedJob:
-        wait_for_renderer(renderer, seconds=settings.renderer_patience)
-        from trompe_server.target.sailenv import SailenvTarget
+        wait_for_renderer(renderers, seconds=settings.renderer_patience)
+        from trompe_server.target import RendererPool, SailenvTarget
 
-        target = SailenvTarget(*renderer)
+        target = SailenvTarget(*renderers[0]) if len(renderers) == 1 else RendererPool(renderers)
         try:
             artifacts = LocalArtifacts(settings.artifacts(job.id))
             pipeline = _named(settings.pipeline)(job.spec, library=library, artifacts=artifacts, target=target)

@@ -1,6 +1,6 @@
-"""A photograph behind the object, for a renderer that only knows uniform backgrounds."""
+"""Photographs behind the object, for a renderer that only knows uniform backgrounds."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,20 +11,24 @@ from trompe_server.target.protocol import TargetRenderer
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
-__all__ = ["BackdropTarget"]
+__all__ = ["BackdropTarget", "fitted"]
 
 Images = NDArray[np.uint8]
 
 
-class BackdropTarget:
-    """Renders each view in front of black and of white; the difference says how much of the picture shows through.
+def fitted(picture: Images, size: tuple[int, int]) -> Images:
+    """``picture`` (h, w, 3), cropped and scaled to fill an image of ``size`` (H, W)."""
+    return np.asarray(ImageOps.fit(Image.fromarray(picture), (size[1], size[0]), Image.Resampling.LANCZOS))
 
-    ``picture`` is (h, w, 3) uint8, sRGB; it is cropped and scaled to fill the image. Views' own backgrounds are
-    ignored.
+
+class BackdropTarget:
+    """Renders views that have a backdrop in front of black and of white; the difference says how much shows through.
+
+    ``pictures`` are the backdrops by name, (h, w, 3) uint8, sRGB.
     """
 
-    def __init__(self, target: TargetRenderer, picture: Images) -> None:
-        self._target, self._picture = target, Image.fromarray(picture)
+    def __init__(self, target: TargetRenderer, pictures: Mapping[str, Images]) -> None:
+        self._target, self._pictures = target, pictures
 
     def render(
         self,
@@ -34,19 +38,26 @@ class BackdropTarget:
         size: tuple[int, int],
         on_frame: Callable[[], None] | None = None,
     ) -> Images:
-        """See ``TargetRenderer.render``; asks for two images a view."""
-        black = [replace(view, background=(0, 0, 0)) for view in views]
-        white = [replace(view, background=(255, 255, 255)) for view in views]
-        dark = self._target.render(obj, black, size=size, on_frame=on_frame).astype(np.float32)
-        bright = self._target.render(obj, white, size=size).astype(np.float32)
-        through = np.clip((bright - dark).mean(axis=3, keepdims=True) / 255, 0, 1)
-        blended: Images = np.clip(np.round(dark + through * self.backdrop(size)), 0, 255).astype(np.uint8)
-        return blended
-
-    def backdrop(self, size: tuple[int, int]) -> Images:
-        """What stands behind the object, (H, W, 3) uint8."""
-        return np.asarray(ImageOps.fit(self._picture, (size[1], size[0]), Image.Resampling.LANCZOS))
+        """See ``TargetRenderer.render``; asks for two images of a view with a backdrop."""
+        before = [replace(view, background=(0, 0, 0)) if view.backdrop else view for view in views]
+        images = self._target.render(obj, before, size=size, on_frame=on_frame)
+        pictured = [k for k, view in enumerate(views) if view.backdrop]
+        if not pictured:
+            return images
+        bright = self._target.render(obj, [replace(views[k], background=(255, 255, 255)) for k in pictured], size=size)
+        behind = {name: fitted(picture, size) for name, picture in self._pictures.items()}
+        images = images.copy()
+        for image, k in zip(bright, pictured, strict=True):
+            images[k] = _blended(images[k], image, behind[views[k].backdrop or ""])
+        return images
 
     def close(self) -> None:
         """Close the renderer behind it."""
         self._target.close()
+
+
+def _blended(dark: Images, bright: Images, behind: Images) -> Images:
+    """The picture in front of ``behind``, of which black and white show how much shows through."""
+    through = np.clip((bright - dark.astype(np.float32)).mean(axis=2, keepdims=True) / 255, 0, 1)
+    blended: Images = np.clip(np.round(dark + through * behind), 0, 255).astype(np.uint8)
+    return blended

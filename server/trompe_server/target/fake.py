@@ -82,6 +82,7 @@ def _splat(image: NDArray[np.uint8], surface: _Points, view: View) -> None:
     seen = facing & (z < -1e-3) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     seen = np.flatnonzero(seen)[np.argsort(z[seen], kind="stable")]
     lambert = np.maximum(surface.normals @ spherical(view.light.azimuth, view.light.elevation), 0.0)
-    linear = surface.colors * (view.light.ambient + view.light.intensity * lambert)[:, None]
+    lit = view.light.intensity * lambert[:, None] * (np.array(view.light.colour) / 255)
+    linear = surface.colors * (view.light.ambient + lit)
     shaded = np.rint(255 * linear.clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
     image[row[seen].astype(np.int64), column[seen].astype(np.int64)] = shaded[seen]
