@@ -1,19 +1,21 @@
 """How do time and memory of the surrogate grow with textures, images, views and faces? At most linearly, is the mark.
 
-python -m bench.growth [--axes texels pixels views faces] [--rounds 3] [--csv growth.csv]
+python -m bench.growth [--axes texels pixels views faces] [--rounds 5] [--csv growth.csv] [--chart growth.png]
 
 One shipped object; random pictures stand in for the target's. Prints CSV, then the exponent of each cost: the slope of
-its logarithm against the logarithm of the axis, over the largest half of the sizes, where fixed costs matter least.
+its logarithm against the logarithm of the axis, by least squares over the largest half of the sizes, where fixed costs
+matter least. A chart (PNG or SVG, by its name) needs matplotlib.
 """
 
 import argparse
 import csv
+import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench._common import BenchObject, bench_objects, machine, markdown_table, painted_at_random
+from trompe_server.memory import keep_freed_memory
 from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
 from trompe_server.surrogate.calibration import CURVE_GREYS, Calibration, Fidelity, build_surrogate
 from trompe_shared.object3d import Object3D, Part
@@ -46,8 +49,8 @@ class Case:
 
 @dataclass(frozen=True)
 class Cost:
-    """The least of some rounds: preparing (rasterise, operator, colour model) in seconds, a step (forward and backward
-    of all views) in milliseconds, and the operators in MiB."""
+    """Medians of some rounds: preparing (rasterise, operator, colour model) in seconds, a step (forward and backward of
+    all views) in milliseconds; and the operators in MiB."""
 
     axis: str
     size: int
@@ -115,7 +118,8 @@ def cost(entry: BenchObject, case: Case, rounds: int) -> Cost:
         seconds, surrogate = timed(lambda: build_surrogate(calibration, case.obj, views, clean))
         preparing.append(seconds)
         stepping += [timed(lambda: step(surrogate, textures))[0] for _ in range(2)]  # noqa: B023
-    return Cost(case.axis, case.size, min(preparing), 1000 * min(stepping), surrogate.geometry.nbytes / 2**20)
+    middle = (statistics.median(preparing), 1000 * statistics.median(stepping))
+    return Cost(case.axis, case.size, *middle, surrogate.geometry.nbytes / 2**20)
 
 
 def step(surrogate: Surrogate, textures: Mapping[str, Tensor]) -> None:
@@ -136,33 +140,87 @@ def timed(work: Callable[[], Made]) -> tuple[float, Made]:
     return time.perf_counter() - started, made
 
 
+def exponent(costs: Sequence[Cost], name: str) -> float:
+    """How the cost called ``name`` grows over the largest half of ``costs``, which are of one axis."""
+    largest = costs[len(costs) // 2 :]
+    sizes, values = ([getattr(cost, attribute) for cost in largest] for attribute in ("size", name))
+    return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
+
+
+def by_axis(costs: Sequence[Cost]) -> dict[str, list[Cost]]:
+    """The costs of each axis, smallest size first."""
+    return {axis: [each for each in costs if each.axis == axis] for axis in AXES if axis in {c.axis for c in costs}}
+
+
 def exponents(costs: Sequence[Cost]) -> str:
     """Table of the exponents; at most 1.1 counts as linear, for timings are not exact."""
     rows = []
-    for axis in dict.fromkeys(each.axis for each in costs):
-        mine = [each for each in costs if each.axis == axis]
-        largest = mine[len(mine) // 2 :]
-        slopes = [
-            np.polyfit(np.log([c.size for c in largest]), np.log([getattr(c, name) for c in largest]), 1)[0]
-            for name in COSTS
-        ]
-        sizes = f"{largest[0].size} .. {largest[-1].size}"
+    for axis, mine in by_axis(costs).items():
+        slopes = [exponent(mine, name) for name in LABELS]
+        sizes = f"{mine[len(mine) // 2].size} .. {mine[-1].size}"
         rows.append([axis, sizes, *(f"{slope:.2f}" for slope in slopes), "yes" if max(slopes) <= 1.1 else "no"])
-    return markdown_table(["exponent against", "sizes", *COSTS, "linear at most"], rows)
+    return markdown_table(["exponent against", "sizes", *LABELS, "linear at most"], rows)
 
 
-COSTS = [field.name for field in fields(Cost)][2:]
+AXES = {
+    "texels": "texture side, texels",
+    "pixels": "image side, pixels",
+    "views": "views",
+    "faces": "triangles of the mesh",
+}
+LABELS = {
+    "prepare_s": ("prepare all views, s", "#0072B2"),
+    "step_ms": ("one step, forward\nand backward, ms", "#D55E00"),
+    "operator_mib": ("memory of the\noperators, MiB", "#009E73"),
+}
+"""What each cost is called, and its colour (of Okabe and Ito, which the colour-blind tell apart)."""
+
+
+def draw(costs: Sequence[Cost], files: Sequence[Path]) -> None:
+    """A chart: a row for each cost, a column for each axis, and the exponent in each panel."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        sys.exit("A chart needs matplotlib: pip install matplotlib, or leave --chart out.")
+    tables = by_axis(costs)
+    figure = Figure(figsize=(3 * len(tables), 6.4), layout="constrained")
+    panels = figure.subplots(len(LABELS), len(tables), sharex="col", sharey="row", squeeze=False)
+    for row, name in zip(panels, LABELS, strict=True):
+        row[0].set_ylabel(LABELS[name][0])
+        for panel, (axis, mine) in zip(row, tables.items(), strict=True):
+            _curve(panel, axis, mine, name)
+    for panel, axis in zip(panels[-1], tables, strict=True):
+        panel.set_xlabel(AXES[axis])
+    title = "Exponents: over the largest half of the sizes. Dotted: linear in texels, pixels, views, triangles."
+    figure.suptitle(title, fontsize=9)
+    for file in files:
+        figure.savefig(file, dpi=120, metadata={"Date": None} if file.suffix == ".svg" else None)
+
+
+def _curve(panel: Any, axis: str, costs: Sequence[Cost], name: str) -> None:
+    """One cost against one axis; sides are drawn by their length, so that what is linear in texels rises by 2."""
+    sizes, values = (np.array([getattr(cost, attribute) for cost in costs]) for attribute in ("size", name))
+    shown, colour = np.sqrt(sizes) if "side" in AXES[axis] else sizes, LABELS[name][1]
+    panel.set(xscale="log", yscale="log", xticks=shown, xticklabels=[f"{x:.0f}" for x in shown])
+    panel.plot(shown, values[-1] * sizes / sizes[-1], color="0.5", linestyle=":", scaley=False)
+    panel.plot(shown, values, color=colour, marker="o", markersize=5)
+    panel.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
+    panel.tick_params(axis="x", labelrotation=30, labelsize=8)
+    panel.grid(alpha=0.3)
+    text = f"exponent {max(exponent(costs, name), 0):.2f}"
+    panel.text(0.04, 0.95, text, transform=panel.transAxes, va="top", fontsize=9, bbox={"color": "white", "alpha": 0.8})
 
 
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    every = ["texels", "pixels", "views", "faces"]
-    parser.add_argument("--axes", nargs="+", choices=every, default=every)
+    parser.add_argument("--axes", nargs="+", choices=list(AXES), default=list(AXES))
     parser.add_argument("--object", default="teapot", metavar="NAME", help="a shipped object, or one of TROMPE_ASSETS")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--csv", type=Path, metavar="FILE")
+    parser.add_argument("--chart", type=Path, nargs="+", default=[], metavar="FILE")
     options = parser.parse_args()
+    keep_freed_memory()
     (entry,) = bench_objects([options.object])
     print(machine() + "\n")
     writer = csv.writer(sys.stdout, lineterminator="\n")
@@ -178,6 +236,8 @@ def main() -> None:
             rows = csv.DictWriter(file, asdict_names, lineterminator="\n")
             rows.writeheader()
             rows.writerows(asdict(each) for each in costs)
+    if options.chart:
+        draw(costs, options.chart)
 
 
 if __name__ == "__main__":

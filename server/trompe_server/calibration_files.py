@@ -16,9 +16,7 @@ from trompe_shared.object3d import Object3D
 __all__ = ["calibration_key", "pack_calibration", "unpack_calibration"]
 
 
-def calibration_key(
-    obj: Object3D, views: Sequence[View], clean: np.ndarray, *, wanted: str, seed: int, backdrop: np.ndarray | None
-) -> str:
+def calibration_key(obj: Object3D, views: Sequence[View], clean: np.ndarray, *, wanted: str, seed: int) -> str:
     """Name of the calibration that these would give: equal for equal objects, views and answers of the target.
 
     ``clean``, the target's images of the unpainted object, stand for the renderer: one that has changed shows it there.
@@ -26,9 +24,7 @@ def calibration_key(
     digest = hashlib.sha256(json.dumps([wanted, seed, [asdict(view) for view in views]]).encode())
     for name in sorted(obj.files):
         digest.update(name.encode() + b"\0" + hashlib.sha256(obj.files[name]).digest())
-    for images in (clean, backdrop):
-        if images is not None:
-            digest.update(repr(images.shape).encode() + np.ascontiguousarray(images).tobytes())
+    digest.update(repr(clean.shape).encode() + np.ascontiguousarray(clean).tobytes())
     return digest.hexdigest()
 
 

@@ -38,24 +38,36 @@ def spherical(azimuth: float, elevation: float) -> Matrix:
     return np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
 
 
-def look_rotation(azimuth: float, elevation: float) -> Matrix:
+def look_rotation(azimuth: float, elevation: float, roll: float = 0.0) -> Matrix:
     """Camera-to-world rotation (3, 3) of an OpenGL camera at (azimuth, elevation): columns right, up, back.
 
-    Closed form, so that it is well defined straight above and below the object (|elevation| = 90) too.
+    ``roll`` as of ``Camera``. Closed form, so that it is well defined straight above and below the object
+    (|elevation| = 90) too.
     """
     a, e = np.radians(azimuth), np.radians(elevation)
     right = [np.cos(a), 0.0, -np.sin(a)]
     up = [-np.sin(e) * np.sin(a), np.cos(e), -np.sin(e) * np.cos(a)]
-    return np.stack([right, up, spherical(azimuth, elevation)], axis=1)
+    upright = np.stack([right, up, spherical(azimuth, elevation)], axis=1)
+    return upright @ _turn(roll) if roll else upright
+
+
+def _turn(degrees: float) -> Matrix:
+    """Rotation (3, 3) about z, from x towards y."""
+    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera that looks at the origin. ``distance`` in metres, ``azimuth`` and ``elevation`` in degrees."""
+    """A camera that looks at the origin. ``distance`` in metres, all angles in degrees.
+
+    ``roll`` turns the camera counter-clockwise about its line of sight: the object turns clockwise in the image.
+    """
 
     distance: float
     azimuth: float
     elevation: float
+    roll: float = 0.0
 
     def position(self) -> Matrix:
         """World position (3,), metres."""
@@ -63,7 +75,7 @@ class Camera:
 
     def world_to_camera(self) -> Matrix:
         """Rigid transform (4, 4) from world to OpenGL camera coordinates (x right, y up, looks along -z)."""
-        rotation = look_rotation(self.azimuth, self.elevation).T
+        rotation = look_rotation(self.azimuth, self.elevation, self.roll).T
         matrix = np.eye(4)
         matrix[:3, :3] = rotation
         matrix[:3, 3] = -rotation @ self.position()
@@ -75,37 +87,42 @@ class Light:
     """A directional light that shines from (azimuth, elevation), plus ambient light.
 
     ``intensity`` is relative: at 1.0 a white matt surface that faces the light reflects white, before ambient is added.
-    ``ambient`` is the share of white that reaches every surface from everywhere, in [0, 1].
+    ``ambient`` is the share of white that reaches every surface from everywhere, in [0, 1]. ``colour`` is that of the
+    directional light, linear, three ints in 0..255 as SAILenv takes them.
     """
 
     azimuth: float = 0.0
     elevation: float = 75.0
     intensity: float = 1.25
     ambient: float = 0.5
+    colour: tuple[int, int, int] = (255, 255, 255)
 
 
 @dataclass(frozen=True)
 class View:
-    """One camera with one light. ``background`` is an sRGB colour, three ints in 0..255."""
+    """One camera with one light. ``background`` is an sRGB colour, three ints in 0..255.
+
+    ``backdrop`` names a picture that stands behind the object in its place.
+    """
 
     camera: Camera
     light: Light = field(default_factory=Light)
     background: tuple[int, int, int] = (255, 255, 255)
+    backdrop: str | None = None
 
 
 def sailenv_pose(camera: Camera) -> tuple[Matrix, Matrix]:
     """Position (3,) and Euler angles (3,) in degrees, as SAILenv's SET_POSITION and SET_ROTATION want them."""
-    return camera.position(), np.array([180.0 - camera.elevation, camera.azimuth, 180.0])
+    return camera.position(), np.array([180.0 - camera.elevation, camera.azimuth, 180.0 - camera.roll])
 
 
 def euler_to_matrix(degrees: Matrix) -> Matrix:
     """Rotation (3, 3) of Unity's Euler angles (x, y, z) in degrees: z first, then x, then y."""
-    x, y, z = np.radians(np.asarray(degrees, dtype=np.float64))
-    cx, sx, cy, sy, cz, sz = np.cos(x), np.sin(x), np.cos(y), np.sin(y), np.cos(z), np.sin(z)
+    x, y, _ = np.radians(np.asarray(degrees, dtype=np.float64))
+    cx, sx, cy, sy = np.cos(x), np.sin(x), np.cos(y), np.sin(y)
     rotate_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     rotate_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    rotate_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return np.asarray(rotate_y @ rotate_x @ rotate_z)
+    return np.asarray(rotate_y @ rotate_x @ _turn(degrees[2]))
 
 
 def unity_to_opengl_rotation(degrees: Matrix) -> Matrix:

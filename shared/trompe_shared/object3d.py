@@ -24,7 +24,18 @@ from PIL import Image, UnidentifiedImageError
 from trompe_shared.errors import ObjectError
 from trompe_shared.wavefront import Part, parse_mtl, parse_obj
 
-__all__ = ["Material", "Object3D", "Part", "decode_rgb", "encode_png", "load_object", "object_from_files", "pack_zip"]
+__all__ = [
+    "MAX_TEXTURE_SIDE",
+    "Material",
+    "Object3D",
+    "Part",
+    "decode_rgb",
+    "encode_png",
+    "load_object",
+    "object_from_files",
+    "pack_zip",
+    "unzip",
+]
 
 MAX_ARCHIVE_BYTES: Final = 512 * 2**20
 MAX_MEMBERS: Final = 256
@@ -143,7 +154,7 @@ def load_object(source: bytes | str | Path) -> Object3D:
     Raises ``ObjectError`` when there is none, when it does not hold together, or when it is unreasonably large.
     """
     if isinstance(source, bytes):
-        return object_from_files(_unzip(source))
+        return object_from_files(unzip(source))
     path = Path(source)
     if path.is_dir():
         return object_from_files({p.name: p.read_bytes() for p in sorted(path.iterdir()) if p.is_file()})
@@ -151,11 +162,11 @@ def load_object(source: bytes | str | Path) -> Object3D:
         raise ObjectError(f"There is no file or folder {str(path)!r}.")
     if path.suffix.lower() == ".obj":
         return load_object(path.parent)
-    return object_from_files(_unzip(path.read_bytes()))
+    return object_from_files(unzip(path.read_bytes()))
 
 
-def _unzip(data: bytes) -> dict[str, bytes]:
-    """Members of a flat zip (one common folder is allowed and removed), within the limits above."""
+def unzip(data: bytes) -> dict[str, bytes]:
+    """Members of a flat zip (one common folder is allowed and removed), within the limits. Raises ``ObjectError``."""
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
     except _DAMAGED as error:

@@ -1,7 +1,7 @@
 """Calibration: it finds how a target samples, asks no more than it needs, counts what it asks, and is not fooled."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -241,9 +241,9 @@ def test_a_photograph_behind_the_object_is_behind_every_surrogate(mug: Object3D)
     outside = (ask(painted_grey(mug, 0), VIEWS) == 255).all(axis=-1, keepdims=True)
 
     clean = np.where(outside, photo, ask(mug, VIEWS))
-    black = [View(view.camera, view.light, (0, 0, 0)) for view in VIEWS]
+    pictured = [replace(view, background=(0, 0, 0), backdrop="photo") for view in VIEWS]
     calibration = calibrate(mug, VIEWS, clean, ask, wanted="diffuse", generator=np.random.default_rng(0))
-    images = images_of(build_surrogate(calibration, mug, black, clean, backdrop=photo), mug)
+    images = images_of(build_surrogate(calibration, mug, pictured, clean, backdrops={"photo": photo}), mug)
     corner = np.s_[:, :4, :4]
     assert outside[corner].all()
     assert (images[corner] == photo[:4, :4]).all()

@@ -218,13 +218,14 @@ def test_the_order_of_the_triangles_does_not_matter(soup: Floats, camera: Camera
     assert (np.array([*order, -1])[shuffled] == straight)[certain].all()
 
 
-@pytest.mark.parametrize("candidates", [1, 7, 100])
+@pytest.mark.parametrize(("candidates", "faces"), [(1, 2**14), (7, 1), (100, 1000)])
 def test_drawing_in_small_portions_gives_the_same_picture(
-    candidates: int, mug: Object3D, monkeypatch: pytest.MonkeyPatch
+    candidates: int, faces: int, mug: Object3D, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mesh, camera = mesh_of(mug), Camera(0.157, 30, 20)
     whole = seen_faces(mesh, camera, samples=MSAA4)
     monkeypatch.setattr(module, "MAX_CANDIDATES", candidates)
+    monkeypatch.setattr(module, "FACES_AT_ONCE", faces)
     assert (seen_faces(mesh, camera, samples=MSAA4) == whole).all()
     assert (whole >= 0).any()
 

@@ -1,7 +1,10 @@
 """The surrogate as a whole: its gradients are right, of itself and, what matters, of the real target."""
 
+import json
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +12,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from trompe_server.surrogate import (
     SamplingModel,
@@ -28,7 +32,7 @@ from trompe_server.surrogate.calibration import (
 from trompe_server.surrogate.surrogate import BATCH
 from trompe_server.target import FakeTarget, SailenvTarget, TargetRenderer
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import Object3D
+from trompe_shared.object3d import Object3D, load_object
 
 Make = Callable[..., Any]
 SIZE = (96, 96)
@@ -161,6 +165,59 @@ def test_the_surrogate_predicts_what_the_real_target_shows(mug: Object3D, target
         true.append(float((change.view_as(weights) * weights).sum()))
     assert np.corrcoef(told, true)[0, 1] > 0.95
     assert np.polyfit(told, true, 1)[0] == pytest.approx(1, abs=0.25)
+
+
+ASSETS = Path(os.environ.get("TROMPE_ASSETS", "none")) / "objects"
+
+
+def waves(obj: Object3D, generator: np.random.Generator) -> dict[str, NDArray[np.int64]]:
+    """A wave of a few periods over each texture, of its own direction and phase in each channel, +-12 of 255."""
+
+    def wave(height: int, width: int) -> NDArray[np.float64]:
+        y, x = np.mgrid[:height, :width] / np.array([height, width]).reshape(2, 1, 1)
+        phase = generator.integers(-4, 5) * x + generator.integers(1, 5) * y + generator.random()
+        return np.asarray(np.cos(2 * np.pi * phase))
+
+    return {
+        name: np.rint(12 * np.stack([wave(*image.shape[:2]) for _ in range(3)], -1)).astype(np.int64)
+        for name, image in obj.textures.items()
+    }
+
+
+def moved_by(obj: Object3D, way: dict[str, NDArray[np.int64]], sign: int) -> Object3D:
+    return obj.with_textures(
+        {name: (image + sign * way[name]).clip(0, 255).astype(np.uint8) for name, image in obj.textures.items()}
+    )
+
+
+@pytest.mark.assets
+@pytest.mark.skipif(not ASSETS.is_dir(), reason="TROMPE_ASSETS does not name the folder with the real objects")
+@pytest.mark.parametrize("name", ["candle", "toilet"])
+def test_the_gradient_is_that_of_finite_differences_of_the_target(name: str, target: SailenvTarget) -> None:
+    """Smooth changes of a real object's textures, both ways, in the images of the real target.
+
+    Pixels that are nearly black or white are left out: they can change one way only.
+    """
+    obj, facts = load_object(ASSETS / name), json.loads((ASSETS / "objects.json").read_text())[name]
+    low, high = facts["elevation_range"]
+    views = [
+        View(Camera(facts["distance"], 90 * k, low + (high - low) * k / 3), background=(0, 0, 0)) for k in range(4)
+    ]
+    surrogate, clean = measured(obj, target, CURVE_GREYS, views)
+    random, before = np.random.default_rng(0), torch.from_numpy(clean).permute(0, 3, 1, 2) / 255
+    coarse = torch.from_numpy(random.normal(size=(len(views), 3, 6, 6))).float()
+    weights = interpolate(coarse, SIZE, mode="bilinear") * ((before > 0.1) & (before < 0.9))
+    gradients = gradient_of(surrogate, obj, weights)
+    told, true = [], []
+    for _ in range(8):
+        way = waves(obj, random)
+        up, down = (moved_by(obj, way, sign) for sign in (1, -1))
+        shown = [torch.from_numpy(target.render(each, views, size=SIZE)).float() / 255 for each in (up, down)]
+        steps = {key: textures_of(up)[key] - textures_of(down)[key] for key in obj.textures}
+        true.append(float(((shown[0] - shown[1]).permute(0, 3, 1, 2) * weights).sum()))
+        told.append(sum(float((gradients[key] * step).sum()) for key, step in steps.items()))
+    assert np.corrcoef(told, true)[0, 1] > 0.995
+    assert np.polyfit(told, true, 1)[0] == pytest.approx(1, abs=0.05)
 
 
 def test_pixels_outside_of_the_masks_pass_no_gradient(mug: Object3D, curved: Surrogate) -> None:

@@ -9,12 +9,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
-from trompe_server.surrogate.sampling import mip_layout, mip_levels
+from trompe_server.surrogate import pyramid as module
+from trompe_server.surrogate.pyramid import mip_layout, read_texels
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, View
-from trompe_shared.object3d import Object3D
+from trompe_shared.object3d import Object3D, encode_png, object_from_files
 
 Make = Callable[..., Any]
 Image8 = NDArray[np.uint8]
@@ -73,12 +75,22 @@ def averaged(level: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.fl
     return np.array(rows)
 
 
-@given(st.integers(1, 20), st.integers(1, 20))
-@settings(max_examples=40, deadline=None)
-def test_the_pyramid_is_the_texture_averaged_again_and_again(height: int, width: int) -> None:
+def every_texel(layout: module.MipLayout) -> list[Tensor]:
+    """All texels of each level."""
+    return [torch.arange(height * width) for sizes in layout.sizes for height, width in sizes]
+
+
+SIDES = st.one_of(st.integers(1, 20), st.sampled_from([24, 32]))
+
+
+@given(SIDES, SIDES, st.sampled_from([10, 100, 10_000]))
+@settings(max_examples=60, deadline=None)
+def test_the_pyramid_is_the_texture_averaged_again_and_again(height: int, width: int, band: int) -> None:
     layout = mip_layout([(height, width), (2, 3)])
     textures = [noise(height, width) / 255, noise(2, 3, seed=1) / 255]
-    flat = torch.cat(mip_levels([torch.from_numpy(t) for t in textures], layout)).numpy()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "BAND_TEXELS", band)
+        flat = read_texels([torch.from_numpy(t) for t in textures], layout, every_texel(layout)).numpy()
     assert len(flat) == layout.total
     for level, sizes, starts in zip(textures, layout.sizes, layout.starts, strict=True):
         expected = level
@@ -86,6 +98,35 @@ def test_the_pyramid_is_the_texture_averaged_again_and_again(height: int, width:
         for size, start in zip(sizes, starts, strict=True):
             expected = averaged(expected, size)
             np.testing.assert_allclose(flat[start : start + size[0] * size[1]].reshape(*size, 3), expected, atol=1e-6)
+
+
+@given(SIDES, SIDES, st.sampled_from([10, 100, 10_000]), st.floats(0, 1))
+@settings(max_examples=60, deadline=None)
+def test_texels_of_the_pyramid_pass_their_gradient_back_to_all_they_are_averages_of(
+    height: int, width: int, band: int, share: float
+) -> None:
+    layout, random = mip_layout([(height, width), (3, 2)]), torch.Generator().manual_seed(height)
+    reads = [level[torch.rand(len(level), generator=random) < share] for level in every_texel(layout)]
+    textures = [torch.rand(*sizes[0], 3, generator=random).requires_grad_() for sizes in layout.sizes]
+    changes = [torch.rand(texture.shape, generator=random) for texture in textures]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "BAND_TEXELS", band)
+        texels = read_texels(textures, layout, reads)
+        weights = torch.rand(texels.shape, generator=random)
+        gradients = torch.autograd.grad(texels, textures, weights)
+        moved = read_texels(changes, layout, reads)  # the pyramid is linear
+    told = sum(float((gradient * change).sum()) for gradient, change in zip(gradients, changes, strict=True))
+    assert told == pytest.approx(float((moved * weights).sum()), rel=1e-4, abs=1e-5)
+
+
+def test_levels_rounded_to_8_bits_are_rounded_after_columns_and_again_after_rows() -> None:
+    texture = torch.tensor([[0, 1], [0, 0]])[..., None].expand(2, 2, 3) / 255
+    layout = mip_layout([(2, 2)])
+    exact, rounded = (
+        read_texels([texture], layout, every_texel(layout), rounded=choice)[-1, 0] for choice in (False, True)
+    )
+    assert float(exact) * 255 == pytest.approx(0.25)
+    assert float(rounded) * 255 == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
@@ -208,3 +249,53 @@ def test_each_part_reads_its_own_texture(make_object: Make, make_quad: Make) -> 
     columns = geometry.batches[0].pixel % SIZE[1]
     values = read_values(obj, views=views)[0][:, 0] * 255
     torch.testing.assert_close(values, torch.where(columns < 32, 50.0, 150.0), atol=0.1, rtol=0)
+
+
+def cut(obj: Object3D, name: str, opacity: Image8) -> Object3D:
+    """``obj`` with an alpha channel (H, W), of the texture's size, in one of its albedo files."""
+    picture = Image.fromarray(obj.textures[name])
+    picture.putalpha(Image.fromarray(opacity))
+    return object_from_files({**obj.files, name: encode_png(picture)})
+
+
+@pytest.mark.parametrize("model", MODELS, ids=repr)
+def test_where_alpha_is_below_one_half_what_lies_behind_is_read(
+    model: SamplingModel, make_object: Make, make_quad: Make
+) -> None:
+    front, back = make_quad(np.full((64, 64, 3), 50, np.uint8), z=0.02), make_quad(np.full((8, 8, 3), 150, np.uint8))
+    opacity = np.full((64, 64), 255, np.uint8)
+    opacity[:, :32] = 0
+    obj, views = cut(make_object(front, back), "m0.png", opacity), [View(Camera(0.5, 0, 0))]
+    geometry, _ = reading(obj, model, views)
+    values = read_values(obj, model, views)[0][:, 0]
+    left, right = (
+        read_values(make_object(make_quad(np.full((2, 2, 3), k, np.uint8))), model, views)[0][0, 0] for k in (150, 50)
+    )
+    column = geometry.batches[0].pixel % SIZE[1]
+    assert torch.allclose(values[column < 30], left, atol=1e-3)
+    assert torch.allclose(values[column > 34], right, atol=1e-3)
+
+
+def test_a_sheet_that_is_all_cut_out_leaves_every_number_as_if_it_were_not_there(
+    make_object: Make, make_quad: Make
+) -> None:
+    back, sheet = make_quad(noise(16, 16)), make_quad(noise(8, 8), z=0.02)
+    with_it, alone = cut(make_object(back, sheet), "m1.png", np.zeros((8, 8), np.uint8)), make_object(back)
+    first, second = (reading(obj)[0].batches[0] for obj in (with_it, alone))
+    assert torch.equal(first.pixel, second.pixel)
+    assert all(
+        torch.equal(a, b) for a, b in zip(vars(first.gather).values(), vars(second.gather).values(), strict=True)
+    )
+
+
+def test_alpha_is_read_at_the_level_that_the_pixel_reads(make_object: Make, make_quad: Make) -> None:
+    """Stripes of one texel, five eighths of them opaque: from afar their mean lets the whole sheet be seen."""
+    opacity = np.where(np.arange(256) % 8 < 5, 255, 0).astype(np.uint8)[None].repeat(256, 0)
+    obj = make_object(make_quad(noise(256, 256)))
+    views = [View(Camera(2.0, 0, 0))]
+    whole, striped, faint = (
+        len(reading(each, views=views)[0].batches[0].pixel)
+        for each in (obj, cut(obj, "m0.png", opacity), cut(obj, "m0.png", 255 - opacity))
+    )
+    assert striped == whole
+    assert faint == 0

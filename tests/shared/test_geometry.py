@@ -43,15 +43,31 @@ def test_the_origin_is_straight_ahead_of_a_camera(distance: float, azimuth: floa
     assert np.allclose(origin, [0, 0, -distance, 1], atol=1e-9)
 
 
-@given(distances, azimuths, elevations)
-@example(1.0, 45.0, 90.0)
-@example(1.0, 45.0, -90.0)
-def test_what_sailenv_is_told_is_the_same_camera(distance: float, azimuth: float, elevation: float) -> None:
-    camera = Camera(distance, azimuth, elevation)
+@given(distances, azimuths, elevations, azimuths)
+@example(1.0, 45.0, 90.0, 0.0)
+@example(1.0, 45.0, -90.0, 30.0)
+def test_what_sailenv_is_told_is_the_same_camera(
+    distance: float, azimuth: float, elevation: float, roll: float
+) -> None:
+    camera = Camera(distance, azimuth, elevation, roll)
     position, euler = sailenv_pose(camera)
     rotation = unity_to_opengl_rotation(euler)
-    assert np.allclose(rotation, look_rotation(azimuth, elevation), atol=1e-9)
+    assert np.allclose(rotation, look_rotation(azimuth, elevation, roll), atol=1e-9)
+    assert np.allclose(rotation.T, camera.world_to_camera()[:3, :3], atol=1e-9)
     assert np.allclose(rotation.T @ position, [0, 0, distance], atol=1e-9)
+
+
+@given(azimuths, elevations, azimuths)
+def test_roll_turns_right_and_up_about_the_line_of_sight(azimuth: float, elevation: float, roll: float) -> None:
+    right, up, back = look_rotation(azimuth, elevation).T
+    cosine, sine = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+    rolled = look_rotation(azimuth, elevation, roll).T
+    assert np.allclose(rolled, [cosine * right + sine * up, cosine * up - sine * right, back], atol=1e-12)
+
+
+def test_a_camera_that_rolls_to_the_left_sees_what_is_above_on_its_right() -> None:
+    above = Camera(2.0, 0, 0, roll=90).world_to_camera() @ [0, 1, 0, 1]
+    assert np.allclose(above, [1, 0, -2, 1], atol=1e-12)
 
 
 @pytest.mark.parametrize(

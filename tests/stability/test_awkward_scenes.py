@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trompe_server.attack import Budget, attack, saliency, start
+from trompe_server.attack import Budget, Goal, attack, saliency, start
 from trompe_server.classifiers import fake_classifier
 from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate.calibration import (
@@ -68,7 +68,9 @@ def images_of(surrogate: Surrogate, obj: Object3D) -> Tensor:
 def step_from(surrogate: Surrogate, obj: Object3D) -> dict[str, Tensor]:
     """What one step of the attack adds to each texture."""
     textures = textures_of(obj)
-    state = attack(start(textures), textures, surrogate, fake_classifier(), 9, budget=Budget(0.05, 0.02), steps=1)
+    state = attack(
+        start(textures), textures, surrogate, fake_classifier(), goal=Goal(9), budget=Budget(0.05, 0.02), steps=1
+    )
     return dict(state.deltas)
 
 
@@ -215,7 +217,7 @@ def test_a_black_object_on_black_is_black(make_object: Make, make_quad: Make) ->
     for surrogate in surrogates(obj, views, SamplingModel()):
         assert images_of(surrogate, obj).max() < 0.01
         assert (step_from(surrogate, obj)["m0.png"] >= 0).all()
-    maps = saliency(np.zeros((2, *SIZE, 3), np.uint8), fake_classifier(), 3)
+    maps = saliency(np.zeros((2, *SIZE, 3), np.uint8), fake_classifier(), goal=Goal(3))
     assert torch.isfinite(maps).all()
 
 

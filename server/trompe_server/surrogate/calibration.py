@@ -4,7 +4,7 @@ The target stays a black box: it is shown the object painted in greys and in ran
 judged by how well it predicts what the noise changes in the target's images.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Final
 
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from trompe_server.surrogate.sampling import SamplingModel
 from trompe_server.surrogate.surrogate import (
+    NO_BACKDROPS,
     Geometry,
     Surrogate,
     curve_surrogate,
@@ -25,6 +26,7 @@ from trompe_server.surrogate.surrogate import (
 from trompe_shared.api import SurrogateModel
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
+from trompe_shared.opacity import opacity_of
 
 __all__ = [
     "CALIBRATED_GREYS",
@@ -63,8 +65,13 @@ Ask = Callable[[Object3D, Sequence[View]], Image8]
 
 
 def painted_grey(obj: Object3D, grey: int) -> Object3D:
-    """``obj`` with every albedo texture replaced by one uniform grey (encoded, 0..255)."""
-    return obj.with_textures({name: np.full((4, 4, 3), grey, dtype=np.uint8) for name in obj.textures})
+    """``obj`` with every albedo texture replaced by one uniform grey (encoded, 0..255); what is cut out stays so."""
+    return obj.with_textures(
+        {
+            name: np.full((4, 4, 3) if opacity_of(obj.files[name]) is None else image.shape, grey, dtype=np.uint8)
+            for name, image in obj.textures.items()
+        }
+    )
 
 
 def painted_noise(obj: Object3D, generator: np.random.Generator) -> Object3D:
@@ -121,8 +128,11 @@ def measure_fidelity(
         texels = [surrogate.texels(textures_of(each, device=device)) for each in (obj, repainted)]
         for number, batch in enumerate(surrogate.geometry.batches):
             before, after = (surrogate.colours(each, number)[0] for each in texels)
-            plain = before if surrogate.anchors is None else before - surrogate.anchors[number]
-            columns = (after - before, plain, *(batch.of(each) / 255 for each in true))
+            shown, repainted_shown = (batch.of(each) / 255 for each in true)
+            if surrogate.missed is None:
+                columns = (after - before, before, shown, repainted_shown)
+            else:
+                columns = (after - shown, shown - surrogate.missed[number], shown, repainted_shown)
             by_view = zip(*(torch.split(column, list(batch.counts)) for column in columns), strict=True)
             rows += [_compare(*pixels) for pixels in by_view if len(pixels[0])]
     return Fidelity(*(tuple(column) for column in zip(*rows, strict=True)))
@@ -216,16 +226,19 @@ def build_surrogate(
     views: Sequence[View],
     clean: Image8,
     *,
-    backdrop: Image8 | None = None,
+    geometry: Geometry | None = None,
+    backdrops: Mapping[str, Image8] = NO_BACKDROPS,
     device: torch.device | str = "cpu",
 ) -> Surrogate:
     """The surrogate for ``views``, whose target images are ``clean``.
 
-    ``backdrop`` (H, W, 3) uint8 is what stands behind the object in place of the views' uniform backgrounds.
+    ``geometry``: what ``prepare_geometry`` made of the same, where that has been done. ``backdrops`` as for
+    ``diffuse_surrogate``.
     """
-    size = (clean.shape[1], clean.shape[2])
-    geometry = prepare_geometry(obj, views, size=size, sampling=calibration.sampling, device=device)
-    return _shaded(calibration, geometry, obj, views, clean, backdrop)
+    if geometry is None:
+        size = (clean.shape[1], clean.shape[2])
+        geometry = prepare_geometry(obj, views, size=size, sampling=calibration.sampling, device=device)
+    return _shaded(calibration, geometry, obj, views, clean, backdrops)
 
 
 def _shaded(
@@ -234,13 +247,13 @@ def _shaded(
     obj: Object3D,
     views: Sequence[View],
     clean: Image8,
-    backdrop: Image8 | None,
+    backdrops: Mapping[str, Image8],
 ) -> Surrogate:
     """The surrogate on a geometry that stands already."""
     if calibration.model == "diffuse":
-        return diffuse_surrogate(geometry, views, backdrop=backdrop)
+        return diffuse_surrogate(geometry, views, backdrops=backdrops)
     greys, probes = calibration.greys, calibration.probes
-    return curve_surrogate(geometry, obj, views, clean, greys, probes, backdrop=backdrop)
+    return curve_surrogate(geometry, obj, views, clean, greys, probes, backdrops=backdrops)
 
 
 def calibrate(
@@ -251,14 +264,15 @@ def calibrate(
     *,
     wanted: SurrogateModel,
     generator: np.random.Generator,
-    backdrop: Image8 | None = None,
+    backdrops: Mapping[str, Image8] = NO_BACKDROPS,
+    on_sampling: Callable[[SamplingModel], None] = lambda _: None,
 ) -> Calibration:
     """Probe the target as little as the ``wanted`` colour model needs; ``auto`` takes the cheapest that is good enough.
 
     ``clean`` are the target's images of ``obj``, (views, H, W, 3) uint8. A few trial views decide; only then are all of
-    them probed.
+    them probed. ``on_sampling`` is told the sampling model as soon as it is known, before most of the probes.
     """
-    trial = _Trial.of(obj, views, clean, ask, generator, backdrop)
+    trial = _Trial.of(obj, views, clean, ask, generator, backdrops)
     if wanted in {"auto", "diffuse"}:
         fidelity = trial.fidelity("diffuse", SamplingModel(), ())
         if wanted == "diffuse" or fidelity.good_enough:
@@ -266,6 +280,7 @@ def calibrate(
             nothing = np.zeros((0, *clean.shape), np.uint8)
             return Calibration("diffuse", reason, SamplingModel(), (), nothing, fidelity, trial.renders)
     sampling = find_sampling(lambda model: trial.fidelity("calibrated", model, CALIBRATED_GREYS).score)
+    on_sampling(sampling)
     model, reason, fidelity = _cheapest(trial, sampling, wanted)
     greys = CALIBRATED_GREYS if model == "calibrated" else CURVE_GREYS
     probes = np.stack([trial.probe_all(grey, views) for grey in greys])
@@ -283,7 +298,7 @@ class _Trial:
     clean: Image8
     repainted: Object3D
     images: Image8
-    backdrop: Image8 | None
+    backdrops: Mapping[str, Image8]
     ask: Ask
     probes: dict[int, Image8] = field(default_factory=dict)
     """What was asked for so far, by grey."""
@@ -298,12 +313,12 @@ class _Trial:
         clean: Image8,
         ask: Ask,
         generator: np.random.Generator,
-        backdrop: Image8 | None,
+        backdrops: Mapping[str, Image8],
     ) -> "_Trial":
         index = tuple(sorted({round(k) for k in np.linspace(0, len(views) - 1, TRIAL_VIEWS + 2)[1:-1]}))
         few = tuple(views[k] for k in index)
         repainted = painted_noise(obj, generator)
-        return cls(obj, index, few, clean[list(index)], repainted, ask(repainted, few), backdrop, ask)
+        return cls(obj, index, few, clean[list(index)], repainted, ask(repainted, few), backdrops, ask)
 
     @property
     def renders(self) -> int:
@@ -330,7 +345,7 @@ class _Trial:
         nothing = Fidelity((), (), (), ())
         calibration = Calibration(model, "", sampling, greys, probes, nothing, 0)
         geometry = replace(self._geometry(sampling), sampling=sampling)
-        surrogate = _shaded(calibration, geometry, self.obj, self.views, self.clean, self.backdrop)
+        surrogate = _shaded(calibration, geometry, self.obj, self.views, self.clean, self.backdrops)
         return measure_fidelity(surrogate, self.obj, self.clean, self.repainted, self.images)
 
     def _geometry(self, sampling: SamplingModel) -> Geometry:

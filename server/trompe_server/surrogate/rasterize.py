@@ -7,7 +7,8 @@ object, and UVs and their screen-space derivatives are exact anywhere on (and be
 
 import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,8 +16,21 @@ from torch import Tensor
 
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera
 from trompe_shared.object3d import Object3D
+from trompe_shared.opacity import opacity_of
 
-__all__ = ["CENTRE", "MSAA4", "MSAA4_MIRRORED", "Mesh", "Planes", "Visibility", "mesh_of", "project", "rasterize"]
+__all__ = [
+    "CENTRE",
+    "MSAA4",
+    "MSAA4_MIRRORED",
+    "Drawn",
+    "Mesh",
+    "Planes",
+    "Visibility",
+    "covered",
+    "mesh_of",
+    "project",
+    "rasterize",
+]
 
 CENTRE = ((0.5, 0.5),)
 """One sample in the middle of a pixel."""
@@ -31,6 +45,9 @@ MSAA4_MIRRORED = tuple((x, 1 - y) for x, y in MSAA4)
 NEAR = 1e-3
 """Nothing nearer to the camera than this is seen, metres."""
 
+FACES_AT_ONCE = 2**14
+"""Triangles that are set up at once: what that takes stays in the processor's cache."""
+
 MAX_CANDIDATES = 2_000_000
 """Pixel-triangle pairs that are tested at once: bounds the memory of the rasteriser (about 200 bytes each)."""
 
@@ -40,7 +57,7 @@ class Mesh:
     """All triangles of an object.
 
     positions: metres. uvs: v = 0 is the bottom row. normals: unit length. texture: index into ``textures``, the albedo
-    file names.
+    file names. opacities: the alpha of those textures that cut something out, in [0, 1], by their index.
     """
 
     positions: Float[Tensor, "faces 3 3"]
@@ -48,6 +65,7 @@ class Mesh:
     normals: Float[Tensor, "faces 3 3"]
     texture: Int[Tensor, " faces"]
     textures: tuple[str, ...]
+    opacities: Mapping[int, Float[Tensor, "H W"]] = field(default_factory=dict)
 
 
 def mesh_of(obj: Object3D, *, device: torch.device | str = "cpu") -> Mesh:
@@ -59,8 +77,11 @@ def mesh_of(obj: Object3D, *, device: torch.device | str = "cpu") -> Mesh:
         gathered["positions"].append(torch.from_numpy(part.vertices)[faces])
         gathered["uvs"].append(torch.from_numpy(part.uvs)[faces])
         gathered["normals"].append(torch.from_numpy(part.normals)[faces])
-        gathered["texture"].append(torch.full((len(faces),), names.index(obj.albedo_of(part))))
-    return Mesh(**{key: torch.cat(value).to(device) for key, value in gathered.items()}, textures=names)
+        gathered["texture"].append(torch.full((len(faces),), names.index(obj.albedo_of(part)), device="cpu"))
+    found = {number: opacity_of(obj.files[name]) for number, name in enumerate(names)}
+    opacities = {k: torch.from_numpy(alpha).to(device) / 255 for k, alpha in found.items() if alpha is not None}
+    arrays = {key: torch.cat(value).to(device) for key, value in gathered.items()}
+    return Mesh(**arrays, textures=names, opacities=opacities)
 
 
 @dataclass(frozen=True)
@@ -92,9 +113,15 @@ def project(mesh: Mesh, camera: Camera, size: tuple[int, int], *, cull: bool) ->
 
     With ``cull`` triangles seen from behind (clockwise) are dropped. Degenerate ones always are.
     """
+    parts = [_set_up(faces, camera, size, cull=cull) for faces in torch.split(mesh.positions, FACES_AT_ONCE)]
+    kept = [part.face + k * FACES_AT_ONCE for k, part in enumerate(parts)]
+    return Planes(torch.cat(kept), torch.cat([part.edges for part in parts]), torch.cat([part.box for part in parts]))
+
+
+def _set_up(positions: Float[Tensor, "faces 3 3"], camera: Camera, size: tuple[int, int], *, cull: bool) -> Planes:
     height, width = size
-    matrix = torch.from_numpy(camera.world_to_camera()).to(mesh.positions.device)
-    eye = mesh.positions.double() @ matrix[:3, :3].T + matrix[:3, 3]
+    matrix = torch.from_numpy(camera.world_to_camera()).to(positions.device)
+    eye = positions.double() @ matrix[:3, :3].T + matrix[:3, 3]
     focal = height / 2 / math.tan(math.radians(FIELD_OF_VIEW) / 2)
     depth = -eye[..., 2]
     corners = torch.stack(
@@ -128,14 +155,22 @@ def _pixel_box(
     return torch.cat([low, high], 1).nan_to_num(0.0).long(), touches
 
 
-def rasterize(planes: Planes, size: tuple[int, int], samples: tuple[tuple[float, float], ...]) -> Visibility:
-    """The nearest triangle at each of ``samples`` (x, y in pixels) of every pixel. The first one drawn wins ties."""
+Samples = tuple[tuple[float, float], ...]
+Drawn = Callable[[Int[Tensor, " n"], Int[Tensor, " n"], Int[Tensor, " n"]], Bool[Tensor, " n"]]
+"""Whether triangles (rows of the planes) are drawn at the pixels (x, y)."""
+
+
+def rasterize(planes: Planes, size: tuple[int, int], samples: Samples, *, drawn: Drawn | None = None) -> Visibility:
+    """The nearest triangle at each of ``samples`` (x, y in pixels) of every pixel. The first one drawn wins ties.
+
+    Triangles are left out of the pixels where they are not ``drawn``.
+    """
     height, width = size
     nearest = torch.full((height * width * len(samples),), -1, dtype=torch.int64, device=planes.face.device)
     extent = planes.box[:, 2:] - planes.box[:, :2] + 1
     counts = extent[:, 0] * extent[:, 1]
     for start, stop in _chunks(counts):
-        _draw(planes, start, stop, counts, width, samples, nearest)
+        _draw(planes, start, stop, counts, width, samples, drawn, nearest)
     nearest = nearest.view(-1, len(samples))
     pixel = (nearest >= 0).any(1).nonzero()[:, 0]
     keys = nearest[pixel]
@@ -162,7 +197,8 @@ def _draw(
     stop: int,
     counts: Int[Tensor, " n"],
     width: int,
-    samples: tuple[tuple[float, float], ...],
+    samples: Samples,
+    drawn: Drawn | None,
     nearest: Int[Tensor, " pixels_samples"],
 ) -> None:
     """Test triangles ``start:stop`` against the pixels of their boxes and keep the nearest per sample, in ``nearest``.
@@ -176,13 +212,28 @@ def _draw(
     box = planes.box[row]
     columns = box[:, 2] - box[:, 0] + 1
     x, y = box[:, 0] + within % columns, box[:, 1] + within // columns
+    if drawn is not None:
+        row, x, y = (values[drawn(row, x, y)] for values in (row, x, y))
     edges = planes.edges[row]
     at_corner = edges[:, 0] * x[:, None] + edges[:, 1] * y[:, None] + edges[:, 2]
     base = (y * width + x) * len(samples)
     for index, (sx, sy) in enumerate(samples):
         value = at_corner + edges[:, 0] * sx + edges[:, 1] * sy
         inverse_depth = value.sum(1)
-        seen = ((value >= 0).all(1) & (inverse_depth > 0) & (inverse_depth < 1 / NEAR)).nonzero()[:, 0]
+        seen = _inside(value, inverse_depth).nonzero()[:, 0]
         bits = inverse_depth[seen].contiguous().view(torch.int32).long()
         keys = (bits << 32) | (0xFFFFFFFF - row[seen])
         nearest.scatter_reduce_(0, base[seen] + index, keys, "amax")
+
+
+def covered(
+    planes: Planes, row: Int[Tensor, " n"], x: Int[Tensor, " n"], y: Int[Tensor, " n"], samples: Samples
+) -> Bool[Tensor, "n samples"]:
+    """Which samples of the pixels (x, y) triangles cover."""
+    edges = planes.edges[row]
+    values = [edges[:, 0] * (x + sx)[:, None] + edges[:, 1] * (y + sy)[:, None] + edges[:, 2] for sx, sy in samples]
+    return torch.stack([_inside(value, value.sum(1)) for value in values], 1)
+
+
+def _inside(over_depth: Float[Tensor, "n 3"], inverse_depth: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    return (over_depth >= 0).all(1) & (inverse_depth > 0) & (inverse_depth < 1 / NEAR)

@@ -5,26 +5,34 @@ and with which weights (trilinear, per fragment, fragments weighted by the sampl
 repainted object are a single gather, and the gradient its transpose.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, embedding_bag
+from torch.nn.functional import embedding_bag
 
-from trompe_server.surrogate.rasterize import CENTRE, MSAA4, MSAA4_MIRRORED, Mesh, Planes, Visibility
+from trompe_server.surrogate.pyramid import MipLayout, mip_layout, read_texels
+from trompe_server.surrogate.rasterize import (
+    CENTRE,
+    MSAA4,
+    MSAA4_MIRRORED,
+    Mesh,
+    Planes,
+    Visibility,
+    covered,
+)
+from trompe_shared.opacity import CUTOFF
 
 __all__ = [
+    "AlphaTest",
     "Fragments",
     "Gather",
-    "MipLayout",
     "SamplingModel",
     "Taps",
     "fragments_of",
-    "mip_layout",
-    "mip_levels",
     "taps_of",
 ]
 
@@ -65,71 +73,6 @@ class SamplingModel:
 
 
 @dataclass(frozen=True)
-class MipLayout:
-    """Where each mip level of each texture lies in the flat array. ``sizes[t][l]`` is (H, W), ``starts[t][l]`` its
-    first texel."""
-
-    sizes: tuple[tuple[tuple[int, int], ...], ...]
-    starts: tuple[tuple[int, ...], ...]
-    total: int
-
-
-def mip_layout(sizes: Sequence[tuple[int, int]]) -> MipLayout:
-    """Layout of the full mip pyramids (halved and rounded down until 1 x 1) of textures of ``sizes`` (H, W)."""
-    levels, starts, position = [], [], 0
-    for height, width in sizes:
-        chain = [(height, width)]
-        while chain[-1] != (1, 1):
-            chain.append((max(1, chain[-1][0] // 2), max(1, chain[-1][1] // 2)))
-        first = []
-        for h, w in chain:
-            first.append(position)
-            position += h * w
-        levels.append(tuple(chain))
-        starts.append(tuple(first))
-    return MipLayout(tuple(levels), tuple(starts), position)
-
-
-def mip_levels(
-    textures: Sequence[Float[Tensor, "H W 3"]], layout: MipLayout, *, rounded: bool = False
-) -> list[Float[Tensor, "_ 3"]]:
-    """The texels of all mip levels of ``textures`` (row 0 on top), box filtered, in the layout's order. Differentiable.
-
-    With ``rounded`` levels are rounded to 8 bits as they are made; the gradient passes as if they were not.
-    """
-    levels = []
-    for texture, sizes in zip(textures, layout.sizes, strict=True):
-        level = texture
-        levels.append(level.reshape(-1, 3))
-        for size in sizes[1:]:
-            level = _halve(level, size, _round8 if rounded else _same)
-            levels.append(level.reshape(-1, 3))
-    return levels
-
-
-def _halve(
-    level: Float[Tensor, "H W 3"], size: tuple[int, int], settle: Callable[[Tensor], Tensor]
-) -> Float[Tensor, "h w 3"]:
-    """The next mip level; ``settle`` is applied to the averages of columns, and to those of rows."""
-    height, width = size
-    if level.shape[:2] == (2 * height, 2 * width):
-        left, right = level.view(2 * height, width, 2, 3).unbind(2)
-        upper, lower = settle((left + right) / 2).view(height, 2, width, 3).unbind(1)
-        return settle((upper + lower) / 2)
-    return settle(adaptive_avg_pool2d(level.permute(2, 0, 1), size).permute(1, 2, 0).contiguous())
-
-
-def _same(values: Tensor) -> Tensor:
-    return values
-
-
-def _round8(values: Tensor) -> Tensor:
-    """Rounded half up to 1/255, with the gradient of the identity."""
-    exact = values.detach()
-    return values + ((exact * 255 + 0.5 + 1e-4).floor() / 255 - exact)
-
-
-@dataclass(frozen=True)
 class Fragments:
     """The (pixel, triangle) pairs of one view.
 
@@ -156,15 +99,22 @@ def fragments_of(
     earlier = torch.ones(n_samples, n_samples, device=rows.device).tril(-1).bool()
     first = (rows >= 0) & ~(same & earlier).any(2)
     entry, sample = first.nonzero(as_tuple=True)
-    covered = same[entry, sample].float()
+    share = same[entry, sample].float()
     row = rows[entry, sample]
-    position = torch.tensor(samples, device=rows.device)
-    centre = torch.tensor(CENTRE, device=rows.device)
-    offset = (covered @ position) / covered.sum(1, keepdim=True) if shade_at == "centroid" else centre
+    offset = _shading_point(share, samples, shade_at)
     pixel = visibility.pixel[entry]
     point = torch.stack([pixel % width, pixel // width], 1) + offset
     uv, duv, barycentric = _texture_coordinates(visibility.planes, mesh, row, point)
-    return Fragments(visibility.planes.face[row], entry, covered.sum(1) / n_samples, uv, duv, barycentric)
+    return Fragments(visibility.planes.face[row], entry, share.sum(1) / n_samples, uv, duv, barycentric)
+
+
+def _shading_point(
+    share: Float[Tensor, "n samples"], samples: tuple[tuple[float, float], ...], shade_at: str
+) -> Float[Tensor, "_ 2"]:
+    """Where in the pixel a fragment that covers the samples with a ``share`` of 1 (not 0) reads its texture."""
+    if shade_at == "centre":
+        return torch.tensor(CENTRE, device=share.device)
+    return (share @ torch.tensor(samples, device=share.device)) / share.sum(1, keepdim=True)
 
 
 def _texture_coordinates(
@@ -250,16 +200,27 @@ def taps_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout, 
     for texture, (sizes, starts) in enumerate(zip(layout.sizes, layout.starts, strict=True)):
         mine = (mesh.texture[fragments.face] == texture).nonzero()[:, 0]
         uv, duv, entry, part = fragments.uv[mine], fragments.duv[mine], fragments.entry[mine], share[mine]
-        level = level_of_detail(duv, sizes[0], model).clamp(0, len(sizes) - 1)
-        lower = level.floor().clamp(max=max(len(sizes) - 2, 0))
-        for step in (0, 1):
-            blend = (level - lower) if step else 1 - (level - lower)
-            used = (blend > 0).nonzero()[:, 0]
-            index, weight = _bilinear(uv[used], lower[used].long() + step, sizes, starts)
+        for used, index, weight, blend in _trilinear(uv, duv, sizes, starts, model):
             entries.append(entry[used, None].expand(-1, 4).reshape(-1))
             indices.append(index.reshape(-1))
-            weights.append((weight * (blend * part)[used, None]).reshape(-1))
+            weights.append((weight * (blend * part[used])[:, None]).reshape(-1))
     return _merged(torch.cat(entries), torch.cat(indices), torch.cat(weights), layout.total)
+
+
+def _trilinear(
+    uv: Float[Tensor, "n 2"],
+    duv: Float[Tensor, "n 2 2"],
+    sizes: tuple[tuple[int, int], ...],
+    starts: tuple[int, ...],
+    model: SamplingModel,
+) -> Iterator[tuple[Int[Tensor, " m"], Int[Tensor, "m 4"], Float[Tensor, "m 4"], Float[Tensor, " m"]]]:
+    """For the finer and the coarser level: who reads it, flat indices and weights there, and the level's own weight."""
+    level = level_of_detail(duv, sizes[0], model).clamp(0, len(sizes) - 1)
+    lower = level.floor().clamp(max=max(len(sizes) - 2, 0))
+    for step in (0, 1):
+        blend = (level - lower) if step else 1 - (level - lower)
+        used = (blend > 0).nonzero()[:, 0]
+        yield used, *_bilinear(uv[used], lower[used].long() + step, sizes, starts), blend[used]
 
 
 def level_of_detail(duv: Float[Tensor, "n 2 2"], size: tuple[int, int], model: SamplingModel) -> Float[Tensor, " n"]:
@@ -300,3 +261,48 @@ def _merged(
     pair, which = torch.unique_consecutive(pair, return_inverse=True)
     total = torch.zeros(len(pair), device=weight.device).index_add_(0, which, weight[used][order].float())
     return Taps((pair // n_texels).int(), (pair % n_texels).int(), total)
+
+
+@dataclass(frozen=True)
+class AlphaTest:
+    """Alpha-tested textures: a fragment is drawn only where the alpha that it reads is at least ``CUTOFF``.
+
+    layout, alpha: the mip levels of ``mesh.opacities``, in order, as one flat array.
+    """
+
+    mesh: Mesh
+    model: SamplingModel
+    layout: MipLayout
+    alpha: Float[Tensor, " texels"]
+
+    @classmethod
+    def of(cls, mesh: Mesh, model: SamplingModel) -> "AlphaTest | None":
+        """The test of a mesh under a hypothesis; ``None`` where all of it is opaque."""
+        if not mesh.opacities:
+            return None
+        layout = mip_layout([(len(alpha), alpha.shape[1]) for alpha in mesh.opacities.values()])
+        everything = [torch.arange(h * w, device=mesh.texture.device) for sizes in layout.sizes for h, w in sizes]
+        planes = [alpha[..., None] for alpha in mesh.opacities.values()]
+        alpha = read_texels(planes, layout, everything, rounded=model.mips == "rounded")
+        return cls(mesh, model, layout, alpha[:, 0])
+
+    def drawn(
+        self, planes: Planes, row: Int[Tensor, " n"], x: Int[Tensor, " n"], y: Int[Tensor, " n"]
+    ) -> Bool[Tensor, " n"]:
+        """Whether triangles (rows of ``planes``) are drawn at the pixels (x, y)."""
+        texture = self.mesh.texture[planes.face[row]]
+        passed = torch.ones_like(texture, dtype=torch.bool)
+        for number, sizes, starts in zip(self.mesh.opacities, self.layout.sizes, self.layout.starts, strict=True):
+            mine = (texture == number).nonzero()[:, 0]
+            share = covered(planes, row[mine], x[mine], y[mine], self.model.positions)
+            passed[mine] = False
+            mine, share = mine[share.any(1)], share[share.any(1)].float()
+            point = torch.stack([x[mine], y[mine]], 1) + _shading_point(
+                share, self.model.positions, self.model.shade_at
+            )
+            uv, duv, _ = _texture_coordinates(planes, self.mesh, row[mine], point)
+            read = torch.zeros(len(mine), device=uv.device)
+            for used, index, weight, blend in _trilinear(uv, duv, sizes, starts, self.model):
+                read.index_add_(0, used, (self.alpha[index] * weight).sum(1) * blend)
+            passed[mine] = read >= CUTOFF
+        return passed

@@ -8,6 +8,8 @@ images = surrogate.render(texels, batch=0)  # of the views surrogate.batches[0];
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final
 
 import numpy as np
 import torch
@@ -16,24 +18,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import FunctionCtx
+from torch.nn.functional import softshrink
 
+from trompe_server.surrogate.pyramid import MipLayout, mip_layout, read_texels
 from trompe_server.surrogate.rasterize import Mesh, mesh_of, project, rasterize
-from trompe_server.surrogate.sampling import (
-    Gather,
-    MipLayout,
-    SamplingModel,
-    Taps,
-    fragments_of,
-    mip_layout,
-    mip_levels,
-    taps_of,
-)
+from trompe_server.surrogate.sampling import AlphaTest, Gather, SamplingModel, Taps, fragments_of, taps_of
 from trompe_server.surrogate.shading import CurveShading, DiffuseShading, Shading, decode, encode, fit_curve, lambert
 from trompe_shared.geometry import View, spherical
 from trompe_shared.object3d import Object3D
 
 __all__ = [
     "BATCH",
+    "NO_BACKDROPS",
     "Geometry",
     "Surrogate",
     "ViewBatch",
@@ -45,6 +41,8 @@ __all__ = [
 
 Image8 = NDArray[np.uint8]
 
+
+NO_BACKDROPS: Final[Mapping[str, Image8]] = {}
 
 BATCH = 10
 """Views that are one operator: the fastest on CPUs (larger batches miss the caches)."""
@@ -86,8 +84,7 @@ class Geometry:
 
     def texels(self, textures: Sequence[Float[Tensor, "H W 3"]], *, rounded: bool = False) -> Float[Tensor, "texels 3"]:
         """The texels that some view reads of the mip levels of ``textures``. Differentiable."""
-        levels = mip_levels(textures, self.layout, rounded=rounded)
-        return torch.cat([level.index_select(0, reads) for level, reads in zip(levels, self.reads, strict=True)])
+        return read_texels(textures, self.layout, self.reads, rounded=rounded)
 
     @property
     def device(self) -> torch.device:
@@ -111,7 +108,8 @@ def prepare_geometry(
     """Rasterise ``obj`` once for all ``views`` and images of ``size`` (H, W)."""
     mesh = mesh_of(obj, device=device)
     layout = mip_layout([obj.textures[name].shape[:2] for name in mesh.textures])
-    prepared = [_prepare_view(mesh, layout, view, size, sampling) for view in views]
+    test = AlphaTest.of(mesh, sampling)
+    prepared = [_prepare_view(mesh, layout, test, view, size, sampling) for view in views]
     read = torch.zeros(layout.total, dtype=torch.bool, device=device)
     for view in prepared:
         read[view.taps.index] = True
@@ -133,9 +131,17 @@ class _View:
     shade: Float[Tensor, "pixels 1"]
 
 
-def _prepare_view(mesh: Mesh, layout: MipLayout, view: View, size: tuple[int, int], sampling: SamplingModel) -> _View:
+def _prepare_view(
+    mesh: Mesh,
+    layout: MipLayout,
+    test: AlphaTest | None,
+    view: View,
+    size: tuple[int, int],
+    sampling: SamplingModel,
+) -> _View:
     planes = project(mesh, view.camera, size, cull=sampling.cull)
-    visibility = rasterize(planes, size, sampling.positions)
+    drawn = None if test is None else partial(test.drawn, planes)
+    visibility = rasterize(planes, size, sampling.positions, drawn=drawn)
     fragments = fragments_of(visibility, mesh, size[1], samples=sampling.positions, shade_at=sampling.shade_at)
     n_pixels = len(visibility.pixel)
     normals = (fragments.barycentric.clamp(0, 1)[..., None] * mesh.normals[fragments.face]).sum(1)
@@ -201,15 +207,15 @@ class Surrogate:
     """A differentiable model of the target renderer for fixed views.
 
     base: (views, H, W, 3) uint8, what every pixel shows that the object does not touch.
-    shadings: the colour model of each batch of views. anchors: what it adds to the colours of the object's pixels, so
-    that the unpainted object is predicted as the target shows it; ``None`` where the target has not been asked.
+    shadings: the colour model of each batch of views. missed: true minus predicted colours of the unpainted object, as
+    the colour model alone would have it; ``None`` where the target has not been asked.
     """
 
     geometry: Geometry
     model: str
     base: UInt8[Tensor, "views H W 3"]
     shadings: tuple[Shading, ...]
-    anchors: tuple[Float[Tensor, "pixels 3"], ...] | None = None
+    missed: tuple[Float[Tensor, "pixels 3"], ...] | None = None
 
     @property
     def n_views(self) -> int:
@@ -250,12 +256,12 @@ class Surrogate:
 
         Zero where a view shows no object, and where the target has not been asked.
         """
-        if self.anchors is None:
+        if self.missed is None:
             return (0.0,) * self.n_views
         per_view = [
             part.abs().mean() if len(part) else part.new_zeros(())
-            for batch, anchors in zip(self.geometry.batches, self.anchors, strict=True)
-            for part in torch.split(anchors, list(batch.counts))
+            for batch, missed in zip(self.geometry.batches, self.missed, strict=True)
+            for part in torch.split(missed, list(batch.counts))
         ]
         return tuple(float(error) for error in per_view)
 
@@ -283,12 +289,14 @@ class Surrogate:
         return colour, slope * rate
 
 
-def diffuse_surrogate(geometry: Geometry, views: Sequence[View], *, backdrop: Image8 | None = None) -> Surrogate:
+def diffuse_surrogate(
+    geometry: Geometry, views: Sequence[View], *, backdrops: Mapping[str, Image8] = NO_BACKDROPS
+) -> Surrogate:
     """The paper's surrogate: asks nothing of the target. ``views`` are those of ``geometry``.
 
-    ``backdrop`` (H, W, 3) uint8 is what stands behind the object in place of the views' uniform backgrounds.
+    ``backdrops`` are the pictures that stand behind the object where a view has one, (H, W, 3) uint8 by name.
     """
-    base = _behind(geometry, views, backdrop)
+    base = _behind(geometry, views, backdrops)
     shadings = tuple(
         DiffuseShading(batch.shade * batch.coverage, (1 - batch.coverage) * (batch.of(base) / 255))
         for batch in geometry.batches
@@ -296,11 +304,12 @@ def diffuse_surrogate(geometry: Geometry, views: Sequence[View], *, backdrop: Im
     return Surrogate(geometry, "diffuse", base, shadings)
 
 
-def _behind(geometry: Geometry, views: Sequence[View], backdrop: Image8 | None) -> UInt8[Tensor, "views H W 3"]:
+def _behind(geometry: Geometry, views: Sequence[View], backdrops: Mapping[str, Image8]) -> UInt8[Tensor, "views H W 3"]:
     """What each view shows where there is no object."""
-    colours = np.array([view.background for view in views], np.uint8)[:, None, None, :]
-    full = np.broadcast_to(colours if backdrop is None else backdrop, (len(views), *geometry.size, 3))
-    return torch.from_numpy(full.copy()).to(geometry.device)
+    full = np.empty((len(views), *geometry.size, 3), np.uint8)
+    for image, view in zip(full, views, strict=True):
+        image[:] = view.background if view.backdrop is None else backdrops[view.backdrop]
+    return torch.from_numpy(full).to(geometry.device)
 
 
 def curve_surrogate(
@@ -311,17 +320,17 @@ def curve_surrogate(
     greys: Sequence[int],
     probes: Image8,
     *,
-    backdrop: Image8 | None = None,
+    backdrops: Mapping[str, Image8] = NO_BACKDROPS,
 ) -> Surrogate:
     """A surrogate measured on the target: ``calibrated`` with two greys, ``curve`` with more.
 
     clean: the target's images of ``obj``, (views, H, W, 3) uint8. greys: encoded values, ascending, the first 0.
-    probes: the target's images of ``obj`` painted in each grey, (greys, views, H, W, 3) uint8. ``backdrop`` as for
+    probes: the target's images of ``obj`` painted in each grey, (greys, views, H, W, 3) uint8. ``backdrops`` as for
     ``diffuse_surrogate``.
     """
     base = torch.from_numpy(clean).to(geometry.device)
     levels = torch.tensor(list(greys), dtype=torch.uint8, device=base.device)
-    behind = _behind(geometry, views, backdrop)
+    behind = _behind(geometry, views, backdrops)
     shadings = [
         fit_curve(
             levels,
@@ -337,14 +346,24 @@ def curve_surrogate(
 
 
 def _anchored(plain: Surrogate, obj: Object3D, shadings: Sequence[CurveShading]) -> Surrogate:
-    """``plain``, whose ``shadings`` these are, with true minus predicted colours of the unpainted object added."""
+    """``plain``, whose ``shadings`` these are, made to predict the unpainted object as the target shows it.
+
+    The target's image is rounded to 8 bits: a prediction that would be rounded to it is believed as it is, any other is
+    shifted until it would.
+    """
     texels = plain.texels(textures_of(obj, device=plain.base.device))
-    anchors = tuple(
+    missed = tuple(
         batch.of(plain.base) / 255 - plain.colours(texels, number)[0]
         for number, batch in enumerate(plain.geometry.batches)
     )
-    anchored = tuple(shading.anchored(anchor) for shading, anchor in zip(shadings, anchors, strict=True))
-    return replace(plain, shadings=anchored, anchors=anchors)
+    anchored = tuple(
+        shading.anchored(softshrink(miss, SAME_LEVEL)) for shading, miss in zip(shadings, missed, strict=True)
+    )
+    return replace(plain, shadings=anchored, missed=missed)
+
+
+SAME_LEVEL = 0.499 / 255
+"""A prediction this near to an 8-bit value is rounded to it."""
 
 
 def textures_of(obj: Object3D, *, device: torch.device | str = "cpu") -> dict[str, Float[Tensor, "H W 3"]]:

@@ -1,0 +1,203 @@
+"""The mip pyramids of all textures as one flat array, of which only the texels that are read are ever put together.
+
+Large levels are made, read and dropped in bands of rows that stay in the processor's cache, there and back: the cost of
+a step grows with the number of texels and not with the time that memory takes to answer.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import FunctionCtx
+
+__all__ = ["MipLayout", "mip_layout", "read_texels"]
+
+Reads = Sequence[Int[Tensor, " _"]]
+"""Of each mip level in the layout's order, texels (row * width + column), ascending."""
+
+BAND_TEXELS = 2**18
+"""Levels with more texels than this are made in bands of about as many."""
+
+
+@dataclass(frozen=True)
+class MipLayout:
+    """Where each mip level of each texture lies in the flat array. ``sizes[t][l]`` is (H, W), ``starts[t][l]`` its
+    first texel."""
+
+    sizes: tuple[tuple[tuple[int, int], ...], ...]
+    starts: tuple[tuple[int, ...], ...]
+    total: int
+
+
+def mip_layout(sizes: Sequence[tuple[int, int]]) -> MipLayout:
+    """Layout of the full mip pyramids (halved and rounded down until 1 x 1) of textures of ``sizes`` (H, W)."""
+    levels, starts, position = [], [], 0
+    for height, width in sizes:
+        chain = [(height, width)]
+        while chain[-1] != (1, 1):
+            chain.append((max(1, chain[-1][0] // 2), max(1, chain[-1][1] // 2)))
+        first = []
+        for h, w in chain:
+            first.append(position)
+            position += h * w
+        levels.append(tuple(chain))
+        starts.append(tuple(first))
+    return MipLayout(tuple(levels), tuple(starts), position)
+
+
+def read_texels(
+    textures: Sequence[Float[Tensor, "H W channels"]], layout: MipLayout, reads: Reads, *, rounded: bool = False
+) -> Float[Tensor, "texels channels"]:
+    """The texels ``reads`` of the mip levels of ``textures`` (row 0 on top), box filtered. Differentiable.
+
+    With ``rounded`` levels are rounded to 8 bits as they are made; the gradient passes as if they were not.
+    """
+    texels: Tensor = _ReadTexels.apply(layout, reads, rounded, *textures)  # type: ignore[no-untyped-call]
+    return texels
+
+
+class _ReadTexels(Function):
+    """``read_texels``, with the gradient's way back."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, layout: MipLayout, reads: Reads, rounded: bool, *textures: Tensor) -> Tensor:
+        chains = _chains(layout, reads)
+        ctx.chains = chains  # type: ignore[attr-defined]
+        pairs = zip(chains, textures, strict=True)
+        return torch.cat([part for chain, texture in pairs for part in chain.read(texture, rounded=rounded)])
+
+    @staticmethod
+    def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        chains: list[_Chain] = ctx.chains  # type: ignore[attr-defined]
+        counts = [len(level) for chain in chains for level in chain.reads]
+        parts = iter(torch.split(gradient, counts))
+        return (None, None, None, *(chain.spread([next(parts) for _ in chain.sizes]) for chain in chains))
+
+
+def _chains(layout: MipLayout, reads: Reads) -> list["_Chain"]:
+    levels = iter(reads)
+    return [_Chain(sizes, tuple(next(levels) for _ in sizes)) for sizes in layout.sizes]
+
+
+@dataclass(frozen=True)
+class _Chain:
+    """The mip levels of one texture, and what is read of them."""
+
+    sizes: tuple[tuple[int, int], ...]
+    reads: tuple[Int[Tensor, " _"], ...]
+
+    @cached_property
+    def banded(self) -> int:
+        """How many of the first levels are made in bands: the large ones, as long as both sides are even."""
+        small = (k for k, (h, w) in enumerate(self.sizes) if h * w <= BAND_TEXELS or h % 2 or w % 2)
+        return next(small, len(self.sizes) - 1)
+
+    def bands(self) -> Iterator[list[tuple[slice, slice]]]:
+        """For each band and each banded level: its rows, and which of the level's reads lie in them."""
+        banded, (height, width) = self.banded, self.sizes[0]
+        tall = max(1, BAND_TEXELS // width >> banded)
+        starts = range(0, height >> banded, tall)
+        edges = [
+            torch.searchsorted(level, torch.tensor([(s << banded >> k) * w for s in starts], device=level.device))
+            for k, (level, (_, w)) in enumerate(zip(self.reads[:banded], self.sizes, strict=False))
+        ]
+        places = [[*edge.tolist(), len(level)] for edge, level in zip(edges, self.reads, strict=False)]
+        for number, start in enumerate(starts):
+            stop = min(start + tall, height >> banded)
+            yield [
+                (slice(start << banded >> k, stop << banded >> k), slice(place[number], place[number + 1]))
+                for k, place in enumerate(places)
+            ]
+
+    def within(self, level: int, rows: slice, places: slice) -> Int[Tensor, " _"]:
+        """Those of a level's reads, counted from the first texel of ``rows``."""
+        return self.reads[level][places].sub(rows.start * self.sizes[level][1])
+
+    def read(self, texture: Float[Tensor, "H W channels"], *, rounded: bool) -> list[Float[Tensor, "_ channels"]]:
+        """What is read of each level, level by level (of the large ones band by band)."""
+        banded, channels = self.banded, texture.shape[2]
+        found: list[list[Tensor]] = [[] for _ in self.sizes]
+        level = texture.new_empty(*self.sizes[banded], channels) if banded else texture
+        for band in self.bands() if banded else ():
+            part = texture[band[0][0]]
+            for k, (rows, places) in enumerate(band):
+                found[k].append(part.reshape(-1, channels).index_select(0, self.within(k, rows, places)))
+                part = _halved(part, rounded=rounded)
+            level[rows.start // 2 : rows.stop // 2] = part
+        for k in range(banded, len(self.sizes)):
+            found[k].append(level.reshape(-1, channels).index_select(0, self.reads[k]))
+            level = _halved(level, rounded=rounded)
+        return [part for parts in found for part in parts]
+
+    def spread(self, gradients: Sequence[Float[Tensor, "_ channels"]]) -> Float[Tensor, "H W channels"]:
+        """The transpose of ``read``: what the texture gets from what was read of each level."""
+        banded, channels = self.banded, gradients[0].shape[1]
+        total = gradients[0].new_zeros(*self.sizes[-1], channels)
+        for k in reversed(range(banded, len(self.sizes))):
+            total = total if total.shape[:2] == self.sizes[k] else _doubled(total, self.sizes[k])
+            total.view(-1, channels).index_add_(0, self.reads[k], gradients[k])
+        if not banded:
+            return total
+        whole = total.new_empty(*self.sizes[0], channels)
+        for band in self.bands():
+            rows = band[-1][0]
+            part = total[rows.start // 2 : rows.stop // 2]
+            for k in reversed(range(banded)):
+                rows, places = band[k]
+                size = (rows.stop - rows.start, self.sizes[k][1])
+                part = _doubled(part, size, out=whole[rows] if k == 0 else None)
+                part.view(-1, channels).index_add_(0, self.within(k, rows, places), gradients[k][places])
+        return whole
+
+
+def _halved(level: Float[Tensor, "H W channels"], *, rounded: bool) -> Float[Tensor, "h w channels"]:
+    """The next mip level: columns are averaged, then rows, two by two (an odd side: three by three that overlap)."""
+    for axis in (1, 0):
+        if level.shape[axis] > 1:
+            windows = _windows(level, axis)
+            level = windows[0] + windows[1]
+            for window in windows[2:]:
+                level += window
+            level.div_(len(windows))
+            if rounded:
+                level.mul_(255).add_(0.5 + 1e-4).floor_().div_(255)
+    return level
+
+
+def _windows(level: Float[Tensor, "H W channels"], axis: int) -> list[Tensor]:
+    """The first, the second (and if their number is odd the third) of the texels that become one, along ``axis``."""
+    side = level.shape[axis]
+    steps = [slice(k, k + side // 2 * 2 - 1, 2) for k in range(2 + side % 2)]
+    return [level[step] if axis == 0 else level[:, step] for step in steps]
+
+
+def _doubled(
+    total: Float[Tensor, "h w channels"], size: tuple[int, int], *, out: Tensor | None = None
+) -> Float[Tensor, "H W channels"]:
+    """The transpose of averaging a level of ``size`` (H, W), a new tensor or (both sides even) in ``out``."""
+    if size[0] % 2 or size[1] % 2:
+        return _shared(_shared(total, size[1], 1), size[0], 0)
+    quarter = total / 4
+    wide = torch.stack([quarter, quarter], 2).view(len(total), 1, -1)
+    whole = total.new_empty(*size, total.shape[2]) if out is None else out
+    pairs = whole.view(len(total), 2, -1)
+    pairs.copy_(wide.expand_as(pairs))
+    return whole
+
+
+def _shared(total: Float[Tensor, "h w channels"], side: int, axis: int) -> Tensor:
+    """The gradient of each texel shared by the two (or three) of which it is the average, ``side`` along ``axis``."""
+    if side == 1:
+        return total.clone()
+    if side % 2 == 0:
+        return torch.stack([half := total / 2, half], axis + 1).flatten(axis, axis + 1)
+    shape = list(total.shape)
+    shape[axis] = side
+    wide, third = total.new_zeros(shape), total / 3
+    for window in _windows(wide, axis):
+        window += third
+    return wide

@@ -1,0 +1,253 @@
+"""Scenes that are hard to rasterise, as the real renderer shows them: the surrogate sees the same surfaces in the same
+places, and predicts what a repaint changes there."""
+
+import io
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from trompe_server.surrogate import SamplingModel, Surrogate, curve_surrogate, prepare_geometry
+from trompe_server.surrogate.calibration import CURVE_GREYS, measure_fidelity, painted_noise
+from trompe_server.target import SailenvTarget
+from trompe_shared.geometry import Camera, View
+from trompe_shared.object3d import Object3D, object_from_files
+
+Image8 = NDArray[np.uint8]
+Surface = tuple[Any, Any, Image8]
+Make = Callable[..., Any]
+MakeObject = Callable[..., Object3D]
+SIZE = (128, 128)
+MAGENTA = (255, 0, 255)
+AROUND = [
+    View(Camera(0.4, azimuth, elevation), background=MAGENTA)
+    for azimuth, elevation in ((0, 0), (35, 20), (-50, 10), (60, -30), (180, 0), (215, 40))
+]
+
+
+def noise(height: int, width: int, seed: int = 0) -> Image8:
+    return np.random.default_rng(seed).integers(40, 216, (height, width, 3), dtype=np.uint8)
+
+
+def with_opacity(obj: Object3D, name: str, opacity: Image8) -> Object3D:
+    """``obj`` with an alpha channel (H, W), of the texture's size, in one of its albedo files."""
+    buffer = io.BytesIO()
+    Image.fromarray(np.dstack([obj.textures[name], opacity])).save(buffer, "PNG")
+    return object_from_files({**obj.files, name: buffer.getvalue()})
+
+
+def holes(side: int) -> Image8:
+    """Round holes with a soft edge, (side, side) uint8."""
+    x = np.sin(np.arange(side) * 2 * np.pi * 3 / side)
+    return np.asarray(128 + 127 * np.clip(2 * (x[:, None] * x[None] + 0.3), -1, 1), np.uint8)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the target shows of an object, and a surrogate measured on that."""
+
+    obj: Object3D
+    clean: Image8
+    repainted: Object3D
+    images: Image8
+    surrogate: Surrogate
+
+
+def show(
+    obj: Object3D, target: SailenvTarget, views: Sequence[View] = AROUND, *, sampling: SamplingModel | None = None
+) -> Shown:
+    def grey(level: int) -> Object3D:
+        return obj.with_textures({name: np.full_like(image, level) for name, image in obj.textures.items()})
+
+    clean = target.render(obj, views, size=SIZE)
+    probes = np.stack([target.render(grey(level), views, size=SIZE) for level in CURVE_GREYS])
+    geometry = prepare_geometry(obj, views, size=SIZE, sampling=sampling or SamplingModel())
+    surrogate = curve_surrogate(geometry, obj, views, clean, CURVE_GREYS, probes)
+    repainted = painted_noise(obj, np.random.default_rng(1))
+    return Shown(obj, clean, repainted, target.render(repainted, views, size=SIZE), surrogate)
+
+
+def check_places(shown: Shown, background: tuple[int, int, int] = MAGENTA) -> None:
+    """The object covers the pixels that it covers in the target's images, but for a few on edges."""
+    where = np.zeros((shown.clean.shape[0] * SIZE[0] * SIZE[1],), bool)
+    for batch in shown.surrogate.geometry.batches:
+        where[batch.pixel.numpy() + batch.views.start * SIZE[0] * SIZE[1]] = True
+    true = (shown.clean != background).any(axis=-1).ravel()
+    assert true.any()
+    assert (where != true).sum() <= 0.01 * true.sum() + 3
+
+
+def quads(make_quad: Make, *places: tuple[float, float, int]) -> list[Surface]:
+    """Squares of half a side at a depth, with a texture of noise each: (half, z, texels a side)."""
+    return [make_quad(noise(n, n, seed=k), half=half, z=z) for k, (half, z, n) in enumerate(places)]
+
+
+def turned(surface: Surface, degrees: float) -> Surface:
+    """About the vertical axis."""
+    corners, uvs, texture = surface
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.asarray(corners) @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]), uvs, texture
+
+
+def reverse(surface: Surface, texture: Image8) -> Surface:
+    """The same surface seen from the other side."""
+    corners, uvs, _ = surface
+    return np.asarray(corners)[:, ::-1], np.asarray(uvs)[:, ::-1], texture
+
+
+def overlapping(make_object: MakeObject, make_quad: Make) -> Object3D:
+    first, second = quads(make_quad, (0.1, 0.0, 64), (0.08, 0.0, 64))
+    sides = [reverse(first, noise(32, 32, seed=7)), reverse(second, noise(32, 32, seed=8))]
+    return make_object(turned(first, 30), turned(second, -40), turned(sides[0], 30), turned(sides[1], -40))
+
+
+def coplanar(make_object: MakeObject, make_quad: Make) -> Object3D:
+    return make_object(*quads(make_quad, (0.1, 0.0, 64), (0.1, 0.0, 48)))
+
+
+def two_sided(make_object: MakeObject, make_quad: Make) -> Object3D:
+    (front,) = quads(make_quad, (0.1, 0.0, 64))
+    return make_object(front, reverse(front, noise(24, 24, seed=5)))
+
+
+def outside_uvs(make_object: MakeObject, make_quad: Make) -> Object3D:
+    corners, uvs, texture = make_quad(noise(32, 32), repeat=2.5)
+    behind = reverse((corners, -3.25 * np.asarray(uvs), texture), noise(16, 16))
+    return make_object((corners, np.asarray(uvs) - [7.3, -4.1], texture), behind)
+
+
+def several_materials(make_object: MakeObject, make_quad: Make) -> Object3D:
+    front = quads(make_quad, (0.05, 0.06, 64), (0.08, 0.03, 32), (0.1, 0.0, 128))
+    return make_object(*front, reverse(front[2], noise(8, 8)), make_quad(noise(1, 1), half=0.03, z=0.09))
+
+
+def shared_texture(make_object: MakeObject, make_quad: Make) -> Object3D:
+    obj = make_object(*quads(make_quad, (0.06, 0.05, 64), (0.1, 0.0, 64)))
+    table = {name: {"albedo": "m0.png"} for name in ("m0", "m1")}
+    files = {name: data for name, data in obj.files.items() if name != "m1.png"}
+    return object_from_files({**files, "made_mat_def.json": json.dumps(table).encode()})
+
+
+def thin_textures(make_object: MakeObject, make_quad: Make) -> Object3D:
+    textures = (noise(1, 1), noise(1, 37), noise(41, 1))
+    front = [make_quad(texture, half=0.04 + 0.03 * k, z=0.1 - 0.05 * k) for k, texture in enumerate(textures)]
+    return make_object(*front, reverse(front[2], noise(1, 5)))
+
+
+def awkward(make_object: MakeObject, make_quad: Make) -> Object3D:
+    points = [
+        [[-0.2, 0.11, 0.01], [0.2, 0.11, 0.01], [0.2, 0.11 + 1e-6, 0.01]],  # a needle
+        [[0, 0, 0.05]] * 3,
+        [[-0.1, 0, 0.05], [0, 0, 0.05], [0.1, 0, 0.05]],
+        [[0.15, 0.15, 0], [0.1501, 0.15, 0], [0.15, 0.1501, 0]],  # smaller than a pixel
+        [[-9, -9, 5], [9, -9, 5], [0, 9, 5]],  # behind the cameras in front
+    ]
+    uvs = [[[0, 0], [1, 0], [0, 1]]] * 3 + [[[0.3, 0.3]] * 3] * 2
+    return make_object(*quads(make_quad, (0.1, 0.0, 64)), (np.array(points, float), np.array(uvs), noise(8, 8)))
+
+
+def cut_out(make_object: MakeObject, make_quad: Make) -> Object3D:
+    front, back = quads(make_quad, (0.1, 0.04, 128), (0.12, -0.02, 64))
+    return with_opacity(make_object(front, back, reverse(back, noise(16, 16))), "m0.png", holes(128))
+
+
+def black(make_object: MakeObject, make_quad: Make) -> Object3D:
+    return make_object(make_quad(np.zeros((32, 32, 3), np.uint8)))
+
+
+SCENES = [
+    pytest.param(overlapping, AROUND, 0.98, id="parts that pierce each other"),
+    pytest.param(coplanar, AROUND, 0.98, id="parts in the same place, the first is seen"),
+    pytest.param(two_sided, AROUND, 0.98, id="two sides of a sheet, painted differently"),
+    pytest.param(outside_uvs, AROUND, 0.97, id="uvs outside of the unit square, both ways up"),
+    pytest.param(several_materials, AROUND, 0.98, id="several materials and sizes of texture"),
+    pytest.param(shared_texture, AROUND, 0.98, id="a texture that two parts share"),
+    pytest.param(thin_textures, AROUND, 0.90, id="textures of one texel, row or column"),
+    pytest.param(awkward, AROUND[:4], 0.98, id="needles, points, lines and what is behind the camera"),
+    pytest.param(cut_out, AROUND, 0.98, id="an alpha-tested sheet before another"),
+]
+
+
+@pytest.mark.parametrize(("scene", "views", "least"), SCENES)
+def test_the_surrogate_predicts_what_the_target_shows(
+    scene: Make, views: list[View], least: float, target: SailenvTarget, make_object: MakeObject, make_quad: Make
+) -> None:
+    shown = show(scene(make_object, make_quad), target, views)
+    check_places(shown)
+    fidelity = measure_fidelity(shown.surrogate, shown.obj, shown.clean, shown.repainted, shown.images)
+    assert min(fidelity.correlation) >= least
+    assert fidelity.mean()["slope"] == pytest.approx(1, abs=0.05)
+    assert fidelity.mean()["error"] <= 2 / 255
+
+
+def test_a_sheet_with_holes_shows_what_is_behind_them_and_a_repaint_keeps_the_holes(
+    target: SailenvTarget, make_object: MakeObject, make_quad: Make
+) -> None:
+    obj, view = cut_out(make_object, make_quad), AROUND[:1]
+    green, white = (
+        obj.with_textures({name: np.full_like(obj.textures[name], colour)})
+        for name, colour in (("m1.png", (0, 255, 0)), ("m0.png", 255))
+    )
+    shown, behind, before = (target.render(each, view, size=SIZE)[0].astype(int) for each in (obj, green, white))
+    through, sheet = ((np.abs(each - shown) > 8).any(axis=-1) for each in (behind, before))
+    middle = np.s_[SIZE[0] // 2 - 12 : SIZE[0] // 2 + 12, SIZE[1] // 2 - 12 : SIZE[1] // 2 + 12]
+    assert 0.1 < through[middle].mean() < 0.9
+    assert (through & sheet)[middle].mean() < 0.25  # edges of holes show both
+    assert (through | sheet)[middle].mean() > 0.95
+    first, second = (prepare_geometry(o, view, size=SIZE, sampling=SamplingModel()).batches[0] for o in (obj, white))
+    assert (first.pixel == second.pixel).all()
+    assert (first.gather.index == second.gather.index).all()
+
+
+def test_an_alpha_channel_that_cuts_nothing_out_changes_no_image_and_no_operator(
+    worker: tuple[str, int], make_object: MakeObject, make_quad: Make
+) -> None:
+    plain = overlapping(make_object, make_quad)
+    faint = with_opacity(plain, "m0.png", np.full((64, 64), 128, np.uint8))
+    images = []
+    for obj in (plain, faint):
+        target = SailenvTarget(*worker)
+        images.append(target.render(obj, AROUND, size=SIZE))
+        target.close()
+    assert (images[0] == images[1]).all()
+    first, second = (prepare_geometry(o, AROUND, size=SIZE, sampling=SamplingModel()) for o in (plain, faint))
+    for one, other in zip(first.batches, second.batches, strict=True):
+        assert all((a == b).all() for a, b in zip(*(vars(x.gather).values() for x in (one, other)), strict=True))
+
+
+def test_cameras_inside_the_object_see_its_walls_as_the_target_does(
+    target: SailenvTarget, make_object: MakeObject, make_quad: Make
+) -> None:
+    walls = [turned(make_quad(noise(64, 64, seed=k), half=0.1, z=-0.1), 90 * k) for k in range(4)]
+    views = [View(Camera(0.02, 10, 5)), View(Camera(0.06, 100, -20)), View(Camera(0.09, 250, 0))]
+    shown = show(make_object(*walls), target, views)
+    fidelity = measure_fidelity(shown.surrogate, shown.obj, shown.clean, shown.repainted, shown.images)
+    assert min(fidelity.correlation) >= 0.97
+
+
+def test_a_black_object_on_black_is_black_and_its_repaint_is_predicted(
+    target: SailenvTarget, make_object: MakeObject, make_quad: Make
+) -> None:
+    views = [replace(view, background=(0, 0, 0)) for view in AROUND[:3]]
+    shown = show(black(make_object, make_quad), target, views)
+    assert shown.clean.max() <= 40  # its gloss
+    fidelity = measure_fidelity(shown.surrogate, shown.obj, shown.clean, shown.repainted, shown.images)
+    assert min(fidelity.correlation) >= 0.95
+
+
+def test_what_no_view_sees_and_views_that_see_nothing_change_nothing(
+    target: SailenvTarget, make_object: MakeObject, make_quad: Make
+) -> None:
+    obj = make_object(*quads(make_quad, (0.1, 0.0, 64), (0.05, 3.0, 16)))
+    shown = show(obj, target, [AROUND[0], AROUND[4]])
+    (batch,) = shown.surrogate.geometry.batches
+    assert batch.counts[1] == 0
+    assert (shown.clean[1] == MAGENTA).all()
+    hidden = obj.with_textures({"m1.png": 255 - obj.textures["m1.png"]})
+    assert (target.render(hidden, AROUND[:1], size=SIZE)[0] == shown.clean[0]).all()
+    assert (shown.surrogate.influence()["m1.png"] == 0).all()
