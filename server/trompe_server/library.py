@@ -27,6 +27,9 @@ from trompe_shared.shipped import shipped_objects
 __all__ = ["Library"]
 
 INSPECTION_TIMEOUT: Final = 300.0
+CLASSIFIER_ENDINGS: Final = {".pt2", ".pt", ".torchscript", ".onnx"}
+NAMED: Final = "torchvision:"
+"""Begins the names of classifiers that torchvision brings."""
 _INFO: Final = "info.json"
 _PART: Final = 2**20
 
@@ -124,31 +127,40 @@ class Library:
         return self._classifiers.all()
 
     def classifier(self, reference: str) -> ClassifierInfo:
-        """One classifier. Raises ``NotFoundError`` or ``AmbiguousError``."""
-        return self._classifiers.find(reference)
+        """One classifier, or one of torchvision's (``torchvision:NAME``, its weights from the local cache).
+
+        Raises ``NotFoundError``, ``AmbiguousError``, or ``ClassifierError`` for what torchvision does not give.
+        """
+        return _named(reference) if reference.startswith(NAMED) else self._classifiers.find(reference)
 
     def classifier_path(self, reference: str) -> str:
-        """What ``load_classifier`` takes: the path of an uploaded file, the name of a shipped classifier."""
+        """What ``load_classifier`` takes: the path of an uploaded file, the name of any other classifier."""
+        if reference.startswith(NAMED):
+            return reference
         info = self.classifier(reference)
         return info.name if info.shipped else str(self._classifiers.payload(info))
 
     def add_classifier(
         self, file: BinaryIO, filename: str, *, classes: Sequence[str] | None = None, name: str | None = None
     ) -> ClassifierInfo:
-        """Store a .pt2 or .onnx file; without ``classes`` it keeps those that the same file came with before.
+        """Store a .pt2, TorchScript or .onnx file.
 
+        Without ``classes`` it keeps those that the same file came with before, or those that it names itself.
         Raises ``ClassifierError`` for a bad one; nothing is kept then.
         """
         suffix = Path(filename).suffix.lower()
-        if suffix not in {".pt2", ".onnx"}:
-            raise ClassifierError(f"{filename!r} is neither a .pt2 (torch.export) nor an .onnx file.")
+        if suffix not in CLASSIFIER_ENDINGS:
+            raise ClassifierError(
+                f"{filename!r} is neither a .pt2 (torch.export), a TorchScript (.pt, .torchscript) nor an .onnx file."
+            )
         with _Intake(self._classifiers.folder) as intake:
             payload = intake.folder / f"data{suffix}"
             identity = _copy(file, payload)
             found = _inspect(str(payload))
             _check_classes(classes, found)
             before = self._classifiers.stored(identity)
-            classes = classes if classes is not None or before is None else before.classes
+            if classes is None:
+                classes = before.classes if before is not None else found.get("classes")  # type: ignore[assignment]
             info = ClassifierInfo.model_validate(
                 found | {"id": identity, "name": name or Path(filename).stem, "classes": classes}
             )
@@ -235,6 +247,13 @@ def _inspect(path_or_name: str) -> dict[str, object]:
     if "error" in found:
         raise ClassifierError(str(found["error"]))
     return dict(found)
+
+
+@cache
+def _named(reference: str) -> ClassifierInfo:
+    """One of torchvision's classifiers."""
+    name = reference.removeprefix(NAMED)
+    return ClassifierInfo.model_validate(_inspect(reference) | {"id": reference, "name": name})
 
 
 def _check_classes(classes: Sequence[str] | None, found: dict[str, object]) -> None:

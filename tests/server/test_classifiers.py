@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,9 +21,12 @@ from torch import Tensor, nn
 from trompe_server.classifiers import (
     Classifier,
     NetworkClassifier,
+    ScoringClassifier,
     WhiteBoxClassifier,
     fake_classifier,
     load_classifier,
+    resized,
+    score_based,
 )
 from trompe_server.classifiers.archive import read_program
 from trompe_server.classifiers.fold import BATCH_NORM, Formatted, fold_batch_norm
@@ -98,6 +102,13 @@ def export(
     return path
 
 
+def trace(path: Path) -> Path:
+    """``Net`` as a TorchScript file."""
+    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+        torch.jit.save(torch.jit.trace(trained(Net()), torch.rand(2, 3, *SIZE)), path)
+    return path
+
+
 def write_onnx(
     path: Path,
     *,
@@ -138,10 +149,21 @@ def white_box(path: Path) -> NetworkClassifier:
     return classifier
 
 
-@pytest.fixture(params=["fake", "pt2", "onnx", "onnx with a batch of 1", "onnx with a batch of 4", "tiny"])
+@pytest.fixture(
+    params=[
+        *("fake", "pt2", "torchscript", "tiny", "resized", "score based"),
+        *("onnx", "onnx with a batch of 1", "onnx with a batch of 4"),
+    ]
+)
 def classifier(request: pytest.FixtureRequest, tmp_path: Path) -> Classifier:
     if request.param == "fake":
         return fake_classifier()
+    if request.param == "resized":
+        return resized(fake_classifier(), (16, 40))
+    if request.param == "score based":
+        return score_based(fake_classifier(), seed=0)
+    if request.param == "torchscript":
+        return load_classifier(trace(tmp_path / "net.pt"))
     if request.param == "tiny":
         return load_classifier("tiny")
     if request.param == "pt2":
@@ -167,6 +189,15 @@ def test_images_of_another_size_are_resized(classifier: Classifier) -> None:
     flat = np.full((1, 3 * classifier.image_size[0], 50, 3), 90, np.uint8)
     right = np.full((1, *classifier.image_size, 3), 90, np.uint8)
     np.testing.assert_allclose(classifier.predict(flat), classifier.predict(right), rtol=1e-4, atol=1e-5)
+
+
+def test_scores_of_images_that_are_not_8_bit_are_the_predictions_of_those_that_are(classifier: Classifier) -> None:
+    if not isinstance(classifier, ScoringClassifier):
+        pytest.skip("gives gradients by a detour of its own")
+    images = noise(11, classifier.image_size)
+    scores = classifier.scores(fit_images(images, classifier.image_size).requires_grad_())
+    assert not scores.requires_grad
+    np.testing.assert_allclose(scores.numpy(), classifier.predict(images), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -447,7 +478,7 @@ def test_an_onnx_network_only_judges(tmp_path: Path) -> None:
 
 def test_names_that_are_not_known_and_files_that_are_not_there_are_told_apart(tmp_path: Path) -> None:
     with pytest.raises(ClassifierError, match="give 'tiny'"):
-        load_classifier("resnet50")
+        load_classifier("weights.h5")
     with pytest.raises(ClassifierError, match="There is no classifier file"):
         load_classifier(tmp_path / "absent.pt2")
 
@@ -460,7 +491,8 @@ def test_inspect_prints_one_line_of_json(good: bool, pt2: Path, tmp_path: Path) 
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     (line,) = done.stdout.splitlines()
     if good:
-        assert (json.loads(line), done.returncode) == ({"white_box": True, "image_size": [*SIZE], "n_classes": 7}, 0)
+        known = {"white_box": True, "image_size": [*SIZE], "n_classes": 7, "classes": None}
+        assert (json.loads(line), done.returncode) == (known, 0)
     else:
         assert list(json.loads(line)) == ["error"]
         assert done.returncode == 1

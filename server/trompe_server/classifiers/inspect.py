@@ -1,7 +1,7 @@
 """Read a classifier in a process of its own: ``python -m trompe_server.classifiers.inspect FILE_OR_NAME``.
 
-Prints one JSON line: ``{"white_box": bool, "image_size": [H, W], "n_classes": N}``, or ``{"error": "..."}`` with exit
-code 1.
+Prints one JSON line: ``{"white_box": bool, "image_size": [H, W], "n_classes": N, "classes": names or null}``, or
+``{"error": "..."}`` with exit code 1.
 """
 
 import json
@@ -23,6 +23,7 @@ def describe(path_or_name: str) -> dict[str, object]:
         "white_box": isinstance(classifier, WhiteBoxClassifier),
         "image_size": list(classifier.image_size),
         "n_classes": classifier.n_classes,
+        "classes": None if classifier.classes is None else list(classifier.classes),
     }
 
 

@@ -26,17 +26,23 @@ class NetworkClassifier:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        self.network.requires_grad_(False)
+        for parameter in self.network.parameters():  # TorchScript has no requires_grad_ of its own
+            parameter.requires_grad_(False)
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
-        """Logits of sRGB images in [0, 1] of size ``image_size``, differentiable in the images."""
-        logits: Tensor = self.network(images)
-        return logits
+        """Logits of sRGB images in [0, 1] of size ``image_size``, differentiable in the images and on their device."""
+        logits: Tensor = self.network(images.to(self.device))
+        return logits.to(images.device)
+
+    @torch.no_grad()
+    def scores(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
+        """The same logits without a gradient."""
+        return self.logits(images)
 
     @torch.no_grad()
     def predict(self, images: Images) -> Logits:
         """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size."""
         chunks = [np.zeros((0, self.n_classes), np.float32)]
         for batch in in_batches(images, BATCH):
-            chunks.append(self.logits(fit_images(batch, self.image_size).to(self.device)).cpu().numpy())
+            chunks.append(self.logits(fit_images(batch, self.image_size)).numpy())
         return np.concatenate(chunks)

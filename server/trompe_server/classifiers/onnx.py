@@ -8,6 +8,8 @@ from typing import Any, Final
 import numpy as np
 import onnxruntime
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from trompe_server.classifiers.protocol import (
     Images,
@@ -27,7 +29,7 @@ CONTRACT: Final = "input image float32 NCHW in [0, 1], output logits (N, classes
 
 @dataclass(frozen=True)
 class OnnxClassifier:
-    """An onnxruntime session on the CPU; ``fixed_batch``: how many images it takes at once, if its graph says so."""
+    """An onnxruntime session; ``fixed_batch``: how many images it takes at once, if its graph says so."""
 
     name: str
     session: Any
@@ -40,13 +42,25 @@ class OnnxClassifier:
         """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size."""
         chunks = [np.zeros((0, self.n_classes), np.float32)]
         for batch in in_batches(images, self.fixed_batch or BATCH):
-            chunks.append(_run(self.session, fit_images(batch, self.image_size).numpy(), self.fixed_batch))
+            chunks.append(self.scores(fit_images(batch, self.image_size)).numpy())
         return np.concatenate(chunks)
 
+    def scores(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
+        """Logits of sRGB images in [0, 1] of size ``image_size``, on the images' device; no gradient."""
+        chunks = [torch.zeros((0, self.n_classes))]
+        for batch in torch.split(images.detach().cpu(), self.fixed_batch or BATCH):
+            chunks.append(torch.from_numpy(_run(self.session, batch.contiguous().numpy(), self.fixed_batch)))
+        return torch.cat(chunks).to(images.device)
 
-def load_onnx(path: Path, *, name: str | None = None, classes: Sequence[str] | None = None) -> OnnxClassifier:
-    """An ``.onnx`` file as a classifier that only judges. Raises ``ClassifierError`` when it breaks the contract."""
-    session = _session(path)
+
+def load_onnx(
+    path: Path, *, name: str | None = None, classes: Sequence[str] | None = None, device: str = "cpu"
+) -> OnnxClassifier:
+    """An ``.onnx`` file as a classifier that only judges, on ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+
+    Raises ``ClassifierError`` when it breaks the contract, or when onnxruntime was not built for the device.
+    """
+    session = _session(path, device)
     fixed_batch, size = _input(session, path.name)
     noise = np.random.default_rng(0).random((1, 3, *size), np.float32)
     try:
@@ -67,12 +81,27 @@ def _broken(file: str, what: str) -> ClassifierError:
     return ClassifierError(f"{file!r}: {what}. Expected: {CONTRACT}; export it so, with the normalisation inside.")
 
 
-def _session(path: Path) -> Any:
+def _providers(device: str) -> list[str | tuple[str, dict[str, str]]]:
+    """onnxruntime's names for the device, the CPU for what that cannot do. Raises ``ClassifierError``."""
+    kind, _, number = device.partition(":")
+    if kind == "cpu":
+        return ["CPUExecutionProvider"]
+    provider = f"{kind.upper()}ExecutionProvider"
+    if provider not in onnxruntime.get_available_providers():
+        raise ClassifierError(
+            f"This onnxruntime cannot use the device {device!r}: it has {onnxruntime.get_available_providers()}. "
+            "Install onnxruntime-gpu in its place, or load .onnx files on 'cpu'."
+        )
+    return [(provider, {"device_id": number or "0"}), "CPUExecutionProvider"]
+
+
+def _session(path: Path, device: str) -> Any:
+    providers = _providers(device)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:
         raise _broken(path.name, f"onnxruntime cannot read it ({str(error)[:300]})") from error
 

@@ -12,7 +12,16 @@ from torch.nn import functional as F
 
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["Classifier", "WhiteBoxClassifier", "check_classes", "fit_images", "in_batches", "refuse_probabilities"]
+__all__ = [
+    "Classifier",
+    "ScoringClassifier",
+    "WhiteBoxClassifier",
+    "check_classes",
+    "fit_images",
+    "in_batches",
+    "refuse_probabilities",
+    "resize",
+]
 
 Images = NDArray[np.uint8]
 Logits = NDArray[np.float32]
@@ -56,12 +65,26 @@ class WhiteBoxClassifier(Classifier, Protocol):
         ...
 
 
+@runtime_checkable
+class ScoringClassifier(Classifier, Protocol):
+    """A classifier that takes images that are not rounded to 8 bits, whether it gives gradients or not."""
+
+    def scores(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
+        """Logits of sRGB images in [0, 1] of the classifier's own size, without a gradient, on the images' device."""
+        ...
+
+
+def resize(images: Float[Tensor, "n 3 h w"], size: tuple[int, int]) -> Float[Tensor, "n 3 H W"]:
+    """The images in another size (antialiased bilinear, differentiable); the very same tensor where it is theirs."""
+    if images.shape[2:] == size:
+        return images
+    return F.interpolate(images, size, mode="bilinear", antialias=True)
+
+
 def fit_images(images: Images, size: tuple[int, int]) -> Float[Tensor, "n 3 H W"]:
     """Images (N, h, w, 3) as a classifier's input in [0, 1], resized (antialiased bilinear) where not of ``size``."""
     batch = torch.from_numpy(np.ascontiguousarray(images)).permute(0, 3, 1, 2).float() / 255
-    if batch.shape[2:] == size:
-        return batch
-    return F.interpolate(batch, size, mode="bilinear", antialias=True)
+    return resize(batch, size)
 
 
 def in_batches(images: Images, count: int) -> Iterator[Images]:

@@ -1,0 +1,82 @@
+"""The contract of a network that can be attacked, wherever it comes from, and the check that it holds."""
+
+from typing import Any, Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from trompe_server.classifiers.fold import accelerate
+from trompe_server.classifiers.protocol import refuse_probabilities
+from trompe_shared.errors import ClassifierError
+
+__all__ = ["Normalised", "broken", "check_contract", "describe_value", "prepared", "sample_images"]
+
+CONTRACT: Final = "input image float32 NCHW in [0, 1] with a dynamic batch, output logits (N, classes)"
+
+
+class Normalised(nn.Module):
+    """A network with the normalisation that it expects of its images put in front of it."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, network: nn.Module, *, mean: tuple[float, ...], std: tuple[float, ...]) -> None:
+        super().__init__()
+        self.network = network
+        self.register_buffer("mean", torch.tensor(mean).reshape(3, 1, 1))
+        self.register_buffer("std", torch.tensor(std).reshape(3, 1, 1))
+
+    def forward(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
+        """Logits of sRGB images in [0, 1]."""
+        logits: Tensor = self.network((images - self.mean) / self.std)
+        return logits
+
+
+def broken(file: str, what: str) -> ClassifierError:
+    """The error for a network that does not keep the contract."""
+    return ClassifierError(f"{file!r}: {what}. Expected: {CONTRACT}; export it so, with the normalisation inside.")
+
+
+def describe_value(value: Any) -> str:
+    """A value's type and shape, for messages."""
+    return f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+
+
+def sample_images(size: tuple[int, int]) -> Float[Tensor, "2 3 H W"]:
+    """Two images: plain grey and noise."""
+    noise = torch.rand((1, 3, *size), generator=torch.Generator().manual_seed(0))
+    return torch.cat([torch.full_like(noise, 0.5), noise])
+
+
+def check_contract(network: nn.Module, sample: Float[Tensor, "2 3 H W"], file: str) -> int:
+    """Number of classes. Raises ``ClassifierError`` when the output is not finite, differentiable logits."""
+    images = sample.clone().requires_grad_()
+    try:
+        logits = network(images)
+    except RuntimeError as error:
+        raise broken(file, f"it does not run on two images ({str(error)[:300]})") from error
+    if not isinstance(logits, Tensor) or logits.ndim != 2 or len(logits) != 2 or not logits.is_floating_point():
+        raise broken(file, f"its output for two images is {describe_value(logits)}")
+    if not torch.isfinite(logits).all():
+        raise broken(file, "its output is not finite")
+    refuse_probabilities(logits.detach().cpu().numpy(), file)
+    gradient = torch.autograd.grad(logits.max(), images, allow_unused=True)[0] if logits.requires_grad else None
+    if gradient is None or not gradient.any():
+        raise broken(file, "its output has no gradient in the image")
+    return logits.shape[1]
+
+
+def prepared(network: nn.Module, size: tuple[int, int], file: str, *, device: str) -> tuple[nn.Module, int]:
+    """(the same function on ``device``, made faster where torch can export it; number of classes).
+
+    Raises ``ClassifierError`` when the network does not keep the contract on images of ``size``.
+    """
+    network = network.to(device).eval().requires_grad_(False)
+    sample = sample_images(size).to(device)
+    n_classes = check_contract(network, sample, file)
+    try:
+        program = torch.export.export(network, (sample,), dynamic_shapes=({0: torch.export.Dim.DYNAMIC},))
+    except Exception:  # torch.export raises of every kind; what it cannot export runs as it is
+        return network, n_classes
+    return accelerate(program.module(check_guards=False), sample), n_classes

@@ -1,0 +1,76 @@
+"""Several classifiers attacked at once, so that what fools them all may fool one that was never asked."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from trompe_server.classifiers.protocol import Images, Logits, WhiteBoxClassifier, resize
+from trompe_shared.errors import ClassifierError
+
+__all__ = ["ResizedClassifier", "as_ensemble", "resized"]
+
+
+@dataclass(frozen=True)
+class ResizedClassifier:
+    """``inner`` for images of ``image_size``, which it resizes to its own; so does their gradient come back."""
+
+    inner: WhiteBoxClassifier
+    image_size: tuple[int, int]
+
+    @property
+    def name(self) -> str:
+        """See ``Classifier``."""
+        return self.inner.name
+
+    @property
+    def n_classes(self) -> int:
+        """See ``Classifier``."""
+        return self.inner.n_classes
+
+    @property
+    def classes(self) -> tuple[str, ...] | None:
+        """See ``Classifier``."""
+        return self.inner.classes
+
+    def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
+        """Logits of sRGB images in [0, 1] of size ``image_size``, differentiable in them."""
+        return self.inner.logits(resize(images, self.inner.image_size))
+
+    def predict(self, images: Images) -> Logits:
+        """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size, resized once, to the inner size."""
+        return self.inner.predict(images)
+
+
+def resized(classifier: WhiteBoxClassifier, size: tuple[int, int]) -> WhiteBoxClassifier:
+    """The classifier for images of ``size`` (H, W): itself where that is its own."""
+    return classifier if classifier.image_size == size else ResizedClassifier(classifier, size)
+
+
+def as_ensemble(classifiers: Sequence[WhiteBoxClassifier]) -> tuple[WhiteBoxClassifier, ...]:
+    """The classifiers as members that all take images of the first one's size.
+
+    Raises ``ClassifierError`` where there is none, or where two of them do not mean the same by their logits.
+    """
+    if not classifiers:
+        raise ClassifierError("An ensemble needs at least one classifier, got none.")
+    first = next((one for one in classifiers if one.classes is not None), classifiers[0])
+    for other in classifiers:
+        _check_same_classes(first, other)
+    return tuple(resized(one, classifiers[0].image_size) for one in classifiers)
+
+
+def _check_same_classes(first: WhiteBoxClassifier, other: WhiteBoxClassifier) -> None:
+    both = f"{first.name!r} and {other.name!r} cannot be attacked together:"
+    if first.n_classes != other.n_classes:
+        raise ClassifierError(
+            f"{both} they have {first.n_classes} and {other.n_classes} classes; name classifiers of the same classes."
+        )
+    if first.classes is None or other.classes is None or first.classes == other.classes:
+        return
+    index = next(i for i, names in enumerate(zip(first.classes, other.classes, strict=True)) if names[0] != names[1])
+    raise ClassifierError(
+        f"{both} class {index} is {first.classes[index]!r} for one and {other.classes[index]!r} for the other; "
+        "name classifiers of the same classes in the same order."
+    )

@@ -1,0 +1,137 @@
+"""Networks of torchvision by name, with the size and normalisation that belong to their weights.
+
+Nothing is downloaded: weights come from torch's cache, or from a file, and every tensor of the network must be among
+them, so that it never stands there with random weights.
+"""
+
+import difflib
+import importlib
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import urlparse
+
+import torch
+from torch import nn
+
+from trompe_server.classifiers.contract import Normalised, prepared
+from trompe_server.classifiers.network import NetworkClassifier
+from trompe_server.classifiers.protocol import check_classes
+from trompe_shared.errors import ClassifierError
+
+__all__ = ["load_torchvision", "read_weights"]
+
+
+class _LocalWeights:
+    """An entry of torchvision's table of weights, its tensors read from a file here and its classes named anew."""
+
+    def __init__(self, entry: Any, tensors: dict[str, torch.Tensor], classes: Sequence[str]) -> None:
+        self.entry, self.tensors = entry, tensors
+        self.meta = {**entry.meta, "categories": list(classes)}
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        """torchvision builds a network only for a member of the network's own table."""
+        return type(self.entry)
+
+    def get_state_dict(self, **_: Any) -> dict[str, torch.Tensor]:
+        """What torchvision loads into the network."""
+        return self.tensors
+
+
+def load_torchvision(
+    model: str,
+    *,
+    name: str | None = None,
+    classes: Sequence[str] | None = None,
+    weights: str | Path | None = None,
+    device: str = "cpu",
+) -> NetworkClassifier:
+    """The torchvision classification network ``model`` as a white-box classifier.
+
+    ``weights``: which of torchvision's (``"IMAGENET1K_V1"``; its default where ``None``), from torch's cache, or a file
+    with a state dict, for as many classes as ``classes`` names (by default those of torchvision's weights).
+    Raises ``ClassifierError`` when torchvision, the network or the weights are not there, or do not fit together.
+    """
+    models = _torchvision()
+    entry, path = _find_weights(models, model, weights)
+    names = tuple(classes or entry.meta["categories"])
+    transforms = entry.transforms()
+    (side,) = transforms.crop_size
+    network = _built(models, model, entry, path, names)
+    whole = Normalised(network, mean=tuple(transforms.mean), std=tuple(transforms.std))
+    fast, n_classes = prepared(whole, (side, side), model, device=device)
+    check_classes(names, n_classes, model)
+    return NetworkClassifier(name or model, fast, (side, side), n_classes, names, device)
+
+
+def _torchvision() -> Any:
+    """The module ``torchvision.models``. Raises ``ClassifierError``."""
+    try:
+        return importlib.import_module("torchvision.models")
+    except ImportError as error:
+        raise ClassifierError(
+            "torchvision is not installed, and networks by name come from it. Install the version made for torch "
+            f"{torch.__version__} (the 'vision' extra of trompe), or give a .pt2 file."
+        ) from error
+    except RuntimeError as error:
+        raise ClassifierError(
+            f"torchvision is installed, but for another build of torch than {torch.__version__} ({error}). "
+            "Install both from one index and for the same device, or give a .pt2 file."
+        ) from error
+
+
+def _find_weights(models: Any, model: str, weights: str | Path | None) -> tuple[Any, Path]:
+    """(entry of torchvision's table, file). Raises ``ClassifierError``."""
+    known = models.list_models(module=models)
+    if model not in known:
+        near = ", ".join(difflib.get_close_matches(model, known)) or ", ".join(known[:5])
+        raise ClassifierError(f"torchvision has no classification network {model!r}; some that it has: {near}.")
+    table = models.get_model_weights(model)
+    cache = Path(torch.hub.get_dir()) / "checkpoints"
+    if weights is None or weights in table.__members__:
+        entry = table.DEFAULT if weights is None else table[weights]
+        return entry, _existing(cache / _file_of(entry), f"{model} ({entry.name}) from {entry.url}")
+    path = Path(weights)
+    entry = next((entry for entry in table if _file_of(entry) == path.name), table.DEFAULT)
+    return entry, _existing(path, f"{model}, or one of {', '.join(table.__members__)}")
+
+
+def _built(models: Any, model: str, entry: Any, path: Path, classes: Sequence[str]) -> nn.Module:
+    """The network with the weights of a file. Raises ``ClassifierError`` when they do not fit."""
+    tensors = read_weights(path)
+    try:
+        network: nn.Module = models.get_model(model, weights=_LocalWeights(entry, tensors, classes))
+    except RuntimeError as error:
+        raise ClassifierError(
+            f"The weights in {path.name!r} do not fit torchvision's {model!r} with {len(classes)} classes "
+            f"({str(error)[:300]}). Give the file of this very network, and one class name for each of its logits."
+        ) from error
+    return network
+
+
+def _file_of(entry: Any) -> str:
+    return PurePosixPath(urlparse(entry.url).path).name
+
+
+def _existing(path: Path, what: str) -> Path:
+    if not path.is_file():
+        raise ClassifierError(
+            f"There is no file {str(path)!r}, and nothing is downloaded. Put there the weights of {what}, "
+            "or give a state dict's file as weights."
+        )
+    return path
+
+
+def read_weights(path: Path) -> dict[str, torch.Tensor]:
+    """The state dict in a file that ``torch.save`` wrote; tensors only. Raises ``ClassifierError``."""
+    try:
+        tensors = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise ClassifierError(
+            f"The weights in {path.name!r} cannot be read ({type(error).__name__}: {str(error)[:200]}); expected a "
+            "state dict of tensors alone: torch.save(network.state_dict(), path)."
+        ) from error
+    if not isinstance(tensors, dict) or not all(isinstance(value, torch.Tensor) for value in tensors.values()):
+        raise ClassifierError(f"{path.name!r} holds no state dict; save one: torch.save(network.state_dict(), path).")
+    return tensors
