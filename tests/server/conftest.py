@@ -2,11 +2,15 @@
 
 import io
 from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
-from trompe_shared.object3d import pack_zip
+from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry
+from trompe_shared.geometry import Camera, View
+from trompe_shared.object3d import Object3D, pack_zip
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl paint\nf 1/1 2/2 3/3\n"
 
@@ -24,3 +28,18 @@ def _triangle_zip(*, colour: tuple[int, int, int] = (200, 30, 30)) -> bytes:
     return pack_zip(
         {"triangle.obj": TRIANGLE.encode(), "triangle_mat_def.json": materials, "paint.png": picture.getvalue()}
     )
+
+
+@pytest.fixture(scope="session")
+def square(make_object: Callable[..., Object3D], make_quad: Callable[..., Any]) -> Object3D:
+    """A square that the views of ``square_surrogate`` see from the front, and one behind the cameras that none sees."""
+    random = np.random.default_rng(0)
+    textures = [random.integers(40, 216, (16, 16, 3), dtype=np.uint8) for _ in range(2)]
+    return make_object(make_quad(textures[0]), make_quad(textures[1], z=9.0))
+
+
+@pytest.fixture(scope="session")
+def square_surrogate(square: Object3D) -> Surrogate:
+    """12 views of ``square``, 32 x 32, in all of which the fake classifier says class 6."""
+    views = [View(Camera(0.3, azimuth, elevation)) for azimuth in (-40, -10, 20, 45) for elevation in (-20, 0, 30)]
+    return diffuse_surrogate(prepare_geometry(square, views, size=(32, 32), sampling=SamplingModel()), views)

@@ -1,7 +1,6 @@
 """The attack's parts, each against its formula, and the loop as a whole on a small scene."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,28 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from trompe_server.array_files import pack_arrays, unpack_arrays
 from trompe_server.attack import (
-    AttackState,
     Budget,
-    Step,
-    attack,
-    fooled,
+    Goal,
     framing_distance,
     grid_views,
-    load_state,
-    margin,
-    margin_loss,
-    movable,
+    image_gradients,
     random_views,
     saliency,
     saliency_masks,
-    save_state,
-    start,
 )
-from trompe_server.attack.goal import SAFE_MARGIN
 from trompe_server.classifiers import NetworkClassifier, fake_classifier
-from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_shared.errors import SpecError
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View
 from trompe_shared.object3d import Object3D
@@ -126,58 +114,40 @@ def test_an_impossible_budget_is_refused(epsilon: float, alpha: float) -> None:
         Budget(epsilon, alpha)
 
 
-# The goal
-
-LOGITS = st.lists(st.lists(st.floats(-50, 50, width=32), min_size=4, max_size=4), min_size=1, max_size=6)
-
-
-@given(LOGITS, st.integers(0, 3))
-@settings(max_examples=100, deadline=None)
-def test_the_margin_is_the_best_other_logit_minus_the_true_one(rows: list[list[float]], label: int) -> None:
-    logits = torch.tensor(rows)
-    others = [max(row[:label] + row[label + 1 :]) for row in rows]
-    margins = torch.tensor([other - row[label] for other, row in zip(others, rows, strict=True)])
-    torch.testing.assert_close(margin(logits, label), margins)
-    torch.testing.assert_close(margin_loss(logits, label), margins.clamp(max=SAFE_MARGIN))
-    assert fooled(logits, label)[margins > 0].all()
-    assert not fooled(logits, label)[margins < 0].any()
-    assert torch.equal(logits, torch.tensor(rows))
-
-
-@pytest.mark.parametrize("size", [1.0, 1e4, 1e30])
-def test_loss_and_gradient_are_finite_even_when_every_view_is_fooled(size: float) -> None:
-    for logits, moves in ((torch.tensor([[0.0, 9], [0, 99]]), False), (torch.tensor([[9.0, 0], [99, 0]]), True)):
-        leaf = (logits * size).requires_grad_()
-        loss = margin_loss(leaf, 0)
-        (gradient,) = torch.autograd.grad(loss.sum(), leaf)
-        assert torch.isfinite(loss).all()
-        assert torch.isfinite(gradient).all()
-        assert bool((gradient != 0).any()) is moves
-
-
 # Saliency
 
 
 def test_saliency_is_scaled_over_all_views_to_end_at_zero_and_one() -> None:
     images = np.random.default_rng(0).integers(0, 256, (13, 32, 32, 3), dtype=np.uint8)
     classifier = fake_classifier()
-    maps = saliency(images, classifier, 3)
+    maps = saliency(images, classifier, goal=Goal(3))
     assert maps.shape == (13, 32, 32)
     assert (float(maps.min()), float(maps.max())) == (0.0, 1.0)
     gradients = []
     for image in images:
         leaf = (torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255).requires_grad_()
-        (gradient,) = torch.autograd.grad(margin(classifier.logits(leaf), 3).sum(), leaf)
+        (gradient,) = torch.autograd.grad(Goal(3).margins(classifier.logits(leaf)).sum(), leaf)
         gradients.append(gradient[0].abs().mean(0))
     expected = torch.stack(gradients)
     torch.testing.assert_close(maps, (expected - expected.min()) / (expected.max() - expected.min()), atol=1e-4, rtol=0)
+
+
+def test_image_gradients_are_those_of_the_loss_with_their_sign() -> None:
+    images = np.random.default_rng(1).integers(0, 256, (11, 32, 32, 3), dtype=np.uint8)
+    classifier, goal = fake_classifier(), Goal(3, loss="cross_entropy")
+    found = image_gradients(images, classifier, goal=goal)
+    leaf = (torch.from_numpy(images).float() / 255).requires_grad_()
+    (expected,) = torch.autograd.grad(goal.losses(classifier.logits(leaf.permute(0, 3, 1, 2))).sum(), leaf)
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-4)
+    maps = saliency(images, classifier, goal=goal)
+    torch.testing.assert_close((maps == 1).nonzero(), (found.abs().mean(3) == found.abs().mean(3).max()).nonzero())
 
 
 def test_saliency_of_a_classifier_that_does_not_care_is_zero() -> None:
     last = torch.nn.Linear(12, 2)
     torch.nn.init.zeros_(last.weight)
     deaf = torch.nn.Sequential(torch.nn.Flatten(), last)
-    maps = saliency(np.zeros((2, 2, 2, 3), np.uint8), NetworkClassifier("deaf", deaf, (2, 2), 2), 0)
+    maps = saliency(np.zeros((2, 2, 2, 3), np.uint8), NetworkClassifier("deaf", deaf, (2, 2), 2), goal=Goal(0))
     assert (maps == 0).all()
 
 
@@ -239,233 +209,3 @@ def test_from_the_framing_distance_all_of_the_object_is_seen(mug: Object3D, azim
     reach = np.abs(points[:, :2] / -points[:, 2:]) / np.tan(np.radians(FIELD_OF_VIEW / 2))
     assert (points[:, 2] < 0).all()
     assert reach.max() < 1
-
-
-# The loop
-
-SIZE = (32, 32)
-LABEL = 6
-"""What the fake classifier takes the square for, in all of the views below."""
-
-
-@pytest.fixture(scope="module")
-def square(make_object: Make, make_quad: Make) -> Object3D:
-    """A square that all views see from the front, and one behind the cameras that none sees."""
-    random = np.random.default_rng(0)
-    textures = [random.integers(40, 216, (16, 16, 3), dtype=np.uint8) for _ in range(2)]
-    obj: Object3D = make_object(make_quad(textures[0]), make_quad(textures[1], z=9.0))
-    return obj
-
-
-@pytest.fixture(scope="module")
-def surrogate(square: Object3D) -> Surrogate:
-    views = [View(Camera(0.3, azimuth, elevation)) for azimuth in (-40, -10, 20, 45) for elevation in (-20, 0, 30)]
-    return diffuse_surrogate(prepare_geometry(square, views, size=SIZE, sampling=SamplingModel()), views)
-
-
-def run(
-    obj: Object3D, surrogate: Surrogate, *, steps: int = 6, state: AttackState | None = None, **options: Any
-) -> AttackState:
-    textures = textures_of(obj)
-    return attack(
-        state or start(textures),
-        textures,
-        surrogate,
-        fake_classifier(),
-        LABEL,
-        budget=Budget(0.06, 0.02),
-        steps=steps,
-        **options,
-    )
-
-
-def same(one: AttackState, other: AttackState) -> bool:
-    tables = ((one.deltas, other.deltas), (one.momenta, other.momenta))
-    return one.step == other.step and all(
-        mine.keys() == theirs.keys() and all(torch.equal(mine[name], theirs[name]) for name in mine)
-        for mine, theirs in tables
-    )
-
-
-def test_the_attack_raises_the_margin_within_its_budget(square: Object3D, surrogate: Surrogate) -> None:
-    seen: list[Step] = []
-    state = run(square, surrogate, on_step=seen.append)
-    assert [step.step for step in seen] == list(range(6))
-    assert seen[-1].loss > seen[0].loss + 0.01
-    assert all(0 <= step.fooled <= 1 for step in seen)
-    assert state.step == 6
-    delta, texture = state.deltas["m0.png"], textures_of(square)["m0.png"]
-    assert 0.059 < delta.abs().max() <= 0.06 + EPS
-    assert (texture + delta).min() >= 0
-    assert (texture + delta).max() <= 1
-
-
-def test_what_a_step_reports_is_the_mean_over_all_views_before_it_moved(square: Object3D, surrogate: Surrogate) -> None:
-    seen: list[Step] = []
-    run(square, surrogate, steps=1, on_step=seen.append)
-    texels = surrogate.texels(textures_of(square))
-    logits = fake_classifier().logits(surrogate.render_all(texels))
-    assert seen[0].loss == pytest.approx(float(margin_loss(logits, LABEL).mean()), abs=1e-4)
-    assert seen[0].fooled == float(fooled(logits, LABEL).float().mean())
-
-
-def test_a_step_goes_along_the_sign_of_the_mean_gradient(square: Object3D, surrogate: Surrogate) -> None:
-    leaf = textures_of(square)["m0.png"].requires_grad_()
-    texels = surrogate.texels(textures_of(square) | {"m0.png": leaf})
-    logits = fake_classifier().logits(surrogate.render_all(texels))
-    (gradient,) = torch.autograd.grad(margin_loss(logits, LABEL).mean(), leaf)
-    clear = gradient.abs() > 1e-6
-    delta = run(square, surrogate, steps=1).deltas["m0.png"]
-    assert clear.float().mean() > 0.5
-    torch.testing.assert_close(delta[clear], 0.02 * gradient.sign()[clear], atol=EPS, rtol=0)
-
-
-def test_texels_that_no_view_sees_do_not_move(square: Object3D, surrogate: Surrogate) -> None:
-    assert (run(square, surrogate).deltas["m1.png"] == 0).all()
-
-
-def test_two_chunks_are_one_run_bit_for_bit(square: Object3D, surrogate: Surrogate) -> None:
-    whole = run(square, surrogate, steps=5)
-    half = load_state(save_state(run(square, surrogate, steps=2, total_steps=5)))
-    assert same(run(square, surrogate, steps=3, state=half), whole)
-
-
-def test_the_same_inputs_give_the_same_bytes(square: Object3D, surrogate: Surrogate) -> None:
-    assert save_state(run(square, surrogate)) == save_state(run(square, surrogate))
-
-
-def test_with_masks_only_texels_that_masked_pixels_read_move(square: Object3D, surrogate: Surrogate) -> None:
-    masks = torch.zeros(surrogate.n_views, *SIZE, dtype=torch.bool)
-    masks[:4, 12:18, 12:18] = True
-    moved = (run(square, surrogate, masks=masks).deltas["m0.png"] != 0).any(dim=2)
-    read = surrogate.influence(masks)["m0.png"] > 0
-    assert moved.any()
-    assert not moved[~read].any()
-    assert moved.sum() < (run(square, surrogate).deltas["m0.png"] != 0).any(dim=2).sum()
-
-
-def test_masks_that_let_nothing_through_move_nothing(square: Object3D, surrogate: Surrogate) -> None:
-    masks = torch.zeros(surrogate.n_views, *SIZE, dtype=torch.bool)
-    assert all((delta == 0).all() for delta in run(square, surrogate, masks=masks).deltas.values())
-
-
-def test_only_the_texels_that_are_allowed_move(square: Object3D, surrogate: Surrogate) -> None:
-    allowed = {name: torch.zeros(16, 16, dtype=torch.bool) for name in square.textures}
-    allowed["m0.png"][3:9, 4:12] = True
-    moved = (run(square, surrogate, texels=allowed).deltas["m0.png"] != 0).any(dim=2)
-    assert moved.any()
-    assert not (moved & ~allowed["m0.png"]).any()
-
-
-def test_movable_are_the_texels_whose_whole_budget_is_worth_half_a_level(
-    square: Object3D, surrogate: Surrogate
-) -> None:
-    small, large = movable(surrogate, Budget(0.001, 0.001)), movable(surrogate, Budget(1.0, 0.1))
-    influence = surrogate.influence()
-    for name in square.textures:
-        assert torch.equal(large[name], influence[name] >= 0.5 / 255)
-        assert not (small[name] & ~large[name]).any()
-    assert not large["m1.png"].any()
-
-
-def test_a_classifier_that_is_fooled_everywhere_stops_the_attack_without_nan(
-    square: Object3D, surrogate: Surrogate
-) -> None:
-    last = torch.nn.Linear(3, 10)
-    network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), last)
-    with torch.no_grad():
-        last.bias.fill_(50.0)[LABEL] = -50.0
-    seen: list[Step] = []
-    textures = textures_of(square)
-    classifier = replace(fake_classifier(), network=network)
-    state = attack(
-        start(textures), textures, surrogate, classifier, LABEL, budget=Budget(0.1, 0.1), steps=2, on_step=seen.append
-    )
-    assert [step.fooled for step in seen] == [1.0, 1.0]
-    assert [step.loss for step in seen] == [SAFE_MARGIN] * 2
-    assert all((delta == 0).all() for delta in state.deltas.values())
-
-
-# State and arrays as files
-
-
-@given(SEEDS, st.sampled_from(["a.png", "Straße 7.png", "x.npy", "step", "file"]))
-@settings(max_examples=20, deadline=None)
-def test_a_state_comes_back_exactly(seed: int, name: str) -> None:
-    deltas = {name: random_tensor(seed, low=-1, high=1), "other.png": torch.zeros(1, 1, 3)}
-    momenta = {name: random_tensor(seed + 1, low=-9, high=9), "other.png": torch.ones(1, 1, 3)}
-    state = AttackState(seed, deltas, momenta)
-    again = load_state(save_state(state))
-    assert list(again.deltas) == list(state.deltas)
-    assert same(again, state)
-
-
-def test_arrays_come_back_as_they_were() -> None:
-    arrays: dict[str, np.ndarray] = {
-        "images": np.arange(24, dtype=np.uint8).reshape(2, 3, 4),
-        "half": np.array([0.1, np.nan], np.float16),
-        "none": np.zeros((0, 3)),
-    }
-    again = unpack_arrays(pack_arrays(arrays))
-    assert list(again) == list(arrays)
-    for name, array in arrays.items():
-        assert again[name].dtype == array.dtype
-        np.testing.assert_array_equal(again[name], array)
-
-
-PACKED = pack_arrays({"a": np.arange(100), "b": np.zeros(3)})
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"no archive", PACKED[: len(PACKED) // 2], PACKED[:60] + b"\xff" * 40 + PACKED[100:]], ids=len
-)
-def test_damaged_bytes_are_an_error_that_can_be_caught(data: bytes) -> None:
-    for read in (unpack_arrays, load_state):
-        with pytest.raises((ValueError, OSError)):
-            read(data)
-
-
-def test_arrays_that_are_no_state_are_damaged_too() -> None:
-    with pytest.raises(ValueError, match="step"):
-        load_state(PACKED)
-
-
-# The pool: each step looks at some of the views
-
-
-@pytest.fixture(scope="module")
-def many_views(square: Object3D) -> Surrogate:
-    views = pool(30, seed=5)
-    return diffuse_surrogate(prepare_geometry(square, views, size=SIZE, sampling=SamplingModel()), views)
-
-
-def pool(n: int, *, seed: int) -> list[View]:
-    generator = np.random.default_rng(seed)
-    return list(random_views(n, distance=2, elevation=(0, 40), background=(0, 0, 0), generator=generator))
-
-
-def losses(square: Object3D, surrogate: Surrogate, **options: Any) -> list[float]:
-    seen: list[Step] = []
-    run(square, surrogate, steps=4, on_step=seen.append, **options)
-    return [step.loss for step in seen]
-
-
-def test_a_step_that_draws_views_looks_at_other_ones_than_the_next(square: Object3D, many_views: Surrogate) -> None:
-    texels = many_views.texels(textures_of(square))
-    with torch.no_grad():
-        logits = [fake_classifier().logits(many_views.render(texels, batch)) for batch in range(3)]
-    first = losses(square, many_views, views_per_step=10)[0]
-    assert any(first == pytest.approx(float(margin_loss(some, LABEL).mean()), abs=1e-4) for some in logits)
-    assert first != pytest.approx(losses(square, many_views)[0], abs=1e-6)
-
-
-def test_the_seed_decides_which_views_are_drawn(square: Object3D, many_views: Surrogate) -> None:
-    drawn = [losses(square, many_views, views_per_step=10, seed=seed) for seed in (1, 1, 2, 3)]
-    assert drawn[0] == drawn[1]
-    assert drawn[2:] != [drawn[0], drawn[0]]
-
-
-def test_a_run_over_a_pool_that_was_cut_off_goes_on_bit_for_bit(square: Object3D, many_views: Surrogate) -> None:
-    whole = run(square, many_views, steps=5, views_per_step=10, seed=7)
-    half = load_state(save_state(run(square, many_views, steps=2, total_steps=5, views_per_step=10, seed=7)))
-    assert same(run(square, many_views, steps=3, state=half, views_per_step=10, seed=7), whole)

@@ -1,5 +1,6 @@
 """The figures of a result."""
 
+import re
 from random import Random
 
 import numpy as np
@@ -8,9 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trompe_server.attack.metrics import (
+    DropOverSeeds,
     accuracy,
+    drop_interval,
+    drop_over_seeds,
+    drop_warning,
     max_view_change,
     mean_texel_change,
+    predicted_classes,
+    share_beyond,
     softmax,
     texels_altered,
     transfer_gap,
@@ -85,8 +92,113 @@ def test_nothing_stands_after_an_attack_that_was_not_made() -> None:
 def test_accuracy_needs_the_same_views_and_at_least_one() -> None:
     with pytest.raises(ValueError, match="of the same views"):
         accuracy(logits([True, True]), logits([True]), LABEL)
+    with pytest.raises(ValueError, match="of the same views"):
+        drop_interval(logits([True, True]), logits([True]), LABEL)
     with pytest.raises(ValueError, match="at least one view"):
         accuracy(logits([True])[:0], None, LABEL)
+
+
+def interval(pairs: list[tuple[bool, bool]], *, seed: int = 0) -> tuple[float, float] | None:
+    before, after = zip(*pairs, strict=True)
+    return drop_interval(logits(list(before)), logits(list(after)), LABEL, seed=seed)
+
+
+BOTH, FOOLED, HELPED, NEVER = (True, True), (True, False), (False, True), (False, False)
+
+
+@given(hits, st.integers(0, 3))
+def test_the_interval_of_the_drop_ends_by_1_and_is_na_where_the_drop_is(
+    pairs: list[tuple[bool, bool]], seed: int
+) -> None:
+    found = interval(pairs, seed=seed)
+    assert (found is None) == (judged(pairs).a_drop is None)
+    if found is not None:
+        assert found[0] <= found[1] <= 1
+        assert found == interval(pairs, seed=seed)
+
+
+@pytest.mark.parametrize("drop", [0.2, 0.5, 0.75])
+def test_the_interval_of_the_drop_is_the_binomial_one_where_every_view_was_recognised(drop: float) -> None:
+    fooled = round(400 * drop)
+    found = interval([FOOLED] * fooled + [BOTH] * (400 - fooled))
+    assert found == pytest.approx(wilson_interval(fooled, 400), abs=0.015)
+
+
+@pytest.mark.parametrize("views", [10, 60, 200])
+def test_an_attack_that_fooled_every_view_seen_is_not_certain_to_fool_all(views: int) -> None:
+    found = interval([FOOLED] * views)
+    assert found is not None
+    assert found[1] == 1.0
+    assert 1 - found[0] == pytest.approx(wilson_interval(0, views)[1], rel=0.5)
+
+
+def test_few_recognised_views_give_a_wide_interval() -> None:
+    few, many = (interval([FOOLED] * n + [BOTH] * n + [NEVER] * (100 - 2 * n)) for n in (3, 50))
+    assert few is not None
+    assert many is not None
+    assert few[0] < 0 < many[0] < 0.5 < many[1] < few[1]
+
+
+def test_the_interval_holds_the_true_drop_about_as_often_as_it_says() -> None:
+    generator = np.random.default_rng(0)
+    before = generator.random((200, 60)) < 0.9
+    after = before & (generator.random((200, 60)) < 0.01)
+    held = [interval(list(zip(b, a, strict=True)), seed=k) for k, (b, a) in enumerate(zip(before, after, strict=True))]
+    assert np.mean([low <= 0.99 <= high for low, high in filter(None, held)]) > 0.93
+
+
+def test_the_interval_respects_that_a_view_is_the_same_before_and_after() -> None:
+    paired = interval([BOTH] * 50 + [NEVER] * 50)
+    shuffled = interval([BOTH] * 25 + [FOOLED] * 25 + [HELPED] * 25 + [NEVER] * 25)
+    assert paired is not None
+    assert shuffled is not None
+    assert paired[1] - paired[0] < (shuffled[1] - shuffled[0]) / 3
+
+
+@pytest.mark.parametrize(
+    ("pairs", "words"),
+    [
+        pytest.param([FOOLED] * 3 + [NEVER] * 7, None, id="three tenths are enough"),
+        pytest.param([FOOLED] * 7 + [NEVER] * 53, "12% of the views .* rests on 7 of 60 views", id="few"),
+        pytest.param([HELPED] * 60, "None of the 60 views .* n.a.", id="none"),
+    ],
+)
+def test_a_drop_that_rests_on_few_views_comes_with_a_warning(pairs: list[tuple[bool, bool]], words: str | None) -> None:
+    found = drop_warning(judged(pairs))
+    assert found is words is None or (words and re.search(words, found or ""))
+
+
+def test_the_interval_over_seeds_is_students() -> None:
+    assert drop_over_seeds([0.7, 0.8, 0.9]) == DropOverSeeds(
+        3,
+        pytest.approx(0.8),
+        pytest.approx(0.1),
+        (pytest.approx(0.8 - 4.3027 * 0.1 / 3**0.5, abs=1e-5), 1.0),
+    )
+    ten = drop_over_seeds([0.5, 0.6] * 5)
+    assert ten is not None
+    assert ten.interval == pytest.approx((0.55 - 2.26216 * 0.0527046 / 10**0.5, 0.55 + 2.26216 * 0.0527046 / 10**0.5))
+
+
+def test_seeds_without_a_drop_do_not_count() -> None:
+    assert drop_over_seeds([None, 0.5, None]) == DropOverSeeds(1, 0.5, None, None)
+    assert drop_over_seeds([None]) is drop_over_seeds([]) is None
+
+
+@given(st.lists(st.floats(-1, 1), min_size=2, max_size=5))
+def test_the_interval_over_seeds_holds_the_mean_and_does_not_exceed_1(drops: list[float]) -> None:
+    found = drop_over_seeds(drops)
+    assert found is not None
+    assert found.interval is not None
+    low, high = found.interval
+    assert low - 1e-12 <= found.mean <= high + 1e-12
+    assert high <= 1 + 1e-12
+
+
+def test_predicted_classes_are_counted_most_frequent_first() -> None:
+    rows = np.eye(5, dtype=np.float32)[[4, 2, 2, 0, 4, 2]]
+    assert list(predicted_classes(rows).items()) == [(2, 3), (4, 2), (0, 1)]
+    assert predicted_classes(rows[:0]) == {}
 
 
 def test_the_transfer_gap_is_surrogate_minus_target() -> None:
@@ -161,3 +273,24 @@ def test_the_largest_change_of_a_view_has_no_sign_and_does_not_wrap() -> None:
     after[1, 2, 3, 0] = 255
     assert max_view_change(before, after) == max_view_change(after, before) == 1.0
     assert max_view_change(before, before) == 0.0
+
+
+def test_pixels_and_views_beyond_epsilon_are_counted_on_the_object_alone() -> None:
+    before, pixels = np.full((4, 2, 5, 3), 100, np.uint8), np.zeros((4, 2, 5), bool)
+    pixels[:, :, :4] = True
+    after = before.copy()
+    after[0, 0, 0, 1] = 114
+    after[0, 1, 1] = (86, 114, 100)
+    after[1, 0, 0] = 113
+    after[2, :, 4] = 255
+    assert share_beyond(before, after, pixels, epsilon=13 / 255) == (2 / 32, 1 / 4)
+    assert share_beyond(before, after, pixels, epsilon=0.05) == (3 / 32, 2 / 4)
+    assert share_beyond(before, after, pixels & False, epsilon=0.05) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("level", range(1, 256))
+def test_a_change_of_epsilon_itself_is_not_beyond_it(level: int) -> None:
+    before, after = np.zeros((1, 1, 1, 3), np.uint8), np.full((1, 1, 1, 3), level, np.uint8)
+    pixels = np.ones((1, 1, 1), bool)
+    assert share_beyond(before, after, pixels, epsilon=level / 255) == (0.0, 0.0)
+    assert share_beyond(before, after, pixels, epsilon=(level - 0.01) / 255) == (1.0, 1.0)

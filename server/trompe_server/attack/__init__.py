@@ -1,24 +1,31 @@
 """The attack: budget, goal, saliency, views and the loop. Usable without any server."""
 
-from trompe_server.attack.attack import AttackState, Step, attack, load_state, movable, save_state, start
+from trompe_server.attack.attack import Step, attack
 from trompe_server.attack.budget import Budget
-from trompe_server.attack.goal import fooled, margin, margin_loss
-from trompe_server.attack.saliency import saliency, saliency_masks
-from trompe_server.attack.views import framing_distance, grid_views, random_views
+from trompe_server.attack.goal import Goal
+from trompe_server.attack.saliency import image_gradients, saliency, saliency_masks
+from trompe_server.attack.state import AttackState, load_state, save_state, start
+from trompe_server.attack.texels import TexelMasks, best_texels, material_texels, movable, painted_texels, rank_texels
+from trompe_server.attack.views import ViewDistribution, framing_distance, grid_views, random_views
 
 __all__ = [
     "AttackState",
     "Budget",
+    "Goal",
     "Step",
+    "TexelMasks",
+    "ViewDistribution",
     "attack",
-    "fooled",
+    "best_texels",
     "framing_distance",
     "grid_views",
+    "image_gradients",
     "load_state",
-    "margin",
-    "margin_loss",
+    "material_texels",
     "movable",
+    "painted_texels",
     "random_views",
+    "rank_texels",
     "saliency",
     "saliency_masks",
     "save_state",

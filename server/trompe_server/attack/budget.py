@@ -1,6 +1,7 @@
 """How far a texture may move: an L-infinity ball around the original, inside the colours that exist."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -8,6 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from trompe_shared.errors import SpecError
+from trompe_shared.object3d import Object3D
 
 __all__ = ["Budget"]
 
@@ -16,11 +18,13 @@ __all__ = ["Budget"]
 class Budget:
     """``epsilon`` is the largest change of a texel's channel, ``alpha`` the size of one step; sRGB in [0, 1] units.
 
-    Raises ``SpecError`` unless 0 < alpha <= epsilon <= 1.
+    ``epsilon_view``, where given, bounds the change of every pixel of the surrogate's images likewise (the paper's view
+    constraint). Raises ``SpecError`` unless 0 < alpha <= epsilon <= 1 and 0 < epsilon_view <= 1.
     """
 
     epsilon: float
     alpha: float
+    epsilon_view: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.alpha <= self.epsilon <= 1:
@@ -28,19 +32,21 @@ class Budget:
                 "epsilon and alpha must satisfy 0 < alpha <= epsilon <= 1, "
                 f"got alpha={self.alpha}, epsilon={self.epsilon}."
             )
+        if self.epsilon_view is not None and not 0 < self.epsilon_view <= 1:
+            raise SpecError(f"epsilon_view must be in (0, 1], or left out for no bound, got {self.epsilon_view}.")
 
-    def project(self, delta: Float[Tensor, "H W 3"], texture: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    def project(self, delta: Float[Tensor, "*texels 3"], texture: Float[Tensor, "*texels 3"]) -> Tensor:
         """The nearest change that keeps ``|delta| <= epsilon`` and ``0 <= texture + delta <= 1``."""
         return delta.clamp(-self.epsilon, self.epsilon).add_(texture).clamp_(0, 1).sub_(texture)
 
     def ascend(
         self,
-        delta: Float[Tensor, "H W 3"],
-        direction: Float[Tensor, "H W 3"],
-        texture: Float[Tensor, "H W 3"],
+        delta: Float[Tensor, "*texels 3"],
+        direction: Float[Tensor, "*texels 3"],
+        texture: Float[Tensor, "*texels 3"],
         *,
         scale: float = 1.0,
-    ) -> Float[Tensor, "H W 3"]:
+    ) -> Tensor:
         """One projected step of ``scale * alpha`` along the sign of ``direction``; texels where it is zero stay."""
         return self.project(direction.sign().mul_(scale * self.alpha).add_(delta), texture)
 
@@ -49,3 +55,12 @@ class Budget:
         reach = math.floor(self.epsilon * 255 + 1e-9)
         change = (delta * 255).round().clamp(-reach, reach).to(torch.int16)
         return (texture.to(torch.int16) + change).clamp(0, 255).to(torch.uint8)
+
+    def repaint(self, obj: Object3D, deltas: Mapping[str, Float[Tensor, "H W 3"]]) -> Object3D:
+        """``obj`` with its textures changed by ``deltas`` and saved in 8 bits."""
+        return obj.with_textures(
+            {
+                name: self.quantise(delta.cpu(), torch.from_numpy(obj.textures[name])).numpy()
+                for name, delta in deltas.items()
+            }
+        )

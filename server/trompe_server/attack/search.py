@@ -1,0 +1,158 @@
+"""The runs of a search: where each begins, how its steps are paced, which of them found the best change.
+
+A run begins at the unpainted textures or at random, and takes its share of the steps. Of several runs, and of a method
+that goes back and forth, the change with the highest loss over all of the attack's own views in the surrogate wins;
+nothing else is looked at.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from trompe_server.attack.objective import Look, Objective
+from trompe_server.attack.optimiser import OPTIMISERS, Box, OptimiserName, Pace, Point
+from trompe_server.attack.view_budget import ViewBudget
+from trompe_shared.errors import SpecError
+
+__all__ = ["Schedule", "Search"]
+
+Flat = Float[Tensor, "texels 3"]
+
+REST: Final = 2
+"""Steps for which a view that is settled is not looked at."""
+
+BEGIN: Final = 1
+"""Keeps the random numbers of a run's beginning apart from those of a step's views."""
+
+WAKES, SHOWN, BEST, BEST_LOSS = "search.wakes", "search.shown", "search.best", "search.best_loss"
+"""What the search remembers beside its method: the step at which each view is looked at again, the images shown so far,
+the best change of the runs that are over, and its loss."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """``total`` steps, shared evenly by the first run and ``restarts`` more. Raises ``SpecError`` for too few."""
+
+    total: int
+    restarts: int
+    random_start: bool
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.restarts < 0:
+            raise SpecError(f"restarts must be 0 or more, got {self.restarts}.")
+        if self.total <= self.restarts:
+            raise SpecError(
+                f"{self.total} steps are too few for {self.restarts} restarts: each run needs at least one of them."
+            )
+
+    def check(self, optimiser: OptimiserName, *, last: int) -> None:
+        """Raise ``SpecError`` unless ``optimiser`` is known and can use so many steps, of which there are ``last``."""
+        if last > self.total:
+            raise SpecError(f"Steps up to {last} were asked for, but total_steps is {self.total}.")
+        if optimiser not in OPTIMISERS:
+            raise SpecError(f"There is no optimiser {optimiser!r}; choose one of {', '.join(OPTIMISERS)}.")
+        runs = self.restarts + 1
+        if optimiser == "fgsm" and self.total != runs:
+            raise SpecError(f"fgsm is a single step: ask for {runs} (one a run), not {self.total}, or use pgd.")
+
+    def pace(self, step: int) -> tuple[int, Pace]:
+        """The run that ``step`` belongs to, and how far that is."""
+        bounds = [run * self.total // (self.restarts + 1) for run in range(self.restarts + 2)]
+        run = next(run for run, end in enumerate(bounds[1:]) if step < end)
+        return run, Pace(step - bounds[run], bounds[run + 1] - bounds[run])
+
+    def drawn(self, batches: Sequence[range], views: int | None, step: int) -> Sequence[int]:
+        """The batches that a step looks at: all, or as many as hold about ``views`` views."""
+        total, n_views = len(batches), sum(map(len, batches))
+        if views is None or views >= n_views:
+            return range(total)
+        count = max(1, round(views * total / n_views))
+        return sorted(np.random.default_rng([self.seed, step]).choice(total, count, replace=False).tolist())
+
+
+@dataclass(frozen=True)
+class Search:
+    """Moves a point step by step; see the head of this module.
+
+    movable: the texels that may move. within: keeps the images' change in bounds as well, where that is asked for.
+    """
+
+    objective: Objective
+    schedule: Schedule
+    optimiser: OptimiserName
+    box: Box
+    movable: Bool[Tensor, "texels 1"]
+    within: ViewBudget | None
+    views_per_step: int | None
+
+    def begin(self, point: Point, step: int) -> Point:
+        """The point that ``step`` starts from: a random one where it is the first of a run that begins so."""
+        run, pace = self.schedule.pace(step)
+        if pace.done or not (run or self.schedule.random_start):
+            return point
+        delta = self._at_random(run).to(self.box.texture.device) * self.movable
+        kept = {name: value for name, value in _mine(point.memory).items() if name != WAKES}
+        return Point(self._in_view(self.box.project(delta)), kept)
+
+    def look(self, point: Point, step: int) -> tuple[Look, Point]:
+        """What the step sees from ``point``, and the point with that kept in mind."""
+        batches = self.objective.surrogate.batches
+        nothing = torch.zeros(sum(map(len, batches)), dtype=torch.long, device=point.delta.device)
+        wakes = point.memory.get(WAKES, nothing)
+        at = OPTIMISERS[self.optimiser].looks_at(point, self.schedule.pace(step)[1], self.box)
+        look = self.objective.look(at, self.schedule.drawn(batches, self.views_per_step, step), wakes <= step)
+        wakes = wakes.index_fill(0, look.settled, step + 1 + REST)
+        seen = torch.tensor(self.shown(point) + look.images)
+        return look, replace(point, memory={**point.memory, WAKES: wakes, SHOWN: seen})
+
+    def shown(self, point: Point) -> int:
+        """Images that each classifier has been shown so far."""
+        return int(point.memory.get(SHOWN, 0))
+
+    def move(self, point: Point, look: Look, step: int) -> Point:
+        """The point after ``step``. Where nothing pulls, the same one; at the end of all runs, the best one."""
+        _, pace = self.schedule.pace(step)
+        pull = look.gradient.mul_(self.movable)
+        if pull.any():
+            mine, its = _mine(point.memory), _its(point.memory)
+            moved = OPTIMISERS[self.optimiser].step(Point(point.delta, its), pull, look.loss, pace, self.box)
+            point = Point(self._in_view(moved.delta), {**mine, **moved.memory})
+        return self._ended(point, step) if pace.done + 1 == pace.length else point
+
+    def _in_view(self, delta: Flat) -> Flat:
+        return delta if self.within is None else self.within.project(delta)
+
+    def _at_random(self, run: int) -> Flat:
+        """Uniform in the budget, zero-mean, the same for the same seed and run."""
+        epsilon = self.box.budget.epsilon
+        number = int(np.random.SeedSequence([self.schedule.seed, run, BEGIN]).generate_state(1)[0])
+        generator = torch.Generator().manual_seed(number)
+        return torch.empty(self.box.texture.shape).uniform_(-epsilon, epsilon, generator=generator)
+
+    def _ended(self, point: Point, step: int) -> Point:
+        """A run is over: keep the better of what it found and what was found before."""
+        found = [point.delta, point.memory["best"]] if "best" in point.memory else [point.delta]
+        if len(found) == 1 and not self.schedule.restarts:
+            return point
+        losses = [self.objective.loss(delta) for delta in found]
+        if BEST in point.memory:
+            found, losses = [point.memory[BEST], *found], [float(point.memory[BEST_LOSS]), *losses]
+        loss, best = max(zip(losses, found, strict=True), key=lambda pair: pair[0])
+        kept = {**_mine(point.memory), BEST: best, BEST_LOSS: torch.tensor(loss, dtype=torch.float64)}
+        return Point(best, kept) if step + 1 == self.schedule.total else Point(point.delta, kept)
+
+
+def _mine(memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """What the search remembers."""
+    return {name: value for name, value in memory.items() if name.startswith("search.")}
+
+
+def _its(memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """What the method remembers."""
+    return {name: value for name, value in memory.items() if not name.startswith("search.")}
