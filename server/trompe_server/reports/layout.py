@@ -4,7 +4,7 @@ import unicodedata
 from collections.abc import Sequence
 from functools import cache
 from math import ceil
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,22 +12,30 @@ from PIL import Image, ImageDraw, ImageFont
 
 __all__ = [
     "CAPTION",
+    "GAP",
     "GREEN",
     "INK",
     "MARGIN",
     "PAPER",
     "RED",
+    "Align",
+    "Colour",
     "beside",
     "captioned",
     "framed",
+    "line",
     "printable",
     "sheet",
     "shortened",
+    "stacked",
+    "swatch",
+    "text_width",
     "tile",
 ]
 
 Images = NDArray[np.uint8]
 Colour = tuple[int, int, int]
+Align = Literal["left", "centre", "right"]
 
 MARGIN: Final = 24
 GAP: Final = 8
@@ -67,6 +75,31 @@ def shortened(text: str, width: int, *, size: int) -> str:
     return text.rstrip() + "..."
 
 
+def text_width(text: str, *, size: int) -> int:
+    """How wide ``text`` is in letters of ``size``, as far as they can be printed."""
+    return ceil(_font(size).getlength(printable(text)))
+
+
+def line(
+    text: str, width: int, *, size: int = CAPTION, colour: Colour = INK, ground: Colour = PAPER, align: Align = "left"
+) -> Image.Image:
+    """One line of text, shortened to ``width``, which is the picture's."""
+    picture = Image.new("RGB", (width, size + GAP), ground)
+    text = shortened(text, width, size=size)
+    room = width - int(_font(size).getlength(text))
+    x = {"left": 0, "centre": room // 2, "right": room}[align]
+    ImageDraw.Draw(picture).text((x, GAP // 2), text, font=_font(size), fill=colour)
+    return picture
+
+
+def swatch(ground: Colour, *, outline: Colour | None = None) -> Image.Image:
+    """A small square of a colour, to stand before a ``line`` of a legend."""
+    picture = Image.new("RGB", (CAPTION, CAPTION + GAP), PAPER)
+    square = (0, GAP // 2, CAPTION - 1, GAP // 2 + CAPTION - 1)
+    ImageDraw.Draw(picture).rectangle(square, fill=ground, outline=outline or ground, width=2)
+    return picture
+
+
 def tile(image: Images, width: int) -> Image.Image:
     """An (H, W, 3) image scaled to ``width``: smoothly when it shrinks, in visible pixels when it grows."""
     picture = Image.fromarray(np.ascontiguousarray(image))
@@ -85,12 +118,7 @@ def framed(picture: Image.Image, colour: Colour, *, thickness: int) -> Image.Ima
 
 def captioned(picture: Image.Image, text: str, *, colour: Colour = INK) -> Image.Image:
     """The picture with one centred line under it, shortened to the picture's width."""
-    card = Image.new("RGB", (picture.width, picture.height + CAPTION + GAP), PAPER)
-    card.paste(picture, (0, 0))
-    text = shortened(text, picture.width, size=CAPTION)
-    x = (picture.width - int(_font(CAPTION).getlength(text))) // 2
-    ImageDraw.Draw(card).text((x, picture.height + GAP // 2), text, font=_font(CAPTION), fill=colour)
-    return card
+    return stacked([picture, line(text, picture.width, colour=colour, align="centre")], gap=0)
 
 
 def beside(pictures: Sequence[Image.Image], *, gap: int = GAP) -> Image.Image:
@@ -104,19 +132,29 @@ def beside(pictures: Sequence[Image.Image], *, gap: int = GAP) -> Image.Image:
     return row
 
 
-def sheet(cards: Sequence[Image.Image], *, columns: int, title: str) -> Image.Image:
-    """Cards of one width in rows of ``columns``, under a title. Raises ``ValueError`` when there is no card."""
+def stacked(pictures: Sequence[Image.Image], *, gap: int = GAP) -> Image.Image:
+    """Pictures one under the other, left sides aligned."""
+    height = sum(picture.height for picture in pictures) + gap * (len(pictures) - 1)
+    column = Image.new("RGB", (max(picture.width for picture in pictures), height), PAPER)
+    y = 0
+    for picture in pictures:
+        column.paste(picture, (0, y))
+        y += picture.height + gap
+    return column
+
+
+def sheet(cards: Sequence[Image.Image], *, columns: int, title: str, legend: Image.Image | None = None) -> Image.Image:
+    """Cards of one width in rows of ``columns``, under a title and what explains them.
+
+    Raises ``ValueError`` when there is no card.
+    """
     if not cards:
         raise ValueError("a sheet needs at least one view or texture")
     rows = [beside(cards[start : start + columns], gap=3 * GAP) for start in range(0, len(cards), columns)]
-    font = _font(TITLE)
-    title = shortened(title, max(rows[0].width, LONGEST_TITLE), size=TITLE)
-    width, top = max(rows[0].width, ceil(font.getlength(title))), MARGIN + TITLE + 2 * GAP
-    paper = Image.new(
-        "RGB", (width + 2 * MARGIN, top + sum(row.height + 2 * GAP for row in rows) + MARGIN - 2 * GAP), PAPER
-    )
-    ImageDraw.Draw(paper).text((MARGIN, MARGIN), title, font=font, fill=INK)
-    for row in rows:
-        paper.paste(row, (MARGIN, top))
-        top += row.height + 2 * GAP
+    body = stacked(rows if legend is None else [legend, *rows], gap=2 * GAP)
+    title = shortened(title, max(body.width, LONGEST_TITLE), size=TITLE)
+    width, top = max(body.width, text_width(title, size=TITLE)), MARGIN + TITLE + 2 * GAP
+    paper = Image.new("RGB", (width + 2 * MARGIN, top + body.height + MARGIN), PAPER)
+    ImageDraw.Draw(paper).text((MARGIN, MARGIN), title, font=_font(TITLE), fill=INK)
+    paper.paste(body, (MARGIN, top))
     return paper
