@@ -28,7 +28,7 @@ from bench._common import (
     painted_at_random,
     rescaled,
 )
-from trompe_server.attack import Budget, attack, margin_loss, movable, start
+from trompe_server.attack import Budget, Goal, attack, movable, start
 from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate.calibration import CURVE_GREYS, Calibration, Fidelity, build_surrogate
@@ -109,7 +109,7 @@ def outside_share(work: Work, classifier: WhiteBoxClassifier, shares: list[float
 
     def step() -> None:
         inside.seconds, started = 0.0, time.perf_counter()
-        attack(state, textures, work.surrogate, inside, 0, budget=budget, steps=1, texels=texels)  # type: ignore[arg-type]
+        attack(state, textures, work.surrogate, inside, goal=Goal(0), budget=budget, steps=1, texels=texels)  # type: ignore[arg-type]
         shares.append(1 - inside.seconds / (time.perf_counter() - started))
 
     return step
@@ -121,7 +121,7 @@ def classifier_alone(classifier: WhiteBoxClassifier) -> Callable[[], None]:
     images = torch.rand(BATCH, *classifier.image_size, 3, generator=generator).permute(0, 3, 1, 2).requires_grad_()
 
     def step() -> None:
-        torch.autograd.grad(margin_loss(classifier.logits(images), 0).sum(), images)
+        torch.autograd.grad(Goal(0).losses(classifier.logits(images)).sum(), images)
 
     return step
 

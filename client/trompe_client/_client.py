@@ -1,7 +1,7 @@
 """The synchronous client: carries ``_core``'s requests by httpx, which no other module imports."""
 
 import ipaddress
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +16,7 @@ from trompe_client._job import JobHandle
 from trompe_client._plan import (
     AttackOptions,
     AttackPlan,
+    Sources,
     Upload,
     background_upload,
     classifier_upload,
@@ -54,8 +55,10 @@ class Client:
         *,
         label: str | int,
         classifier: str | Path = "tiny",
-        judges: Sequence[str | Path] = (),
-        background: str | Path = "white",
+        ensemble: Sources = (),
+        judges: Sources = (),
+        background: Sources = "white",
+        masks: Mapping[str, str | Path] | None = None,
         **options: Unpack[AttackOptions],
     ) -> JobHandle:
         """Submit an attack and return at once with a handle on the job.
@@ -63,17 +66,27 @@ class Client:
         Args:
             object: path of a zip, of a folder with an .obj, or of an .obj; or the name or id of a stored object.
             label: the object's true class, a name or an index.
-            classifier: path of a .pt2 or .onnx file; or the name or id of a stored classifier. Class names are read
-                from ``<stem>.classes.json``, ``imagenet_classes.json`` or ``classes.json`` beside the file.
-            judges: classifiers that only judge the result, given like ``classifier``.
-            background: "white", "black", "#rrggbb", or the path of a picture.
-            options: the numbers of the attack, see ``JobSpec``.
+            classifier: path of a .pt2, TorchScript (.pt, .torchscript) or .onnx file; or the name or id of a stored
+                classifier. Class names are read from ``<stem>.classes.json``, ``imagenet_classes.json`` or
+                ``classes.json`` beside the file.
+            ensemble: classifiers that are attacked together with it, given alike.
+            judges: classifiers that only judge the result, given alike.
+            background: "white", "black", "#rrggbb", or the path of a picture; each view draws one of several.
+            masks: by the file name of a texture, the path of a picture of its size that is white where it may change.
+            options: everything else about the attack, see ``JobSpec``.
 
         Raises ``ObjectError``, ``ClassifierError`` or ``SpecError`` for what is wrong on this side, ``APIError`` for
         what the server refuses, ``ServerUnreachable``.
         """
         plan = plan_attack(
-            object, label=label, classifier=classifier, judges=tuple(judges), background=background, **options
+            object,
+            label=label,
+            classifier=classifier,
+            ensemble=ensemble,
+            judges=judges,
+            background=background,
+            masks=masks or {},
+            **options,
         )
         return self.start(plan)
 
@@ -82,8 +95,10 @@ class Client:
         spec = plan.spec(
             object=self._stored_object(plan.object),
             classifier=self._stored_classifier(plan.classifier),
+            ensemble=[self._stored_classifier(member) for member in plan.ensemble],
             judges=[self._stored_classifier(judge) for judge in plan.judges],
-            background=self._stored_background(plan.background),
+            background=[self._stored_background(each) for each in plan.backgrounds],
+            masks={texture: self._stored_background(picture) for texture, picture in plan.masks.items()},
         )
         return self.submit(spec)
 
@@ -121,11 +136,11 @@ class Client:
     def upload_classifier(
         self, source: str | Path, *, classes: list[str] | None = None, name: str | None = None
     ) -> ClassifierInfo:
-        """Store a classifier (.pt2 or .onnx); ``classes`` defaults to the names in a JSON file beside it."""
+        """Store a classifier's file; ``classes`` defaults to the names in a JSON file beside it."""
         return self.send(_core.upload_classifier(classifier_upload(source, classes=classes, name=name)))
 
     def upload_background(self, source: str | Path) -> str:
-        """Store a background picture; gives the id that ``JobSpec.background`` takes."""
+        """Store a picture; gives the id that ``JobSpec.background`` and ``JobSpec.masks`` take."""
         return self.send(_core.upload_background(background_upload(Path(source)))).id
 
     def _stored_object(self, source: Upload | str) -> str:

@@ -3,31 +3,38 @@
 import io
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypedDict, Unpack
 
 from pydantic import ValidationError
 
-from trompe_shared.api import JobSpec, SurrogateModel
+from trompe_shared.api import JobSpec, Loss, Optimiser, SurrogateModel, ViewRanges
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
 
 __all__ = [
     "AttackOptions",
     "AttackPlan",
+    "Sources",
     "Upload",
     "background_source",
     "background_upload",
     "classifier_source",
     "classifier_upload",
+    "mask_upload",
     "object_source",
     "object_upload",
     "plan_attack",
 ]
 
-CLASSIFIER_SUFFIXES: Final = {".pt2", ".onnx"}
+CLASSIFIER_SUFFIXES: Final = (".pt2", ".pt", ".torchscript", ".onnx")
+CLASSIFIER_KINDS: Final = ("torchvision:", "hub:")
+"""How names begin that are looked up elsewhere, whatever they end with."""
 PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
+
+
+Sources = str | Path | Sequence[str | Path]
 
 
 @dataclass(frozen=True)
@@ -45,6 +52,15 @@ class AttackOptions(TypedDict, total=False):
     epsilon: float
     alpha: float
     tau: float | None
+    keep: float | None
+    materials: Sequence[str]
+    epsilon_view: float | None
+    target_label: str | int | None
+    top_k: int
+    loss: Loss
+    optimiser: Optimiser
+    restarts: int
+    queries: int | None
     surrogate: SurrogateModel
     steps: int
     seed: int
@@ -52,26 +68,42 @@ class AttackOptions(TypedDict, total=False):
     elevation: tuple[float, float] | None
     azimuths: int
     elevations: int
-    held_out: int
     pool: int
+    ranges: ViewRanges | Mapping[str, Any]
+    held_out: int
 
 
 @dataclass(frozen=True)
 class AttackPlan:
-    """An attack with its files in hand. Object, classifiers and background are uploads, or names the server knows."""
+    """An attack with its files in hand. Object, classifiers and backgrounds are uploads, or names the server knows.
+
+    ``masks`` are pictures by the texture's file name.
+    """
 
     object: Upload | str
     label: str | int
     classifier: Upload | str
+    ensemble: tuple[Upload | str, ...]
     judges: tuple[Upload | str, ...]
-    background: Upload | str
+    backgrounds: tuple[Upload | str, ...]
+    masks: Mapping[str, Upload]
     options: AttackOptions
 
-    def spec(self, *, object: str, classifier: str, judges: list[str], background: str) -> JobSpec:
+    def spec(
+        self,
+        *,
+        object: str,
+        classifier: str,
+        ensemble: list[str],
+        judges: list[str],
+        background: list[str],
+        masks: dict[str, str],
+    ) -> JobSpec:
         """The job, with the ids that the uploads were given. Raises ``SpecError``."""
-        named: dict[str, Any] = {"object": object, "classifier": classifier, "judges": judges, "background": background}
+        attacked = {"object": object, "label": self.label, "classifier": classifier, "ensemble": ensemble}
+        others = {"judges": judges, "background": background, "masks": masks}
         try:
-            return JobSpec(label=self.label, **named, **self.options)
+            return JobSpec.model_validate(attacked | others | dict(self.options))
         except ValidationError as error:
             wrong = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" if e["loc"] else e["msg"] for e in error.errors()]
             raise SpecError("The attack's options are not right. " + "; ".join(wrong) + ".") from error
@@ -82,17 +114,30 @@ def plan_attack(
     *,
     label: str | int,
     classifier: str | Path,
-    judges: tuple[str | Path, ...],
-    background: str | Path,
+    ensemble: Sources,
+    judges: Sources,
+    background: Sources,
+    masks: Mapping[str, str | Path],
     **options: Unpack[AttackOptions],
 ) -> AttackPlan:
     """Read the files and check the options. Raises ``ObjectError``, ``ClassifierError`` or ``SpecError``."""
-    sources = tuple(classifier_source(judge) for judge in judges)
     plan = AttackPlan(
-        object_source(object), label, classifier_source(classifier), sources, background_source(background), options
+        object_source(object),
+        label,
+        classifier_source(classifier),
+        tuple(classifier_source(each) for each in _each(ensemble)),
+        tuple(classifier_source(each) for each in _each(judges)),
+        tuple(background_source(each) for each in _each(background)),
+        {texture: mask_upload(Path(picture)) for texture, picture in masks.items()},
+        options,
     )
-    plan.spec(object="", classifier="", judges=[], background="")
+    plan.spec(object="", classifier="", ensemble=[], judges=[], background=[""] * len(plan.backgrounds), masks={})
     return plan
+
+
+def _each(sources: Sources) -> Sequence[str | Path]:
+    """One source is a list of one, never its letters."""
+    return [sources] if isinstance(sources, str | Path) else sources
 
 
 def object_source(source: str | Path) -> Upload | str:
@@ -121,8 +166,9 @@ def object_upload(path: Path) -> Upload:
 
 
 def classifier_source(source: str | Path) -> Upload | str:
-    """A .pt2 or .onnx file becomes an upload; any other word is a stored one's name. Raises ``ClassifierError``."""
-    return classifier_upload(source) if Path(source).suffix.lower() in CLASSIFIER_SUFFIXES else str(source)
+    """A file, told by its ending, becomes an upload; any other word is a name. Raises ``ClassifierError``."""
+    is_file = Path(source).suffix.lower() in CLASSIFIER_SUFFIXES and not str(source).startswith(CLASSIFIER_KINDS)
+    return classifier_upload(source) if is_file else str(source)
 
 
 def classifier_upload(source: str | Path, *, classes: list[str] | None = None, name: str | None = None) -> Upload:
@@ -133,7 +179,8 @@ def classifier_upload(source: str | Path, *, classes: list[str] | None = None, n
     path = Path(source)
     if not path.is_file():
         raise ClassifierError(
-            f"There is no classifier file {str(path)!r}. Give a .pt2 or .onnx file, or a stored one's name."
+            f"There is no classifier file {str(path)!r}. Give one that ends in {', '.join(CLASSIFIER_SUFFIXES)}, "
+            "or a stored one's name."
         )
     names = classes if classes is not None else _classes_beside(path)
     form = {"classes": json.dumps(names)} if names is not None else {}
@@ -147,10 +194,17 @@ def background_source(source: str | Path) -> Upload | str:
 
 def background_upload(path: Path) -> Upload:
     """A picture file. Raises ``SpecError`` when there is none."""
+    return _picture(path, "background", "Give a picture file, white, black or '#rrggbb'.")
+
+
+def mask_upload(path: Path) -> Upload:
+    """A picture of a texture's size, white where it may change. Raises ``SpecError`` when there is none."""
+    return _picture(path, "mask", "Give a picture of the texture's size, white where the texture may change.")
+
+
+def _picture(path: Path, use: str, remedy: str) -> Upload:
     if not path.is_file():
-        raise SpecError(
-            f"There is no background picture {str(path)!r}. Give a picture file, white, black or '#rrggbb'."
-        )
+        raise SpecError(f"There is no {use} picture {str(path)!r}. {remedy}")
     return Upload(path.name, path.read_bytes())
 
 

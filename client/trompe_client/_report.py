@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from trompe_client._job import JobHandle
-from trompe_shared.api import Accuracy, ClassifierInfo, ObjectInfo, Result
+from trompe_shared.api import Accuracy, ClassifierInfo, JobSpec, ObjectInfo, Result
 
 __all__ = ["classifiers_table", "jobs_table", "objects_table", "result_report"]
 
@@ -18,6 +18,8 @@ def result_report(result: Result, *, note: str | None = None) -> RenderableType:
     for name, accuracy in _rows(result):
         table.add_row(name, str(accuracy.views), *_cells(accuracy))
     facts = Table.grid(padding=(0, 2))
+    facts.add_column(no_wrap=True)
+    facts.add_column()
     for name, value in _facts(result):
         facts.add_row(name, value)
     notes = [Text(f"n.a.: {note}", style="yellow")] if note else []
@@ -52,25 +54,30 @@ def classifiers_table(classifiers: Sequence[ClassifierInfo]) -> Table:
     """One line per stored classifier."""
     table = _table("name", "id", "use", "input", "classes", "origin")
     for one in classifiers:
-        use = "attack, judge" if one.white_box else "judge"
+        use = "attack, judge" if one.white_box else "judge, attack by scores"
         height, width = one.image_size
         table.add_row(one.name, _short(one.id), use, f"{width}x{height}", str(one.n_classes), _origin(one.shipped))
     return table
 
 
 def _table(*columns: str, right: int = 0) -> Table:
-    """A table; the last ``right`` columns are aligned to the right."""
+    """A table; the last ``right`` columns hold numbers: they are aligned to the right and keep to one line."""
     table = Table()
     for index, name in enumerate(columns):
-        table.add_column(name, justify="right" if index >= len(columns) - right else "left", overflow="fold")
+        number = index >= len(columns) - right
+        table.add_column(name, justify="right" if number else "left", overflow="fold", no_wrap=number)
     return table
 
 
 def _headline(result: Result) -> str:
     label = f"{result.label_name} ({result.label})" if result.label_name else str(result.label)
     tau = "none" if result.tau is None else f"{result.tau:g}"
-    numbers = f"epsilon {result.epsilon:g}, alpha {result.alpha:g}, tau {tau}, {result.steps} steps, seed {result.seed}"
-    return f"{result.object}, class {label}, attacked through {result.classifier}: {numbers}"
+    keep = "" if result.spec.keep is None else f", keep {result.spec.keep:g}"
+    numbers = (
+        f"epsilon {result.epsilon:g}, alpha {result.alpha:g}, tau {tau}{keep}, {result.steps} steps, seed {result.seed}"
+    )
+    through = " and ".join([result.classifier, *(_short(member) for member in result.spec.ensemble)])
+    return f"{result.object}, class {label}, attacked through {through}: {numbers}"
 
 
 def _rows(result: Result) -> Iterator[tuple[str, Accuracy]]:
@@ -90,7 +97,7 @@ def _rows(result: Result) -> Iterator[tuple[str, Accuracy]]:
 def _cells(accuracy: Accuracy) -> list[str]:
     before = _with_interval(accuracy.a_before, accuracy.a_before_interval)
     after = _with_interval(accuracy.a_after, accuracy.a_after_interval)
-    return [before, after, _number(accuracy.a_drop)]
+    return [before, after, _with_interval(accuracy.a_drop, accuracy.a_drop_interval)]
 
 
 def _with_interval(share: float | None, interval: tuple[float, float] | None) -> str:
@@ -98,13 +105,29 @@ def _with_interval(share: float | None, interval: tuple[float, float] | None) ->
 
 
 def _facts(result: Result) -> Iterator[tuple[str, str]]:
+    if result.goal_reached is not None and (result.spec.target_label is not None or result.spec.top_k > 1):
+        yield "goal reached", f"{_percent(result.goal_reached)} of the target views: {_goal(result.spec)}"
     yield "N% (texels altered)", _percent(result.texels_altered)
     yield "mean texel change", _levels(result.mean_texel_change)
     yield "max view change", _levels(result.max_view_change)
+    if result.views_beyond_epsilon is not None and result.pixels_beyond_epsilon is not None:
+        views, pixels = _percent(result.views_beyond_epsilon), f"{result.pixels_beyond_epsilon:.2%}"
+        yield "beyond epsilon", f"{views} of the target views ({pixels} of the object's pixels)"
+    if result.ssim is not None and result.delta_e is not None:
+        yield "what people see", f"SSIM {result.ssim:.3f}, colour difference (CIEDE2000) {result.delta_e:.2f}"
     yield "surrogate model", f"{result.surrogate_model}: {result.surrogate_reason}"
     yield "transfer gap", _number(result.transfer_gap)
     yield "seconds", ", ".join(f"{phase} {seconds:.1f}" for phase, seconds in result.seconds.items())
     yield "probe renders", str(result.probe_renders)
+    if result.evaluations is not None:
+        asked = "" if result.queries is None else f", {result.queries:,} scores asked"
+        yield "images evaluated", f"{result.evaluations:,} by each attacked classifier{asked}"
+
+
+def _goal(spec: JobSpec) -> str:
+    if spec.target_label is None:
+        return f"the true class is not among the {spec.top_k} best"
+    return f"taken for {spec.target_label if isinstance(spec.target_label, str) else f'class {spec.target_label}'}"
 
 
 def _number(value: float | None) -> str:

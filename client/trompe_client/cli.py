@@ -4,8 +4,9 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any, Final, TypeVar, get_args
 
@@ -18,7 +19,7 @@ from trompe_client._embedded import embedded_server
 from trompe_client._job import JobHandle
 from trompe_client._plan import AttackPlan, plan_attack
 from trompe_client._report import classifiers_table, jobs_table, objects_table, result_report
-from trompe_shared.api import JobSpec, JobState, SurrogateModel
+from trompe_shared.api import JobSpec, JobState, Loss, Optimiser, SurrogateModel, ViewRanges
 from trompe_shared.errors import SpecError, TrompeError
 
 __all__ = ["main"]
@@ -114,6 +115,37 @@ def main() -> None:
     """Craft adversarial 3D objects: repaint a texture so that people see the same object and a classifier does not."""
 
 
+class _Option(click.Option):
+    """An option that ``--help`` lists in a section."""
+
+    def __init__(self, *declarations: Any, section: str, **attributes: Any) -> None:
+        super().__init__(*declarations, **attributes)
+        self.section = section
+
+
+class _Sectioned(click.Command):
+    """A command with so many options that ``--help`` lists them by section."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """As click's own, section by section."""
+        options = (each for each in self.get_params(ctx) if isinstance(each, click.Option))
+        for title, section in groupby(options, lambda option: getattr(option, "section", "Server and results")):
+            with formatter.section(title):
+                formatter.write_dl([record for option in section if (record := option.get_help_record(ctx))])
+
+
+def _class(word: str) -> str | int:
+    """A class by its index, else by its name."""
+    return int(word) if word.isdecimal() else word
+
+
+def _mask(word: str) -> tuple[str, str]:
+    texture, equals, picture = word.partition("=")
+    if not (texture and equals and picture):
+        raise click.BadParameter(f"{word!r} should be a texture and a picture of its size: albedo.png=mask.png.")
+    return texture, picture
+
+
 def _server_option(*, required: bool) -> Callable[[F], F]:
     without = DEFAULT_SERVER if required else None
     text = f"Address of a running server (or TROMPE_SERVER). Default: {without or 'start one for this command'}."
@@ -128,59 +160,157 @@ _out_option = click.option(
     help="Folder for the results.",
 )
 
+_networks = partial(click.option, cls=_Option, section="Object and classifiers")
+_change = partial(click.option, cls=_Option, section="What may change")
+_goal = partial(click.option, cls=_Option, section="What the classifier should say")
+_search = partial(click.option, cls=_Option, section="How it is looked for")
+_views = partial(click.option, cls=_Option, section="Views")
 
-@main.command()
+CLASSIFIER: Final = "FILE_OR_NAME"
+RANGES: Final = [name for name in ViewRanges.model_fields if name != "light_colours"]
+GRID: Final = ("azimuths", "elevations")
+
+
+@main.command(cls=_Sectioned)
 @click.argument("object", metavar="OBJECT")
-@click.option("--label", required=True, metavar="NAME_OR_INDEX", help="The object's true class.")
-@click.option("--classifier", default=_default("classifier"), show_default=True, metavar="FILE_OR_NAME", help="Victim.")
-@click.option(
-    "--epsilon", type=float, metavar="E", help=f"Largest change of a texel, 0..1. Default: {_default('epsilon')}."
+@_networks("--label", required=True, type=_class, metavar="NAME_OR_INDEX", help="The object's true class.")
+@_networks(
+    "--classifier",
+    default=_default("classifier"),
+    show_default=True,
+    metavar=CLASSIFIER,
+    help="Victim: a .pt2, TorchScript (.pt) or .onnx file, or a name.",
 )
-@click.option("--alpha", type=float, metavar="A", help="Mean step, 0..1. Default: 0.01, or epsilon / 5 if less.")
-@click.option("--tau", type=float, metavar="T", help="Saliency threshold, 0..1. Default: attack all texels.")
-@click.option("--surrogate", type=click.Choice(get_args(SurrogateModel)), help=f"Default: {_default('surrogate')}.")
-@click.option("--steps", type=int, metavar="N", help=f"Steps of the attack. Default: {_default('steps')}.")
-@click.option("--seed", type=int, metavar="S", help=f"Same seed, same bytes. Default: {_default('seed')}.")
-@click.option(
+@_networks("--ensemble", multiple=True, metavar=CLASSIFIER, help="Another victim, attacked together with it. *")
+@_networks("--judge", "judges", multiple=True, metavar=CLASSIFIER, help="Another classifier, which only judges. *")
+@_change("--epsilon", type=float, metavar="E", help=f"Largest change of a texel, 0..1. Default: {_default('epsilon')}.")
+@_change(
+    "--epsilon-view",
+    type=float,
+    metavar="E",
+    help="Largest change of a pixel of a view, 0..1 (the paper's view constraint). Default: no limit.",
+)
+@_change("--tau", type=float, metavar="T", help="Saliency threshold, 0..1. Default: attack all texels.")
+@_change("--keep", type=float, metavar="SHARE", help="Attack this share of the texels, the most salient. Default: all.")
+@_change(
+    "--material", "materials", multiple=True, metavar="NAME", help="Attack this material only. Default: all of them. *"
+)
+@_change(
+    "--mask",
+    "masks",
+    multiple=True,
+    type=_mask,
+    metavar="TEXTURE=FILE",
+    help="Picture of a texture's size, white where the texture may change. *",
+)
+@_goal(
+    "--target",
+    "target_label",
+    type=_class,
+    metavar="NAME_OR_INDEX",
+    help="The class to be taken for. Default: any but the label.",
+)
+@_goal(
+    "--top-k",
+    type=int,
+    metavar="K",
+    help=f"The true class must leave the K best ones. Default: {_default('top_k')}.",
+)
+@_goal("--loss", type=click.Choice(get_args(Loss)), help=f"Default: {_default('loss')}.")
+@_search("--alpha", type=float, metavar="A", help="Mean step, 0..1. Default: 0.01, or epsilon / 5 if less.")
+@_search("--steps", type=int, metavar="N", help=f"Steps of the attack. Default: {_default('steps')}.")
+@_search("--optimiser", type=click.Choice(get_args(Optimiser)), help=f"Default: {_default('optimiser')}.")
+@_search(
+    "--restarts",
+    type=int,
+    metavar="N",
+    help=f"Further runs, which share the steps. Default: {_default('restarts')}.",
+)
+@_search(
+    "--queries",
+    type=int,
+    metavar="N",
+    help="Scores asked per image and step, an even number; only for a classifier without gradients (.onnx).",
+)
+@_search("--surrogate", type=click.Choice(get_args(SurrogateModel)), help=f"Default: {_default('surrogate')}.")
+@_search("--seed", type=int, metavar="S", help=f"Same seed, same bytes. Default: {_default('seed')}.")
+@_views(
     "--distance",
     type=float,
     metavar="D",
     help="Camera's, metres. Default: a shipped object's own, or to fit.",
 )
-@click.option(
+@_views(
     "--elevation",
     type=float,
     nargs=2,
     metavar="LO HI",
     help="Range of the camera's, degrees. Default: a shipped object's own, else 0 50.",
 )
-@click.option(
+@_views(
     "--background",
-    default=_default("background"),
+    multiple=True,
+    default=JobSpec.model_fields["background"].get_default(),
     show_default=True,
     metavar="COLOUR_OR_FILE",
-    help="Behind the object.",
+    help="Behind the object: white, black, #rrggbb or a picture; each view draws one of several. *",
 )
-@click.option(
+@_views(
     "--pool",
     type=int,
     metavar="N",
-    help="Attack N random cameras and lights (240 is a good number) in place of the paper's grid of 60 views.",
+    help=f"Attack N random cameras and lights; 0 for the paper's grid. Default: {_default('pool')}.",
 )
-@click.option("--judge", "judges", multiple=True, metavar="FILE_OR_NAME", help="Another classifier, which only judges.")
+@_views(
+    "--range",
+    "ranges",
+    multiple=True,
+    type=(click.Choice(RANGES), float, float),
+    metavar="NAME LO HI",
+    help=f"What random views are drawn from: {', '.join(RANGES)}; angles in degrees. *",
+)
+@_views(
+    "--held-out",
+    type=int,
+    metavar="N",
+    help=f"Random views that the attack does not see, to judge it on. Default: {_default('held_out')}.",
+)
+@_views(
+    "--grid",
+    is_flag=True,
+    help=f"Attack the paper's grid of views, {_default('azimuths')} azimuths by {_default('elevations')} elevations, "
+    "in place of random ones.",
+)
+@_views("--azimuths", type=int, metavar="N", help=f"Columns of the grid. Default: {_default('azimuths')}.")
+@_views("--elevations", type=int, metavar="N", help=f"Rows of the grid. Default: {_default('elevations')}.")
 @_server_option(required=False)
 @_out_option
-def attack(server: str | None, out: Path, label: str, judges: tuple[str, ...], **options: Any) -> None:
-    """Attack OBJECT: a zip, a folder with an .obj, an .obj file, or the name of a stored object."""
-    given = {name: value for name, value in options.items() if value is not None}
+def attack(server: str | None, out: Path, **options: Any) -> None:
+    """Attack OBJECT: a zip, a folder with an .obj, an .obj file, or the name of a stored object.
+
+    An option marked * can be given several times.
+    """
     try:
-        plan = plan_attack(label=int(label) if label.isdecimal() else label, judges=judges, **given)
+        plan = plan_attack(**_job_options(**options))
     except SpecError as error:
         raise click.UsageError(str(error)) from error
     out.mkdir(parents=True, exist_ok=True)
     with _service(server) as client:
         job = _attack(client, plan, server)
         _deliver(job, out, source=options["object"])
+
+
+def _job_options(
+    *, grid: bool, masks: tuple[tuple[str, str], ...], ranges: tuple[tuple[str, float, float], ...], **options: Any
+) -> dict[str, Any]:
+    """What was given on the command line, as ``plan_attack`` takes it. Raises ``SpecError``."""
+    given = {name: value for name, value in options.items() if value is not None}
+    given |= {"masks": dict(masks), "ranges": {name: (low, high) for name, low, high in ranges}}
+    if grid and given.setdefault("pool", 0):
+        raise SpecError("--grid attacks the paper's grid and --pool random views in its place: choose one.")
+    if given.get("pool", JobSpec.model_fields["pool"].get_default()) and any(name in given for name in GRID):
+        raise SpecError("--azimuths and --elevations shape the paper's grid of views: add --grid.")
+    return given
 
 
 def _attack(client: Client, plan: AttackPlan, server: str | None) -> JobHandle:

@@ -6,37 +6,40 @@ attack-NNN  some steps of the attack in the surrogate
 judge       the 8-bit texture goes back into the target; report
 """
 
-import json
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from functools import cached_property
-from typing import Any, Final
+from functools import cached_property, partial
+from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from trompe_server.array_files import pack_arrays, unpack_arrays
 from trompe_server.attack import (
     AttackState,
     Budget,
     Step,
+    TexelMasks,
     attack,
-    load_state,
+    best_texels,
+    image_gradients,
     movable,
+    rank_texels,
     saliency,
     saliency_masks,
-    save_state,
     start,
 )
-from trompe_server.attack_report import Evidence, public_files
+from trompe_server.attack_report import Evidence, public_files, saliency_views
 from trompe_server.calibration_files import calibration_key, pack_calibration, unpack_calibration
+from trompe_server.job_files import JobFiles
 from trompe_server.library import Library
 from trompe_server.pipeline import Artifacts, OnProgress, PhaseReport
+from trompe_server.reports import heat_textures
 from trompe_server.scene import Scene, open_scene
-from trompe_server.surrogate import Surrogate, textures_of
+from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate.calibration import Calibration, build_surrogate, calibrate
 from trompe_server.target import TargetRenderer
 from trompe_shared.api import JobSpec, JobState, Progress
@@ -75,12 +78,13 @@ class AttackJob:
 
     def __init__(self, spec: JobSpec, scene: Scene, artifacts: Artifacts, calibrations: Artifacts) -> None:
         self.spec, self.scene, self.artifacts, self.calibrations = spec, scene, artifacts, calibrations
-        self.budget = Budget(spec.epsilon, spec.alpha)
+        self.files = JobFiles(artifacts, chunks=-(-spec.steps // CHUNK))
+        self._geometry: Future[Geometry] | None = None
+        self.budget = Budget(spec.epsilon, spec.alpha, spec.epsilon_view)
 
     def phases(self) -> list[str]:
         """See ``Pipeline.phases``."""
-        chunks = range(-(-self.spec.steps // CHUNK))
-        return ["prepare", "calibrate", *(f"attack-{chunk:03d}" for chunk in chunks), "judge"]
+        return self.files.phases
 
     def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
         """See ``Pipeline.run``."""
@@ -91,7 +95,7 @@ class AttackJob:
         else:
             work = {"prepare": self._prepare, "calibrate": self._calibrate, "judge": self._judge}[kind]
             report = work(on_progress)
-        self._note_seconds(phase, time.perf_counter() - self._running[1])
+        self.files.note_seconds(phase, time.perf_counter() - self._running[1])
         return report
 
     def _prepare(self, on_progress: OnProgress) -> PhaseReport:
@@ -99,8 +103,10 @@ class AttackJob:
         total = len(scene.views) + len(scene.held_out)
         ask = self._asker("prepare", total, on_progress)
         own = ask(scene.obj, scene.views)
-        self._save("clean", own=own, held_out=ask(scene.obj, scene.held_out))
-        self._save("saliency", maps=saliency(own, scene.classifier, scene.label).numpy().astype(np.float16))
+        self.files.save("clean", own=own, held_out=ask(scene.obj, scene.held_out))
+        if scene.white_box:
+            self.files.save("saliency", maps=saliency(own, scene.members, goal=scene.goal).numpy().astype(np.float16))
+            _ = self._masks  # a tau that leaves nothing is told before more is asked
         if (scene.classifier.predict(own).argmax(axis=1) != scene.label).all():
             return self._end_without_attack()
         return PhaseReport(_progress("prepare", 1.0))
@@ -116,8 +122,8 @@ class AttackJob:
         return PhaseReport(_progress("judge", 1.0), JobState.not_applicable, note, public)
 
     def _calibrate(self, on_progress: OnProgress) -> PhaseReport:
-        if not self.artifacts.exists("calibration.npz"):
-            clean = self._load("clean")["own"]
+        if not self.files.has("calibration"):
+            clean = self.files.load("clean")["own"]
             name = f"{self._calibration_key(clean)}.npz"
             found = self._known_calibration(name)
             if found is None:
@@ -130,9 +136,7 @@ class AttackJob:
 
     def _calibration_key(self, clean: Image8) -> str:
         scene, spec = self.scene, self.spec
-        return calibration_key(
-            scene.obj, scene.views, clean, wanted=spec.surrogate, seed=spec.seed, backdrop=scene.backdrop
-        )
+        return calibration_key(scene.obj, scene.views, clean, wanted=spec.surrogate, seed=spec.seed)
 
     def _known_calibration(self, name: str) -> Calibration | None:
         """What an earlier job found out by the same questions; a damaged file counts as none."""
@@ -156,15 +160,25 @@ class AttackJob:
             ask,
             wanted=self.spec.surrogate,
             generator=np.random.default_rng([self.spec.seed, PROBE_STREAM]),
-            backdrop=scene.backdrop,
+            backdrops=scene.backdrops,
+            on_sampling=self._prepare_beside,
         )
 
+    def _prepare_beside(self, sampling: SamplingModel) -> None:
+        """Rasterise all views while the renderer is busy with the probes."""
+        scene = self.scene
+        executor = ThreadPoolExecutor(1, thread_name_prefix="rasterise")
+        prepare = partial(prepare_geometry, scene.obj, scene.views, size=scene.size, sampling=sampling)
+        self._geometry = executor.submit(prepare)
+        executor.shutdown(wait=False)
+
     def _attack(self, chunk: int, on_progress: OnProgress) -> PhaseReport:
-        before = load_state(self.artifacts.read(_state(chunk))) if chunk else start(self._textures)
-        last = Progress()
+        before = self.files.load_state(chunk) if chunk else start(self._textures)
+        last, evaluations, asked = Progress(), 0, self.scene.queries or 0
 
         def on_step(step: Step) -> None:
-            nonlocal last
+            nonlocal last, evaluations
+            evaluations = step.evaluations
             share = (step.step + 1) / self.spec.steps
             last = _progress("attack", share).model_copy(
                 update={"step": step.step + 1, "steps": self.spec.steps, "loss": step.loss, "fooled": step.fooled}
@@ -172,7 +186,8 @@ class AttackJob:
             on_progress(last)
 
         steps = min(CHUNK, self.spec.steps - before.step)
-        self.artifacts.write(_state(chunk + 1), save_state(self._ascend(before, steps, on_step)))
+        self.files.save_state(chunk + 1, self._ascend(before, steps, on_step))
+        self.files.note_spent(chunk, evaluations=evaluations, queries=(self.scene.queries or 0) - asked)
         return PhaseReport(last)
 
     def _ascend(self, state: AttackState, steps: int, on_step: Callable[[Step], None]) -> AttackState:
@@ -181,11 +196,13 @@ class AttackJob:
             state,
             self._textures,
             self._surrogate,
-            scene.classifier,
-            scene.label,
+            scene.members,
+            goal=scene.goal,
             budget=self.budget,
             steps=steps,
             total_steps=self.spec.steps,
+            optimiser=self.spec.optimiser,
+            restarts=self.spec.restarts,
             masks=masks,
             texels=self._movable,
             views_per_step=VIEWS_PER_STEP if self.spec.pool else None,
@@ -195,27 +212,32 @@ class AttackJob:
 
     def _judge(self, on_progress: OnProgress) -> PhaseReport:
         scene = self.scene
-        deltas = load_state(self.artifacts.read(_state(len(self.phases()) - 3))).deltas
-        painted = scene.obj.with_textures(
-            {n: self.budget.quantise(d, torch.from_numpy(scene.obj.textures[n])).numpy() for n, d in deltas.items()}
-        )
+        deltas = self.files.load_state(self.files.chunks).deltas
+        painted = self.budget.repaint(scene.obj, deltas)
         ask = self._asker("judge", len(scene.views) + len(scene.held_out), on_progress)
-        self._save("after", own=ask(painted, scene.views), held_out=ask(painted, scene.held_out))
+        self.files.save("after", own=ask(painted, scene.views), held_out=ask(painted, scene.held_out))
+        if self._scores is not None:
+            hot = scene.obj.with_textures(heat_textures(scene.obj.textures, _numpy(self._scores)))
+            self.files.save("hot", images=ask(hot, [scene.views[index] for index in saliency_views(scene)]))
         public = public_files(self._evidence(painted), self.artifacts, warnings=())
         return PhaseReport(_progress("judge", 1.0), JobState.succeeded, None, public)
 
     def _evidence(self, painted: Object3D | None) -> Evidence:
         """What the report is written from; ``painted`` is ``None`` when there was no attack."""
+        kind, started = self._running
         return Evidence(
             spec=self.spec,
             scene=self.scene,
-            before=self._load("clean"),
-            after=self._load("after") if painted is not None else None,
+            before=self.files.load("clean"),
+            after=self.files.load("after") if painted is not None else None,
             painted=painted,
-            maps=self._load("saliency")["maps"].astype(np.float32),
+            maps=None if self._maps is None else self._maps.numpy(),
+            scores=None if painted is None or self._scores is None else _numpy(self._scores),
+            hot=self.files.load("hot")["images"] if self.files.has("hot") else None,
             surrogate=self._surrogate if painted is not None else None,
             calibration=self._calibration if painted is not None else None,
-            seconds=self._seconds(),
+            **self.files.spent(),
+            seconds=self.files.seconds() | {kind: time.perf_counter() - started},
         )
 
     @cached_property
@@ -228,18 +250,35 @@ class AttackJob:
 
     @cached_property
     def _surrogate(self) -> Surrogate:
-        scene, clean = self.scene, self._load("clean")["own"]
-        return build_surrogate(self._calibration, scene.obj, scene.views, clean, backdrop=scene.backdrop)
+        scene, clean = self.scene, self.files.load("clean")["own"]
+        geometry = self._geometry.result() if self._geometry is not None else None
+        return build_surrogate(
+            self._calibration, scene.obj, scene.views, clean, geometry=geometry, backdrops=scene.backdrops
+        )
+
+    @cached_property
+    def _maps(self) -> torch.Tensor | None:
+        """Saliency of the target's images (views, H, W); ``None`` where the classifier gives no gradients."""
+        if not self.scene.white_box:
+            return None
+        return torch.from_numpy(self.files.load("saliency")["maps"].astype(np.float32))
 
     @cached_property
     def _masks(self) -> torch.Tensor | None:
-        if self.spec.tau is None:
-            return None
-        return saliency_masks(torch.from_numpy(self._load("saliency")["maps"].astype(np.float32)), self.spec.tau)
+        return None if self.spec.tau is None or self._maps is None else saliency_masks(self._maps, self.spec.tau)
 
     @cached_property
-    def _movable(self) -> dict[str, torch.Tensor]:
-        return dict(movable(self._surrogate, self.budget, self._masks))
+    def _scores(self) -> Mapping[str, torch.Tensor] | None:
+        """Saliency accumulated per texel."""
+        return None if self._maps is None else rank_texels(self._surrogate, self._textures, self._maps)
+
+    @cached_property
+    def _movable(self) -> TexelMasks:
+        within = list(self.scene.within)
+        if self.spec.keep is not None:
+            gradients = image_gradients(self.files.load("clean")["own"], self.scene.members, goal=self.scene.goal)
+            within.append(best_texels(rank_texels(self._surrogate, self._textures, gradients), self.spec.keep))
+        return movable(self._surrogate, self.budget, self._masks, within=within)
 
     def _asker(self, phase: str, total: int, on_progress: OnProgress) -> Callable[[Object3D, Sequence[View]], Image8]:
         """Asks the target for images and tells how far the phase is; ``total`` images are the whole of it."""
@@ -255,29 +294,9 @@ class AttackJob:
 
         return ask
 
-    def _save(self, name: str, **arrays: NDArray[Any]) -> None:
-        self.artifacts.write(f"{name}.npz", pack_arrays(arrays))
 
-    def _load(self, name: str) -> dict[str, NDArray[Any]]:
-        return unpack_arrays(self.artifacts.read(f"{name}.npz"))
-
-    def _note_seconds(self, phase: str, seconds: float) -> None:
-        self.artifacts.write(f"seconds-{phase}.json", json.dumps(seconds).encode())
-
-    def _seconds(self) -> dict[str, float]:
-        """Seconds of the phases that are done, those of all attack phases together, and of the one that runs."""
-        seconds: dict[str, float] = {}
-        for phase in self.phases():
-            if self.artifacts.exists(f"seconds-{phase}.json"):
-                kind = phase.partition("-")[0]
-                seconds[kind] = seconds.get(kind, 0.0) + json.loads(self.artifacts.read(f"seconds-{phase}.json"))
-        kind, started = self._running
-        return seconds | {kind: time.perf_counter() - started}
-
-
-def _state(chunk: int) -> str:
-    """Name of the checkpoint after ``chunk`` chunks. Two take turns: the one a chunk starts from outlives it."""
-    return f"state-{chunk % 2}.npz"
+def _numpy(scores: Mapping[str, torch.Tensor]) -> dict[str, NDArray[np.float32]]:
+    return {name: score.detach().cpu().numpy() for name, score in scores.items()}
 
 
 def _progress(phase: str, share: float) -> Progress:

@@ -1,7 +1,8 @@
 """The report of a job: ``result.json``, the pictures, and the repainted object."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from typing import Any, Final
@@ -9,33 +10,42 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 from trompe_server.attack.metrics import (
     accuracy,
+    drop_warning,
     max_view_change,
     mean_texel_change,
+    predicted_classes,
+    share_beyond,
     softmax,
     texels_altered,
     transfer_gap,
     view_predictions,
 )
+from trompe_server.attack.perceptual import object_pixels, perceived_change, total_variation
 from trompe_server.classifiers import Classifier
 from trompe_server.pipeline import Artifacts
 from trompe_server.reports import (
     Verdict,
     contact_sheet,
     difference_strip,
+    prediction_histogram,
     representative,
+    saliency_object_sheet,
     saliency_sheet,
+    saliency_texture_sheet,
     texture_sheet,
 )
 from trompe_server.scene import Scene
 from trompe_server.surrogate import Surrogate, textures_of
 from trompe_server.surrogate.calibration import MAX_ERROR, MIN_EXPLAINED, Calibration
 from trompe_shared.api import Accuracy, JobSpec, Judgement, Result
+from trompe_shared.geometry import Camera
 from trompe_shared.object3d import Object3D, encode_png
 
-__all__ = ["Evidence", "public_files"]
+__all__ = ["Evidence", "public_files", "saliency_views"]
 
 Images = Mapping[str, NDArray[np.uint8]]
 """Target images (views, H, W, 3) of the attack's ``own`` views and of the ``held_out`` ones."""
@@ -43,7 +53,6 @@ Images = Mapping[str, NDArray[np.uint8]]
 SHEET_VIEWS: Final = 12
 SALIENCY_VIEWS: Final = 6
 DIFFERENCE_VIEWS: Final = 4
-FEW_RECOGNISED: Final = 0.3
 POOR_VIEW: Final = 3.0 / 255
 NAMED_VIEWS: Final = 5
 
@@ -57,9 +66,16 @@ class Evidence:
     before: Images
     after: Images | None
     painted: Object3D | None
-    maps: NDArray[np.float32]
+    maps: NDArray[np.float32] | None
+    """Saliency of the own views (views, H, W); this and what is made of it: ``None`` without gradients."""
+    scores: Mapping[str, NDArray[np.float32]] | None
+    """Saliency accumulated per texel (H, W)."""
+    hot: NDArray[np.uint8] | None
+    """The target's images, of ``saliency_views``, of the object painted with ``scores`` as heat."""
     surrogate: Surrogate | None
     calibration: Calibration | None
+    evaluations: int | None
+    queries: int | None
     seconds: Mapping[str, float]
 
     @cached_property
@@ -92,6 +108,7 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
     surrogate = _surrogate_accuracy(evidence)
     painted, after = evidence.painted, evidence.logits_after or {}
     return Result(
+        spec=spec,
         object=scene.object_name,
         label=scene.label,
         label_name=scene.class_name(scene.label) if scene.classifier.classes else None,
@@ -106,7 +123,10 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
         **_calibration_fields(evidence),
         texels_altered=texels_altered(scene.obj.textures, painted.textures) if painted else None,
         mean_texel_change=mean_texel_change(scene.obj.textures, painted.textures) if painted else None,
-        max_view_change=_max_view_change(evidence),
+        **_view_changes(evidence),
+        goal_reached=_goal_reached(evidence),
+        evaluations=evidence.evaluations,
+        queries=evidence.queries,
         warnings=[*warnings, *_warnings(evidence, target)],
         seconds={name: round(seconds, 3) for name, seconds in evidence.seconds.items()},
         versions={name: version(name) for name in ("trompe", "torch", "numpy", "pyrender", "onnxruntime")},
@@ -120,6 +140,13 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
 def _accuracy(evidence: Evidence, views: str) -> Accuracy:
     after = None if evidence.logits_after is None else evidence.logits_after[views]
     return accuracy(evidence.logits_before[views], after, evidence.scene.label)
+
+
+def _goal_reached(evidence: Evidence) -> float | None:
+    """Share of the own target views on which the classifier says what the attack wanted."""
+    if evidence.logits_after is None:
+        return None
+    return float(evidence.scene.goal.reached(torch.from_numpy(evidence.logits_after["own"])).float().mean())
 
 
 def _surrogate_accuracy(evidence: Evidence) -> Accuracy | None:
@@ -163,20 +190,35 @@ def _calibration_fields(evidence: Evidence) -> dict[str, Any]:
     }
 
 
-def _max_view_change(evidence: Evidence) -> float | None:
-    """Largest change of a pixel over all target views, the paper's constraint on the images."""
-    if evidence.after is None:
-        return None
-    sets = (evidence.before, evidence.after)
-    return max_view_change(*(np.concatenate([images["own"], images["held_out"]]) for images in sets))
+def _view_changes(evidence: Evidence) -> dict[str, Any]:
+    """How the target's images changed, over all views: by the paper's constraint, and as people see it."""
+    if evidence.after is None or evidence.painted is None:
+        return {"max_view_change": None}
+    scene = evidence.scene
+    before, after = (np.concatenate([each["own"], each["held_out"]]) for each in (evidence.before, evidence.after))
+    pixels = object_pixels(before, after, _behind(scene))
+    beyond = share_beyond(before, after, pixels, epsilon=evidence.spec.epsilon)
+    seen = perceived_change(before, after, pixels)
+    return {
+        "max_view_change": max_view_change(before, after),
+        "pixels_beyond_epsilon": beyond[0],
+        "views_beyond_epsilon": beyond[1],
+        "texture_variation": total_variation(scene.obj.textures, evidence.painted.textures),
+        **({} if seen is None else asdict(seen)),
+    }
+
+
+def _behind(scene: Scene) -> NDArray[np.uint8]:
+    """What stands behind the object in each view, own ones first, (views, H, W, 3)."""
+    views = (*scene.views, *scene.held_out)
+    behind = np.empty((len(views), *scene.size, 3), np.uint8)
+    for image, view in zip(behind, views, strict=True):
+        image[:] = view.background if view.backdrop is None else scene.backdrops[view.backdrop]
+    return behind
 
 
 def _warnings(evidence: Evidence, target: Accuracy) -> list[str]:
-    found = []
-    if 0 < target.a_before < FEW_RECOGNISED:
-        found.append(
-            f"Only {target.a_before:.0%} of the views were recognised before the attack: A_drop rests on few views."
-        )
+    found = [warning] if target.a_before > 0 and (warning := drop_warning(target)) else []
     calibration = evidence.calibration
     if calibration is not None and calibration.model != "diffuse" and not calibration.fidelity.good_enough:
         mean = calibration.fidelity.mean()
@@ -206,36 +248,78 @@ def _poor_views(evidence: Evidence) -> list[str]:
     return [f"The surrogate is off by more than {255 * POOR_VIEW:.0f}/255 on views {'; '.join(named)}{more}."]
 
 
+def saliency_views(scene: Scene) -> NDArray[np.int64]:
+    """The views whose saliency is shown."""
+    distinct = _distinct(scene)
+    return distinct[representative(len(distinct), SALIENCY_VIEWS)]
+
+
 def _pictures(evidence: Evidence) -> dict[str, bytes]:
     scene = evidence.scene
-    own = evidence.before["own"]
-    title = f"{scene.object_name} as {scene.class_name(scene.label).split(',')[0]!r}, {scene.classifier.name}"
-    distinct = _distinct(scene)
-    some = distinct[representative(len(distinct), SALIENCY_VIEWS)]
-    maps = evidence.maps[some]
-    sheets = {
-        "saliency.png": saliency_sheet(own[some], maps, tau=evidence.spec.tau, title=f"Saliency of {title}", columns=3)
-    }
+    title = f"{scene.object_name} as {_short_name(scene, scene.label)!r}, {scene.classifier.name}"
+    sheets = _saliency(evidence, f"Saliency of {title}")
     if evidence.after is not None and evidence.painted is not None:
-        shown = distinct[representative(len(distinct), SHEET_VIEWS)]
-        sheets["contact_sheet.png"] = contact_sheet(
-            own[shown],
-            evidence.after["own"][shown],
-            _verdicts(evidence.logits_before["own"][shown], scene),
-            _verdicts((evidence.logits_after or {})["own"][shown], scene),
-            title=f"{title}, epsilon {evidence.spec.epsilon:g}",
-        )
-        few = distinct[representative(len(distinct), DIFFERENCE_VIEWS)]
-        sheets["difference.png"] = difference_strip(own[few], evidence.after["own"][few], title=title)
-        sheets["textures.png"] = texture_sheet(scene.obj.textures, evidence.painted.textures, title=title)
+        sheets |= _before_and_after(evidence, evidence.after, evidence.painted, title)
     return {name: encode_png(sheet) for name, sheet in sheets.items()}
+
+
+def _saliency(evidence: Evidence, title: str) -> dict[str, Image.Image]:
+    """On some views, and where there was an attack on the texture and the object too; none without gradients."""
+    scene, maps = evidence.scene, evidence.maps
+    if maps is None:
+        return {}
+    some = saliency_views(scene)
+    own = evidence.before["own"][some]
+    sheets = {"saliency.png": saliency_sheet(own, maps[some], tau=evidence.spec.tau, title=title, columns=3)}
+    if evidence.scores is not None and evidence.hot is not None:
+        sheets["saliency_textures.png"] = saliency_texture_sheet(scene.obj.textures, evidence.scores, title=title)
+        sheets["saliency_object.png"] = saliency_object_sheet(own, maps[some], evidence.hot, title=title)
+    return sheets
+
+
+def _before_and_after(evidence: Evidence, after: Images, painted: Object3D, title: str) -> dict[str, Image.Image]:
+    scene, own = evidence.scene, evidence.before["own"]
+    logits_before, logits_after = evidence.logits_before["own"], (evidence.logits_after or {})["own"]
+    distinct = _distinct(scene)
+    shown = distinct[representative(len(distinct), SHEET_VIEWS)]
+    few = distinct[representative(len(distinct), DIFFERENCE_VIEWS)]
+    return {
+        "contact_sheet.png": contact_sheet(
+            own[shown],
+            after["own"][shown],
+            _verdicts(logits_before[shown], scene),
+            _verdicts(logits_after[shown], scene),
+            title=f"{title}, epsilon {evidence.spec.epsilon:g}",
+        ),
+        "difference.png": difference_strip(own[few], after["own"][few], title=title),
+        "textures.png": texture_sheet(scene.obj.textures, painted.textures, title=title),
+        "predictions.png": prediction_histogram(
+            _counts(logits_before, scene),
+            _counts(logits_after, scene),
+            label=_short_name(scene, scene.label),
+            title=f"What {title}, is taken for: {len(own)} target views",
+        ),
+    }
+
+
+def _counts(logits: NDArray[np.float32], scene: Scene) -> Counter[str]:
+    """How many views were given each class, by name."""
+    counts: Counter[str] = Counter()
+    for index, number in predicted_classes(logits).items():
+        counts[_short_name(scene, index)] += number
+    return counts
+
+
+def _short_name(scene: Scene, index: int) -> str:
+    """The first of a class's names."""
+    return scene.class_name(index).split(",")[0]
 
 
 def _distinct(scene: Scene) -> NDArray[np.int64]:
     """Views that show something new: the paper's grid holds azimuth 0 twice, as 0 and as 360."""
-    seen: dict[tuple[float, float, float], int] = {}
+    seen: dict[Camera, int] = {}
     for index, view in enumerate(scene.views):
-        seen.setdefault((view.camera.azimuth % 360, view.camera.elevation, view.camera.distance), index)
+        seen.setdefault(replace(view.camera, azimuth=view.camera.azimuth % 360), index)
     return np.array(list(seen.values()))
 
 

@@ -1,19 +1,36 @@
 """From a job's options to what it works on: the object, the networks, the views and the renderer."""
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from trompe_server.attack import framing_distance, grid_views, random_views
-from trompe_server.classifiers import Classifier, WhiteBoxClassifier, load_classifier
+from trompe_server.attack import (
+    Goal,
+    TexelMasks,
+    ViewDistribution,
+    framing_distance,
+    grid_views,
+    material_texels,
+    painted_texels,
+)
+from trompe_server.classifiers import (
+    Classifier,
+    ScoreBasedClassifier,
+    WhiteBoxClassifier,
+    as_ensemble,
+    load_classifier,
+    score_based,
+)
 from trompe_server.labels import resolve_label
 from trompe_server.library import Library
-from trompe_server.target import BackdropTarget, TargetRenderer
+from trompe_server.target import BackdropTarget, TargetRenderer, fitted
 from trompe_shared.api import JobSpec
-from trompe_shared.errors import ClassifierError
+from trompe_shared.errors import ClassifierError, SpecError
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, decode_rgb, load_object
 from trompe_shared.shipped import shipped_objects
@@ -21,28 +38,51 @@ from trompe_shared.shipped import shipped_objects
 __all__ = ["Scene", "open_scene"]
 
 DEFAULT_ELEVATION: Final = (0.0, 50.0)
+Image8 = NDArray[np.uint8]
+
 COLOURS: Final = {"white": (255, 255, 255), "black": (0, 0, 0)}
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What a job works on. ``label`` is the object's class index, ``views`` are attacked, ``held_out`` only judged."""
+    """What a job works on.
+
+    classifier: the first of those that are attacked, by which the result is judged. members: all of them, as the attack
+    needs them. goal: what they should say. within: masks of the texels that may change. views: what is attacked;
+    ``held_out`` ones are only judged. backdrops: the pictures that views name, (H, W, 3).
+    """
 
     obj: Object3D
     object_name: str
-    label: int
-    classifier: WhiteBoxClassifier
+    classifier: Classifier
+    members: tuple[WhiteBoxClassifier, ...]
     judges: tuple[Classifier, ...]
+    goal: Goal
+    within: tuple[TexelMasks, ...]
     views: tuple[View, ...]
     held_out: tuple[View, ...]
     target: TargetRenderer
-    backdrop: NDArray[np.uint8] | None
-    """(H, W, 3), what stands behind the object in place of the views' uniform backgrounds."""
+    backdrops: Mapping[str, Image8]
+
+    @property
+    def label(self) -> int:
+        """The object's true class."""
+        return self.goal.label
 
     @property
     def size(self) -> tuple[int, int]:
         """(H, W) of every image: what the attacked classifier takes."""
         return self.classifier.image_size
+
+    @property
+    def white_box(self) -> bool:
+        """Whether gradients are computed, not estimated from scores."""
+        return isinstance(self.classifier, WhiteBoxClassifier)
+
+    @property
+    def queries(self) -> int | None:
+        """Scores asked so far of a classifier that gives no gradients."""
+        return sum(each.queries for each in self.members if isinstance(each, ScoreBasedClassifier)) or None
 
     def class_name(self, index: int) -> str:
         """Name of a class, or its number where the classifier has no names."""
@@ -55,27 +95,67 @@ def open_scene(spec: JobSpec, *, library: Library, target: TargetRenderer) -> Sc
     obj = load_object(library.object_bytes(spec.object))
     info = library.object(spec.object)
     classifier = _stored_classifier(spec.classifier, library)
-    if not isinstance(classifier, WhiteBoxClassifier):
-        raise ClassifierError(
-            f"{classifier.name!r} gives scores but no gradients (.onnx), so it can judge, but not be attacked. "
-            "Attack a .pt2 file and name this one as a judge (--judge)."
-        )
     distance, elevation = _framing(spec, obj, info.name if info.shipped else None)
-    colour, backdrop = COLOURS.get(spec.background) or _hex_colour(spec.background), None
-    if colour is None:
-        picture = decode_rgb(library.background_bytes(spec.background), spec.background)
-        target = BackdropTarget(target, picture)
-        colour, backdrop = COLOURS["black"], target.backdrop(classifier.image_size)
+    pictures = {name: _picture(name, library) for name in spec.background if _colour(name) is None}
     return Scene(
         obj,
         info.name,
-        resolve_label(spec.label, classifier.classes, classifier.n_classes),
         classifier,
+        _members(spec, classifier, library),
         tuple(_stored_classifier(judge, library) for judge in spec.judges),
-        *_views(spec, distance, elevation, colour),
-        target,
-        backdrop,
+        _goal(spec, classifier),
+        _within(spec, obj, library),
+        *_views(spec, distance, elevation),
+        BackdropTarget(target, pictures) if pictures else target,
+        {name: fitted(picture, classifier.image_size) for name, picture in pictures.items()},
     )
+
+
+def _goal(spec: JobSpec, classifier: Classifier) -> Goal:
+    def index(label: str | int) -> int:
+        return resolve_label(label, classifier.classes, classifier.n_classes)
+
+    target = None if spec.target_label is None else index(spec.target_label)
+    goal = Goal(index(spec.label), target, spec.top_k, spec.loss)
+    goal.check(classifier.n_classes)
+    return goal
+
+
+def _members(spec: JobSpec, classifier: Classifier, library: Library) -> tuple[WhiteBoxClassifier, ...]:
+    """What is attacked: the classifier (by its scores where it has no gradients) and its ensemble."""
+    first = classifier if isinstance(classifier, WhiteBoxClassifier) else _by_scores(spec, classifier)
+    others = [_stored_classifier(name, library) for name in spec.ensemble]
+    blind = [other.name for other in others if not isinstance(other, WhiteBoxClassifier)]
+    if blind:
+        raise ClassifierError(f"{blind} give scores but no gradients (.onnx), so they cannot be in an ensemble.")
+    return as_ensemble([first, *(other for other in others if isinstance(other, WhiteBoxClassifier))])
+
+
+def _by_scores(spec: JobSpec, classifier: Classifier) -> WhiteBoxClassifier:
+    if spec.queries is None:
+        raise ClassifierError(
+            f"{classifier.name!r} gives scores but no gradients (.onnx). Attack a .pt2 file and name this one as a "
+            "judge (--judge), or let gradients be estimated from scores (--queries 10)."
+        )
+    if spec.tau is not None or spec.keep is not None:
+        raise SpecError(f"tau and keep need saliency, and {classifier.name!r} gives no gradients: leave them out.")
+    behind = _colour(spec.background[0]) if len(spec.background) == 1 else None
+    background = None if behind is None else torch.tensor(behind)[:, None, None] / 255
+    return score_based(classifier, seed=spec.seed, queries=spec.queries, sigma=spec.epsilon, background=background)
+
+
+def _within(spec: JobSpec, obj: Object3D, library: Library) -> tuple[TexelMasks, ...]:
+    """The masks of texels that the options name: materials, painted pictures."""
+    masks: list[TexelMasks] = []
+    if spec.materials:
+        masks.append(material_texels(obj, spec.materials))
+    if spec.masks:
+        masks.append(painted_texels(obj, {name: _picture(image, library) for name, image in spec.masks.items()}))
+    return tuple(masks)
+
+
+def _picture(reference: str, library: Library) -> Image8:
+    return decode_rgb(library.background_bytes(reference), reference)
 
 
 def _stored_classifier(reference: str, library: Library) -> Classifier:
@@ -91,22 +171,24 @@ def _framing(spec: JobSpec, obj: Object3D, shipped: str | None) -> tuple[float, 
     return distance, elevation
 
 
-def _hex_colour(text: str) -> tuple[int, int, int] | None:
+def _colour(text: str) -> tuple[int, int, int] | None:
+    """The colour that a background names; ``None`` for a picture."""
+    if text in COLOURS:
+        return COLOURS[text]
     if not re.fullmatch("#[0-9a-fA-F]{6}", text):
         return None
     red, green, blue = bytes.fromhex(text[1:])
     return red, green, blue
 
 
-def _views(
-    spec: JobSpec, distance: float, elevation: tuple[float, float], background: tuple[int, int, int]
-) -> tuple[tuple[View, ...], tuple[View, ...]]:
+def _views(spec: JobSpec, distance: float, elevation: tuple[float, float]) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """The views that are attacked (the pool, else the paper's grid), and those held out."""
+
+    distribution = ViewDistribution(distance, elevation, **dict(spec.ranges))
 
     def drawn(count: int, stream: int) -> tuple[View, ...]:
         generator = np.random.default_rng([spec.seed, stream])
-        views = random_views(count, distance=distance, elevation=elevation, background=background, generator=generator)
-        return tuple(views)
+        return _before(spec.background, distribution.sample(count, generator=generator), generator)
 
     held_out = drawn(spec.held_out, HELD_OUT_STREAM)
     if spec.pool:
@@ -116,10 +198,21 @@ def _views(
         elevation=elevation,
         azimuths=spec.azimuths,
         elevations=spec.elevations,
-        background=background,
+        background=COLOURS["white"],
     )
-    return tuple(grid), held_out
+    return _before(spec.background, grid, np.random.default_rng([spec.seed, GRID_STREAM])), held_out
 
 
-HELD_OUT_STREAM, POOL_STREAM = 1, 2
-"""Keep the random numbers of held-out views, pool and probes (0) apart."""
+HELD_OUT_STREAM, POOL_STREAM, GRID_STREAM = 1, 2, 3
+"""Keep the random numbers of held-out views, pool, the grid's backgrounds and probes (0) apart."""
+
+
+def _before(backgrounds: Sequence[str], views: Sequence[View], generator: np.random.Generator) -> tuple[View, ...]:
+    """Each of ``views`` in front of one of ``backgrounds``, drawn at random where there are several."""
+    drawn = [backgrounds[k] for k in generator.integers(len(backgrounds), size=len(views))]
+    return tuple(_in_front_of(name, view) for name, view in zip(drawn, views, strict=True))
+
+
+def _in_front_of(background: str, view: View) -> View:
+    colour = _colour(background)
+    return replace(view, backdrop=background) if colour is None else replace(view, background=colour)

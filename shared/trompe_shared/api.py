@@ -2,11 +2,12 @@
 
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 __all__ = [
+    "VIEW_LIMITS",
     "Accuracy",
     "BackgroundInfo",
     "ClassifierInfo",
@@ -16,15 +17,24 @@ __all__ = [
     "JobSpec",
     "JobState",
     "Judgement",
+    "Loss",
     "ObjectInfo",
+    "Optimiser",
     "Problem",
     "Progress",
     "Result",
     "SurrogateModel",
     "ViewPrediction",
+    "ViewRanges",
 ]
 
 SurrogateModel = Literal["auto", "diffuse", "calibrated", "curve"]
+Optimiser = Literal["fgsm", "pgd", "momentum", "nesterov", "adam", "auto"]
+Loss = Literal["margin", "cross_entropy", "dlr"]
+Range = tuple[float, float]
+Colour = tuple[
+    Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)]
+]
 
 
 class _Schema(BaseModel):
@@ -62,6 +72,46 @@ class BackgroundInfo(_Schema):
     name: str
 
 
+class ViewRanges(_Schema):
+    """What random views are drawn from, each quantity uniformly within its range (low, high); angles in degrees."""
+
+    azimuth: Range = (0.0, 360.0)
+    distance_factor: Range = Field(default=(0.9, 1.1), description="the job's distance is multiplied by it")
+    roll: Range = (0.0, 0.0)
+    light_azimuth: Range = (-70.0, 70.0)
+    light_elevation: Range = (35.0, 88.0)
+    intensity: Range = Field(default=(1.25, 1.25), description="1 lights a white surface that faces the light white")
+    ambient: Range = Field(default=(0.5, 0.5), description="share of white that reaches every surface from everywhere")
+    light_colours: tuple[Colour, Colour] = Field(
+        default=((255, 255, 255), (255, 255, 255)),
+        description="ends of the line, in linear light, that colours are drawn from",
+    )
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "ViewRanges":
+        for name, (least, most) in VIEW_LIMITS.items():
+            low, high = getattr(self, name)
+            if not least <= low <= high <= most:
+                raise ValueError(f"{name} must be a range within {least:g}..{most:g}, low end first; got {low} {high}")
+        return self
+
+
+VIEW_LIMITS: Final[dict[str, Range]] = {
+    "azimuth": (-720, 720),
+    "distance_factor": (0.001, 100),
+    "roll": (-360, 360),
+    "light_azimuth": (-720, 720),
+    "light_elevation": (-90, 90),
+    "intensity": (0, 100),
+    "ambient": (0, 1),
+}
+"""The widest range of each quantity of ``ViewRanges``."""
+
+
+def _as_list(given: Any) -> Any:
+    return [given] if isinstance(given, str) else given
+
+
 class JobSpec(_Schema):
     """What to attack, and how. ``object`` and ``classifier`` are ids or names of stored ones."""
 
@@ -73,6 +123,9 @@ class JobSpec(_Schema):
     object: str
     label: str | int = Field(description="the object's true class: a name or an index")
     classifier: str = "tiny"
+    ensemble: list[str] = Field(
+        default_factory=list, description="classifiers that are attacked together with it, for transfer to others"
+    )
     judges: list[str] = Field(default_factory=list, description="other classifiers that judge the result")
     epsilon: Annotated[float, Field(gt=0, le=1)] = 0.05
     alpha: Annotated[float, Field(gt=0, le=1)] = Field(
@@ -81,8 +134,29 @@ class JobSpec(_Schema):
     tau: Annotated[float, Field(ge=0, lt=1)] | None = Field(
         None, description="saliency threshold; null attacks all texels"
     )
+    keep: Annotated[float, Field(gt=0, le=1)] | None = Field(
+        None, description="attack only this share of the texels, those with the most saliency; null attacks all"
+    )
+    materials: list[str] = Field(default_factory=list, description="attack only these materials' textures")
+    masks: dict[str, str] = Field(
+        default_factory=dict,
+        description="by texture file, the id of an uploaded picture of its size that is white where it may change",
+    )
+    epsilon_view: Annotated[float, Field(gt=0, le=1)] | None = Field(
+        None, description="largest change of a pixel of the surrogate's views (the paper's view constraint)"
+    )
+    target_label: str | int | None = Field(
+        None, description="the class to be taken for, a name or an index; null: anything but the label"
+    )
+    top_k: Annotated[int, Field(ge=1)] = Field(1, description="the true class must leave this many best ones")
+    loss: Loss = "margin"
+    optimiser: Optimiser = "nesterov"
+    restarts: Annotated[int, Field(ge=0, le=100)] = Field(0, description="further runs, which share the steps")
+    queries: Annotated[int, Field(ge=2, le=10_000)] | None = Field(
+        None, description="scores asked per image and step, of a classifier that gives no gradients"
+    )
     surrogate: SurrogateModel = "auto"
-    steps: Annotated[int, Field(ge=1, le=10_000)] = 20
+    steps: Annotated[int, Field(ge=1, le=10_000)] = 30
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     distance: Annotated[float, Field(gt=0, le=1000)] | None = Field(
         None, description="metres; null is the shipped object's own, else it fills the frame"
@@ -90,12 +164,18 @@ class JobSpec(_Schema):
     elevation: tuple[float, float] | None = Field(
         None, description="range of camera elevations, degrees; null is the shipped object's own, else 0 to 50"
     )
-    background: str = Field("white", description="'white', 'black', '#rrggbb' or the id of an uploaded picture")
+    background: Annotated[list[str], BeforeValidator(_as_list), Field(min_length=1, max_length=64)] = Field(
+        ["white"],
+        description="'white', 'black', '#rrggbb' or the id of an uploaded picture; each view draws one where there are "
+        "several",
+    )
     azimuths: Annotated[int, Field(ge=1, le=360)] = Field(6, description="columns of the paper's grid of views")
     elevations: Annotated[int, Field(ge=1, le=180)] = Field(10, description="rows of the paper's grid of views")
     pool: Annotated[int, Field(ge=0, le=2000)] = Field(
-        0, description="attack this many random cameras and lights in place of the grid; each step draws 40 of them"
+        240,
+        description="attack this many random cameras and lights, 40 of them a step; 0: the paper's grid of views",
     )
+    ranges: ViewRanges = Field(ViewRanges(), description="what pool and held-out views are drawn from")
     held_out: Annotated[int, Field(ge=0, le=1000)] = Field(60, description="held-out views the result is judged on")
 
     @model_validator(mode="before")
@@ -114,6 +194,12 @@ class JobSpec(_Schema):
             raise ValueError(
                 f"alpha ({self.alpha}) is the step within the budget epsilon ({self.epsilon}); make it smaller"
             )
+        if self.target_label is not None and self.top_k > 1:
+            raise ValueError(
+                "top_k is about leaving the best classes, target_label about becoming the best: choose one"
+            )
+        if self.queries is not None and self.queries % 2:
+            raise ValueError(f"queries come in pairs, on both sides of an image; got {self.queries}, make it even")
         return self
 
 
@@ -187,6 +273,9 @@ class Accuracy(_Schema):
     a_before: float
     a_after: float | None
     a_drop: float | None = Field(description="(a_before - a_after) / a_before; null (n.a.) when a_before is 0")
+    a_drop_interval: tuple[float, float] | None = Field(
+        None, description="95 % bootstrap interval over views; null where a_drop is"
+    )
     a_before_interval: tuple[float, float]
     a_after_interval: tuple[float, float] | None
 
@@ -199,6 +288,11 @@ class ViewPrediction(_Schema):
     distance: float
     light_azimuth: float
     light_elevation: float
+    roll: float = 0.0
+    light_intensity: float = 1.25
+    light_ambient: float = 0.5
+    light_colour: Colour = (255, 255, 255)
+    background: str = Field("#ffffff", description="its colour, or the id of the picture behind the object")
     before: int
     before_confidence: float
     before_true_confidence: float
@@ -218,6 +312,7 @@ class Judgement(_Schema):
 class Result(_Schema):
     """``result.json``: what was asked, what came out, and how well surrogate and target agree."""
 
+    spec: JobSpec = Field(description="what was asked")
     object: str
     label: int
     label_name: str | None
@@ -235,9 +330,27 @@ class Result(_Schema):
     held_out: Accuracy | None
     transfer_gap: float | None = Field(description="surrogate a_drop minus target a_drop on the same views")
     judges: list[Judgement] = Field(default_factory=list)
+    goal_reached: float | None = Field(
+        None, description="share of the target views on which the attack's goal is reached after it"
+    )
     texels_altered: float | None = Field(description="share of texels the attack altered (N%)")
     mean_texel_change: float | None = Field(description="mean |change| over altered texels and channels, [0, 1] units")
     max_view_change: float | None = Field(description="largest |change| of a pixel of a target view, [0, 1] units")
+    pixels_beyond_epsilon: float | None = Field(
+        None, description="share of the object's pixels in target views that changed by more than epsilon"
+    )
+    views_beyond_epsilon: float | None = Field(None, description="share of the target views that hold such a pixel")
+    ssim: float | None = Field(
+        None, description="mean structural similarity of target views before and after, over the object; 1 is equal"
+    )
+    ssim_worst: float | None = Field(None, description="the same of the worst view")
+    delta_e: float | None = Field(None, description="mean CIEDE2000 colour difference over the object's pixels")
+    delta_e_95: float | None = Field(None, description="95 % of the object's pixels differ by less")
+    texture_variation: float | None = Field(
+        None, description="mean |difference| of the change between neighbouring texels, [0, 1] units"
+    )
+    evaluations: int | None = Field(None, description="images that the attack showed each classifier it attacked")
+    queries: int | None = Field(None, description="scores asked of a classifier that gives no gradients")
     fidelity: dict[str, float] = Field(
         default_factory=dict, description="surrogate against target; see docs/glossary.md"
     )

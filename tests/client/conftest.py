@@ -46,6 +46,7 @@ def result_of(spec: JobSpec, *, applicable: bool = True) -> Result:
         a_before=0.9,
         a_after=0.3,
         a_drop=0.6667,
+        a_drop_interval=(0.55, 0.78),
         a_before_interval=(0.8, 0.95),
         a_after_interval=(0.2, 0.43),
     )
@@ -53,6 +54,7 @@ def result_of(spec: JobSpec, *, applicable: bool = True) -> Result:
         views=60, a_before=0, a_after=None, a_drop=None, a_before_interval=(0, 0.06), a_after_interval=None
     )
     return Result(
+        spec=spec,
         object=spec.object,
         label=3,
         label_name="mug",
@@ -73,6 +75,13 @@ def result_of(spec: JobSpec, *, applicable: bool = True) -> Result:
         texels_altered=0.421 if applicable else None,
         mean_texel_change=0.031 if applicable else None,
         max_view_change=0.2 if applicable else None,
+        goal_reached=0.8333 if applicable else None,
+        pixels_beyond_epsilon=0.0123 if applicable else None,
+        views_beyond_epsilon=0.25 if applicable else None,
+        ssim=0.987 if applicable else None,
+        delta_e=1.234 if applicable else None,
+        evaluations=4800 if applicable else None,
+        queries=48_000 if applicable and spec.queries else None,
         warnings=["the [racket] is thin"],
         seconds={"calibrate": 1.25, "attack": 7.5},
         probe_renders=120,

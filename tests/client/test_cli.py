@@ -1,5 +1,7 @@
 """The command line: what it prints, writes and exits with."""
 
+import hashlib
+import io
 import json
 import re
 from contextlib import contextmanager
@@ -8,12 +10,19 @@ from importlib import metadata
 import click
 import pytest
 from click.testing import CliRunner
+from rich.console import Console
 
 from trompe_client import JobHandle, cli
 from trompe_client._plan import object_source
-from trompe_shared.api import JobSpec, JobState
+from trompe_client._report import result_report
+from trompe_shared.api import JobSpec, JobState, ViewRanges
 
 SPEC = JobSpec(object="mug", label="mug")
+
+
+def stored_id(data: bytes) -> str:
+    """The fake server's id of an upload."""
+    return hashlib.sha256(data).hexdigest()[:12]
 
 
 def trompe(*words: object):
@@ -29,7 +38,7 @@ def test_attack_prints_the_table_and_names_the_files_it_wrote(server, tmp_path):
         for line in done.stdout.splitlines()
         if len(cells := [c.strip() for c in line.split("│")]) > 5
     }
-    figures = ["0.90 [0.80, 0.95]", "0.30 [0.20, 0.43]", "0.67"]
+    figures = ["0.90 [0.80, 0.95]", "0.30 [0.20, 0.43]", "0.67 [0.55, 0.78]"]
     assert rows == {
         "surrogate (own views)": ["60", *figures],
         "target (own views)": ["60", *figures],
@@ -40,6 +49,9 @@ def test_attack_prints_the_table_and_names_the_files_it_wrote(server, tmp_path):
         "42.1%",
         "0.0310 (7.9/255)",
         "0.2000 (51.0/255)",
+        "25.0% of the target views (1.23% of the object's pixels)",
+        "SSIM 0.987, colour difference (CIEDE2000) 1.23",
+        "4,800 by each attacked classifier",
         "calibrated: error 0.4/255 is within tolerance",
         "0.01",
         "warning: the [racket] is thin",
@@ -48,27 +60,120 @@ def test_attack_prints_the_table_and_names_the_files_it_wrote(server, tmp_path):
         str(out / "mug_adversarial.zip"),
     ):
         assert words in done.stdout
+    assert "goal reached" not in done.stdout
     assert json.loads((out / "result.json").read_text())["label_name"] == "mug"
 
 
 def test_every_option_reaches_the_job(server, tmp_path):
-    options = "--epsilon .1 --alpha .02 --tau .2 --surrogate curve --steps 9 --seed 4 --distance 2 --elevation -5 30"
-    words = [*options.split(), "--background", "#112233", "--classifier", "tiny", "--label", "7"]
+    mask, member = tmp_path / "mask.png", tmp_path / "member.torchscript"
+    mask.write_bytes(b"mask")
+    member.write_bytes(b"script")
+    options = """--epsilon .1 --alpha .02 --tau .2 --surrogate curve --steps 9 --seed 4 --distance 2 --elevation -5 30
+        --background #112233 --background black --classifier tiny --label 7 --judge torchvision:vgg16 --judge net
+        --keep .3 --material clay --material glaze --epsilon-view .04 --target 2 --loss dlr --optimiser adam
+        --restarts 3 --queries 8 --pool 50 --range roll -10 10 --range ambient 0.2 0.6 --held-out 12"""
+    words = [*options.split(), "--ensemble", member, "--ensemble", "hub:owner/nets.pt", "--mask", f"a.png={mask}"]
     done = trompe("attack", "mug", *words, "--server", server.url, "--out", tmp_path)
     assert done.exit_code == 0, done.output
     assert server.jobs["job-1"].spec == JobSpec(
         object="mug",
         label=7,
+        classifier="tiny",
+        ensemble=[stored_id(b"script"), "hub:owner/nets.pt"],
+        judges=["torchvision:vgg16", "net"],
         epsilon=0.1,
         alpha=0.02,
         tau=0.2,
+        keep=0.3,
+        materials=["clay", "glaze"],
+        masks={"a.png": stored_id(b"mask")},
+        epsilon_view=0.04,
+        target_label=2,
+        loss="dlr",
+        optimiser="adam",
+        restarts=3,
+        queries=8,
         surrogate="curve",
         steps=9,
         seed=4,
         distance=2,
         elevation=(-5, 30),
-        background="#112233",
+        background=["#112233", "black"],
+        pool=50,
+        ranges=ViewRanges(roll=(-10, 10), ambient=(0.2, 0.6)),
+        held_out=12,
     )
+
+
+def test_what_is_not_said_is_left_to_the_job(server, tmp_path):
+    assert trompe("attack", "mug", "--label", "mug", "--server", server.url, "--out", tmp_path).exit_code == 0
+    assert server.jobs["job-1"].spec == SPEC
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        pytest.param("--grid", {"pool": 0}, id="grid"),
+        pytest.param("--pool 0 --azimuths 4", {"pool": 0, "azimuths": 4}, id="no pool"),
+        pytest.param("--grid --azimuths 4 --elevations 3", {"pool": 0, "azimuths": 4, "elevations": 3}, id="its size"),
+        pytest.param("--target vase", {"target_label": "vase"}, id="target by name"),
+        pytest.param("--top-k 5", {"top_k": 5}, id="top k"),
+    ],
+)
+def test_short_words_for_common_wishes(server, tmp_path, words, wanted):
+    done = trompe("attack", "mug", "--label", "mug", *words.split(), "--server", server.url, "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    assert server.jobs["job-1"].spec == JobSpec(**SPEC.model_dump() | wanted)
+
+
+def test_the_command_line_knows_every_option_of_a_job_and_says_its_default():
+    names = {parameter.name for parameter in cli.attack.params}
+    assert names - {"grid", "server", "out"} == JobSpec.model_fields.keys()
+    text = " ".join(trompe("attack", "--help").stdout.split())
+    for option in ("epsilon", "top_k", "loss", "optimiser", "restarts", "surrogate", "steps", "seed", "pool"):
+        words = f"--{option.replace('_', '-')} [^-]*Default: {JobSpec.model_fields[option].default}[. ]"
+        assert re.search(words, text), option
+
+
+def test_help_lists_each_option_once_under_a_heading():
+    lines = trompe("attack", "--help").stdout.splitlines()
+    assert {line for line in lines if re.fullmatch(r"\S.*:", line)} == {
+        "Object and classifiers:",
+        "What may change:",
+        "What the classifier should say:",
+        "How it is looked for:",
+        "Views:",
+        "Server and results:",
+    }
+    listed = re.findall(r"^  (?:-h, )?(--[a-z-]+)", "\n".join(lines), re.MULTILINE)
+    declared = [parameter.opts[-1] for parameter in cli.attack.params if isinstance(parameter, click.Option)]
+    assert listed == [*declared, "--help"]
+
+
+@pytest.mark.parametrize(
+    ("words", "goal"),
+    [
+        pytest.param("--target 2", "83.3% of the target views: taken for class 2", id="index"),
+        pytest.param("--target vase", "83.3% of the target views: taken for vase", id="name"),
+        pytest.param("--top-k 5", "83.3% of the target views: the true class is not among the 5 best", id="top k"),
+    ],
+)
+def test_a_goal_of_its_own_is_told_with_how_often_it_was_reached(server, tmp_path, words, goal):
+    more = ["--queries", 10, "--keep", 0.1, "--ensemble", "net"]
+    done = trompe("attack", "mug", "--label", 0, *words.split(), *more, "--server", server.url, "--out", tmp_path)
+    assert goal in done.stdout
+    assert "attacked through tiny and net: epsilon 0.05, alpha 0.01, tau none, keep 0.1" in done.stdout
+    assert "4,800 by each attacked classifier, 48,000 scores asked" in done.stdout
+
+
+def test_a_report_of_100_columns_keeps_every_number_whole(client):
+    spec = JobSpec(object="mug", label=0, judges=["mobilenet_v3_large"], top_k=5)
+    console = Console(width=100, file=io.StringIO())
+    console.print(result_report(client.submit(spec).wait(timeout=20).result()))
+    lines = console.file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 100
+    rows = [line for line in lines if "0.90 [0.80, 0.95] │ 0.30 [0.20, 0.43] │ 0.67 [0.55, 0.78]" in line]
+    assert len(rows) == 4
 
 
 def test_an_object_comes_back_in_the_form_it_was_given(server, mug_folder, tmp_path):
@@ -111,9 +216,16 @@ def test_a_failed_job_exits_with_1_and_its_reason(server, tmp_path):
         pytest.param(["--surrogate", "magic"], id="no such model"),
         pytest.param(["--elevation", "50", "0"], id="range upside down"),
         pytest.param(["--bogus"], id="no such option"),
+        pytest.param(["--mask", "mask.png"], id="mask of no texture"),
+        pytest.param(["--mask", "a.png=missing.png"], id="mask without a file"),
+        pytest.param(["--range", "elevation", "0", "9"], id="no such range"),
+        pytest.param(["--grid", "--pool", "9"], id="grid and pool"),
+        pytest.param(["--pool", "9", "--azimuths", "4"], id="size of no grid"),
+        pytest.param(["--target", "vase", "--top-k", "5"], id="two goals"),
+        pytest.param(["--queries", "7"], id="odd queries"),
     ],
 )
-def test_wrong_usage_exits_with_2(words, tmp_path):
+def test_wrong_usage_exits_with_2_before_any_server_is_asked(words, tmp_path):
     done = trompe("attack", "mug", "--label", 0, "--server", "http://127.0.0.1:9", "--out", tmp_path, *words)
     assert done.exit_code == 2
     assert "Usage:" in done.stderr
@@ -141,7 +253,10 @@ def test_lists_show_what_the_server_has(server, client):
     for _ in range(3):
         client.submit(SPEC)
     client.job("job-2").cancel()
-    assert "attack, judge" in trompe("classifiers", "--server", server.url).stdout
+    server.classifiers.append(server.classifiers[0].model_copy(update={"name": "blind", "white_box": False}))
+    uses = trompe("classifiers", "--server", server.url).stdout
+    assert re.search(r"tiny .*│ attack, judge ", uses)
+    assert re.search(r"blind .*│ judge, attack by scores ", uses)
     every = trompe("jobs", "--server", server.url).stdout
     assert all(f"job-{k}" in every for k in (1, 2, 3))
     only = trompe("jobs", "--state", "cancelled", "--server", server.url).stdout

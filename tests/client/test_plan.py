@@ -3,11 +3,14 @@
 import io
 import json
 import zipfile
+from typing import Any
 
 import pytest
 
 from trompe_client._plan import (
+    CLASSIFIER_SUFFIXES,
     AttackOptions,
+    AttackPlan,
     Upload,
     background_source,
     classifier_source,
@@ -88,10 +91,18 @@ def test_class_names_that_are_no_list_of_strings_are_refused(tmp_path, text):
         classifier_source(tmp_path / "net.onnx")
 
 
-def test_a_classifier_is_a_file_by_its_suffix_and_a_name_otherwise(tmp_path):
-    assert classifier_source("mobilenet_v2") == "mobilenet_v2"
+@pytest.mark.parametrize("ending", CLASSIFIER_SUFFIXES)
+def test_a_classifier_is_a_file_by_its_ending(tmp_path, ending):
+    file = tmp_path / f"net{ending.upper()}"
     with pytest.raises(ClassifierError, match="There is no classifier file"):
-        classifier_source(tmp_path / "net.pt2")
+        classifier_source(file)
+    file.write_bytes(b"net")
+    assert classifier_source(str(file)) == Upload(file.name, b"net")
+
+
+@pytest.mark.parametrize("name", ["mobilenet_v2", "torchvision:vgg16", "hub:owner/nets:small", "hub:owner/nets.pt"])
+def test_a_classifier_is_a_name_otherwise(name):
+    assert classifier_source(name) == name
 
 
 def test_a_background_is_a_colour_or_a_picture_file(tmp_path):
@@ -103,15 +114,35 @@ def test_a_background_is_a_colour_or_a_picture_file(tmp_path):
 
 
 def test_the_options_are_those_of_a_job():
-    assert AttackOptions.__annotations__.keys() == JobSpec.model_fields.keys() - {
-        "object",
-        "label",
-        "classifier",
-        "judges",
-        "background",
-    }
+    named = {"object", "label", "classifier", "ensemble", "judges", "background", "masks"}
+    assert AttackOptions.__annotations__.keys() == JobSpec.model_fields.keys() - named
 
 
-def test_a_wrong_option_is_named_before_any_server_is_asked():
-    with pytest.raises(SpecError, match="tau: Input should be less than 1"):
-        plan_attack("mug", label=0, classifier="tiny", judges=(), background="white", tau=1.5)
+def plan(**options: Any) -> AttackPlan:
+    nothing = {"ensemble": (), "judges": (), "background": "white", "masks": {}}
+    return plan_attack("mug", **{"label": 0, "classifier": "tiny"} | nothing | options)
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        pytest.param({"tau": 1.5}, "tau: Input should be less than 1", id="out of range"),
+        pytest.param({"ranges": {"colour": (0, 1)}}, "ranges.colour", id="no such range"),
+        pytest.param({"ranges": {"roll": 3}}, "ranges.roll", id="no range"),
+        pytest.param({"background": []}, "background: Value should have at least 1 item", id="no background"),
+        pytest.param({"target_label": 1, "top_k": 5}, "choose one", id="two goals"),
+        pytest.param({"masks": {"a.png": "missing.png"}}, "no mask picture 'missing.png'", id="mask"),
+    ],
+)
+def test_a_wrong_option_is_named_before_any_server_is_asked(option, words):
+    with pytest.raises(SpecError, match=words):
+        plan(**option)
+
+
+def test_an_ensemble_and_judges_are_files_or_names_one_or_several(tmp_path):
+    (tmp_path / "net.pt").write_bytes(b"script")
+    planned = plan(ensemble=tmp_path / "net.pt", judges=["tiny", str(tmp_path / "net.pt")], background="black")
+    assert planned.ensemble == (Upload("net.pt", b"script"),)
+    assert planned.judges == ("tiny", Upload("net.pt", b"script"))
+    assert planned.backgrounds == ("black",)
+    assert plan(judges="tiny").judges == ("tiny",)

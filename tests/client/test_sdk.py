@@ -19,7 +19,7 @@ from trompe_client import (
     ServerUnreachable,
     WaitTimeout,
 )
-from trompe_shared.api import JobSpec, JobState
+from trompe_shared.api import JobSpec, JobState, ViewRanges
 from trompe_shared.errors import ObjectError, SpecError
 
 SPEC = JobSpec(object="mug", label="mug")
@@ -52,6 +52,20 @@ def test_files_are_uploaded_and_the_job_names_them_by_id(client, server, mug_fol
     assert server.classifiers[-1].classes == ["mug", "cup"]
     assert server.uploads["backgrounds"][:2] == ("room.png", b"png")
     assert server.uploads["objects"][0] == "mug.zip"
+
+
+def test_ensemble_and_masks_are_uploaded_too_and_ranges_may_be_plain(client, server, tmp_path):
+    member, mask = tmp_path / "net.pt", tmp_path / "mask.png"
+    member.write_bytes(b"script")
+    mask.write_bytes(b"mask")
+    ranges = {"roll": (-20, 20)}
+    job = client.attack("mug", label=0, ensemble=[member], masks={"a.png": mask}, ranges=ranges, materials=["m"])
+    spec = job.status.spec
+    assert spec.ensemble == [server.classifiers[-1].id]
+    assert server.uploads["backgrounds"][:2] == ("mask.png", b"mask")
+    assert spec.masks == {"a.png": client.upload_background(mask)}
+    assert spec.ranges == ViewRanges(roll=(-20, 20))
+    assert spec.materials == ["m"]
 
 
 def test_uploads_can_be_named_and_bring_their_own_class_names(client, server, mug_folder, tmp_path):

@@ -57,6 +57,7 @@ def run(
         distance=paper["distance"],
         elevation=paper["elevation_range"],
         background=paper["background"],
+        pool=0,
     )
     artifacts = LocalArtifacts(folder)
     job = open_pipeline(spec, library=library, artifacts=artifacts, target=target)

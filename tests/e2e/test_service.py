@@ -201,7 +201,7 @@ def test_jobs_outlive_the_service(serve: Serve) -> None:
 
 
 def test_an_attack_whose_worker_is_killed_ends_with_the_same_bytes(tmp_path: Path) -> None:
-    few = {"azimuths": 2, "elevations": 2, "held_out": 2, "steps": 60}
+    few = {"pool": 0, "azimuths": 2, "elevations": 2, "held_out": 2, "steps": 60}
     spec = {"object": "mug", "label": "mug", "classifier": "tiny", **few}
     serve = Serve(tmp_path / "data", {})
     try:

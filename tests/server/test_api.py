@@ -9,9 +9,11 @@ from typing import Any
 import httpx
 import pytest
 
+from trompe_client._plan import CLASSIFIER_SUFFIXES
 from trompe_server import library as library_module
 from trompe_server.api.services import Services
 from trompe_server.app import create_app
+from trompe_server.classifiers.registry import ENDINGS
 from trompe_server.jobs.engine import DbosQueue
 from trompe_server.jobs.store import JobStore
 from trompe_server.jobs.worker import prepare_data
@@ -21,6 +23,8 @@ from trompe_shared.api import JobState, Progress
 from trompe_shared.errors import ClassifierError
 
 CLASSES = ["mug, cup", "vase", "toilet tissue, toilet paper"]
+GIF = bytes.fromhex("47494638396101000100800000000000ffffff2c00000000010001000002024401003b")
+"""A picture of one pixel."""
 
 
 class Api:
@@ -145,8 +149,7 @@ def test_a_classifier_sent_again_without_its_class_names_keeps_them(stocked: Api
 
 
 def test_a_background_is_an_image(api: Api, tmp_path: Path) -> None:
-    picture = bytes.fromhex("47494638396101000100800000000000ffffff2c00000000010001000002024401003b")
-    stored = api.post("/v1/backgrounds", files={"file": ("beach.gif", picture)}).json()
+    stored = api.post("/v1/backgrounds", files={"file": ("beach.gif", GIF)}).json()
     assert stored["name"] == "beach"
     assert api.get("/v1/backgrounds").json() == [stored]
     assert (
@@ -180,6 +183,27 @@ def test_a_job_keeps_the_ids_of_what_it_names(stocked: Api) -> None:
     assert stocked.get(f"/v1/jobs/{job['id']}").json() == job
 
 
+def test_ensemble_masks_and_backgrounds_are_kept_by_id_too(stocked: Api) -> None:
+    member = stocked.upload_classifier(b"W2", "member.pt2").json()
+    picture = stocked.post("/v1/backgrounds", files={"file": ("beach.gif", GIF)}).json()
+    answer = stocked.submit(
+        ensemble=["member"], masks={"paint.png": "beach"}, materials=["paint"], background=["beach", "#00ff00"]
+    )
+    spec = answer.json()["spec"]
+    assert spec["ensemble"] == [member["id"]]
+    assert spec["masks"] == {"paint.png": picture["id"]}
+    assert spec["background"] == [picture["id"], "#00ff00"]
+
+
+def test_a_classifier_without_gradients_can_be_attacked_by_its_scores(stocked: Api) -> None:
+    stocked.upload_classifier(b"B", "judge.onnx")
+    assert stocked.submit(classifier="judge", queries=10).status_code == 201
+
+
+def test_the_client_uploads_the_files_that_classifiers_are_read_from() -> None:
+    assert set(CLASSIFIER_SUFFIXES) == set(ENDINGS)
+
+
 def test_shipped_things_are_named_by_name(stocked: Api, triangle_zip: Callable[..., bytes]) -> None:
     stocked.upload_object(triangle_zip(), "mug.zip")
     spec = stocked.submit(object="mug", classifier="tiny").json()["spec"]
@@ -196,7 +220,18 @@ def test_shipped_things_are_named_by_name(stocked: Api, triangle_zip: Callable[.
         pytest.param({"label": 3}, 422, "indices are 0..2", id="index"),
         pytest.param({"background": "beach"}, 404, "no background 'beach'", id="background"),
         pytest.param({"background": "#12345"}, 404, "no background '#12345'", id="colour"),
-        pytest.param({"classifier": "judge"}, 422, "cannot be attacked", id="black box"),
+        pytest.param({"ensemble": ["resnet"]}, 404, "no classifier 'resnet'", id="ensemble"),
+        pytest.param({"masks": {"paint.png": "beach"}}, 404, "no background 'beach'", id="mask"),
+        pytest.param({"masks": {"wood.png": "beach"}}, 422, "no texture ['wood.png'] to mask", id="texture"),
+        pytest.param({"materials": ["paint", "wood"]}, 422, "no material ['wood']", id="material"),
+        pytest.param({"target_label": "vaze"}, 422, "did you mean 'vase'?", id="target"),
+        pytest.param({"target_label": "mug"}, 422, "is the object's own class", id="target is the label"),
+        pytest.param({"top_k": 3}, 422, "less than the 3 classes", id="top k"),
+        pytest.param({"queries": 10}, 422, "'net' gives gradients", id="queries of a white box"),
+        pytest.param({"classifier": "judge"}, 422, "gives no gradients", id="black box"),
+        pytest.param({"classifier": "judge", "queries": 4, "tau": 0.1}, 422, "need saliency", id="its tau"),
+        pytest.param({"classifier": "judge", "queries": 4, "keep": 0.1}, 422, "need saliency", id="its saliency"),
+        pytest.param({"ensemble": ["judge"]}, 422, "not in the ensemble", id="black box in the ensemble"),
     ],
 )
 def test_a_job_that_names_what_is_not_there_is_refused_at_once(

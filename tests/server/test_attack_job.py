@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trompe_server.array_files import unpack_arrays
-from trompe_server.attack import Budget, attack, load_state, saliency_masks, start
+from trompe_server.attack import Budget, Goal, attack, load_state, saliency_masks, start
 from trompe_server.attack_job import AttackJob, open_pipeline
 from trompe_server.errors import NotFoundError
 from trompe_server.library import Library
@@ -38,13 +38,22 @@ SPEC = JobSpec.model_validate(
         "alpha": 0.03,
         "surrogate": "calibrated",
         "steps": 6,
+        "pool": 0,
         "azimuths": 2,
         "elevations": 2,
         "held_out": 3,
     }
 )
 QUICK = SPEC.model_copy(update={"surrogate": "diffuse", "steps": 2})
-PICTURES = {"contact_sheet.png", "difference.png", "saliency.png", "textures.png"}
+PICTURES = {
+    "predictions.png",
+    "saliency_object.png",
+    "saliency_textures.png",
+    "contact_sheet.png",
+    "difference.png",
+    "saliency.png",
+    "textures.png",
+}
 Image8 = NDArray[np.uint8]
 
 
@@ -326,8 +335,9 @@ def test_the_threshold_stops_the_gradient_of_the_pixels_below_it(library: Librar
         textures,
         diffuse_surrogate(geometry, scene.views),
         scene.classifier,
-        scene.label,
+        goal=Goal(scene.label),
         budget=Budget(spec.epsilon, spec.alpha),
+        optimiser=spec.optimiser,
         steps=2,
         masks=masks,
     )
@@ -389,7 +399,7 @@ def test_an_uploaded_object_is_framed_by_its_size(tmp_path: Path, mug: Object3D)
     ("background", "colour"), [("black", (0, 0, 0)), ("#0a64ff", (10, 100, 255)), ("#000000", (0, 0, 0))]
 )
 def test_a_background_can_be_a_colour(library: Library, background: str, colour: tuple[int, int, int]) -> None:
-    scene = scene_of(library, background=background)
+    scene = scene_of(library, background=[background])
     assert {view.background for view in (*scene.views, *scene.held_out)} == {colour}
     assert isinstance(scene.target, FakeTarget)
 
@@ -397,7 +407,7 @@ def test_a_background_can_be_a_colour(library: Library, background: str, colour:
 @pytest.mark.parametrize("background", ["#xyzxyz", "#12 34 ", "#123", "red", ""])
 def test_a_background_that_is_nothing_known_is_refused(library: Library, background: str) -> None:
     with pytest.raises(NotFoundError, match="background"):
-        scene_of(library, background=background)
+        scene_of(library, background=[background])
 
 
 @pytest.mark.parametrize(
@@ -430,7 +440,7 @@ def test_a_classifier_without_gradients_cannot_be_attacked(library: Library, mon
     monkeypatch.setattr(library, "classifier", lambda _: info)
     monkeypatch.setattr(library, "classifier_path", lambda _: "net.onnx")
     monkeypatch.setattr("trompe_server.scene.load_classifier", lambda *_, **__: Opaque())
-    with pytest.raises(ClassifierError, match=r"'net'.*no gradients.*\.onnx.*judge.*\.pt2"):
+    with pytest.raises(ClassifierError, match=r"'net'.*no gradients.*\.onnx.*\.pt2.*judge.*--queries"):
         scene_of(library, classifier="net", label=0)
 
 
@@ -447,19 +457,22 @@ def photo() -> Image8:
 def test_an_uploaded_photograph_stands_behind_the_object(tmp_path: Path, photo: Image8) -> None:
     library = Library(tmp_path)
     info = library.add_background(encode_png(photo), "wall.png")
-    scene = scene_of(library, background=info.id)
+    scene = scene_of(library, background=[info.id])
     image = scene.target.render(scene.obj, scene.views[:1], size=scene.size)[0]
     assert isinstance(scene.target, BackdropTarget)
-    plain = FakeTarget().render(scene.obj, scene.views[:1], size=scene.size)[0]
+    black = dataclasses.replace(scene.views[0], background=(0, 0, 0))
+    plain = FakeTarget().render(scene.obj, [black], size=scene.size)[0]
     there = (plain != 0).any(axis=-1)
     assert (image[there] == plain[there]).all()
     assert len(np.unique(image[~there], axis=0)) > 50
 
 
 def test_a_photograph_is_what_compositing_by_hand_gives(mug: Object3D, photo: Image8) -> None:
-    views, size = [View(Camera(0.157, 30, 20)), View(Camera(0.3, 90, 0), background=(1, 2, 3))], (40, 60)
+    views, size = [View(Camera(0.157, 30, 20), backdrop="photo"), View(Camera(0.3, 90, 0), backdrop="photo")], (40, 60)
     frames: list[None] = []
-    images = BackdropTarget(FakeTarget(), photo).render(mug, views, size=size, on_frame=lambda: frames.append(None))
+    images = BackdropTarget(FakeTarget(), {"photo": photo}).render(
+        mug, views, size=size, on_frame=lambda: frames.append(None)
+    )
     cropped = Image.fromarray(photo[25:65]).resize((60, 40), Image.Resampling.LANCZOS)
     for image, view in zip(images, views, strict=True):
         black, white = (
@@ -476,10 +489,12 @@ def test_a_photograph_is_what_compositing_by_hand_gives(mug: Object3D, photo: Im
 def test_a_plain_photograph_is_the_same_as_a_uniform_background_at_soft_edges_too(
     mug: Object3D, target: SailenvTarget
 ) -> None:
-    views, size = [View(Camera(0.157, 30, 20), background=(120, 60, 200))], (64, 64)
-    picture = np.full((5, 5, 3), views[0].background, np.uint8)
-    composed = BackdropTarget(target, picture).render(mug, views, size=size)
-    assert np.abs(composed.astype(int) - target.render(mug, views, size=size)).max() <= 2
+    view, size = View(Camera(0.157, 30, 20), background=(120, 60, 200)), (64, 64)
+    picture = np.full((5, 5, 3), view.background, np.uint8)
+    pictured = [dataclasses.replace(view, backdrop="plain"), view]
+    composed = BackdropTarget(target, {"plain": picture}).render(mug, pictured, size=size)
+    assert np.abs(composed[0].astype(int) - composed[1]).max() <= 2
+    assert (composed[1] == target.render(mug, [view], size=size)).all()
 
 
 class PatchyTarget(FakeTarget):
@@ -496,3 +511,48 @@ def test_views_on_which_the_surrogate_is_far_off_are_named(library: Library) -> 
     (warning,) = [w for w in run(spec, library, target=PatchyTarget()).artifacts.result().warnings if "views" in w]
     view = open_scene(spec, library=library, target=FakeTarget()).views[1].camera
     assert f"1 (azimuth {view.azimuth:.0f}, elevation {view.elevation:.0f})" in warning
+
+
+def test_views_draw_their_backgrounds_from_several(tmp_path: Path, photo: Image8) -> None:
+    library = Library(tmp_path)
+    picture = library.add_background(encode_png(photo), "wall.png").id
+    scene = scene_of(library, background=["black", "#ff0000", picture], held_out=30)
+    for views in (scene.views, scene.held_out):
+        seen = {view.backdrop or view.background for view in views}
+        assert seen <= {(0, 0, 0), (255, 0, 0), picture}
+    assert len({view.backdrop or view.background for view in scene.held_out}) == 3
+    assert scene.backdrops[picture].shape == (*scene.size, 3)
+    again = scene_of(library, background=["black", "#ff0000", picture], held_out=30)
+    assert again.views == scene.views
+
+
+class Liar(FakeTarget):
+    """A target that shows noise wherever the result is judged: held-out views, and everything after the attack."""
+
+    def __init__(self, own: Sequence[View]) -> None:
+        self.own, self.judging = set(own), False
+
+    def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
+        images = super().render(obj, views, **options)
+        noise = np.random.default_rng(0)
+        for image, view in zip(images, views, strict=True):
+            if self.judging or view not in self.own:
+                image[:] = noise.integers(0, 256, image.shape)
+        return images
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"tau": 0.05}, {"keep": 0.2}, {"restarts": 1, "optimiser": "auto"}, {"pool": 12}], ids=str
+)
+def test_what_the_result_is_judged_on_cannot_influence_the_texture(library: Library, options: dict[str, Any]) -> None:
+    spec = SPEC.model_copy(update=options)
+    honest = run(spec, library).artifacts
+    shutil.rmtree(library.calibrations.folder, ignore_errors=True)
+    target, artifacts = Liar(open_scene(spec, library=library, target=FakeTarget()).views), MemoryArtifacts()
+    job = open_pipeline(spec, library=library, artifacts=artifacts, target=target)
+    for phase in job.phases():
+        target.judging = phase == "judge"
+        job.run(phase, lambda _: None)
+    assert artifacts.files["adversarial.zip"] == honest.files["adversarial.zip"]
+    assert artifacts.result().target.a_after != honest.result().target.a_after or honest.result().target.a_after == 0
+    assert artifacts.result().held_out != honest.result().held_out

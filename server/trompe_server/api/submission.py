@@ -19,18 +19,68 @@ def checked_spec(spec: JobSpec, library: Library) -> JobSpec:
     """
     obj = library.object(spec.object)
     classifier = library.classifier(spec.classifier)
-    if not classifier.white_box:
+    _check_goal(spec, classifier)
+    _check_gradients(spec, classifier)
+    _check_materials(spec, obj)
+    references = {
+        "object": _reference(obj),
+        "classifier": _reference(classifier),
+        "ensemble": [_member(spec, classifier, library.classifier(name)) for name in spec.ensemble],
+        "judges": [_judge(spec, classifier, library.classifier(judge)) for judge in spec.judges],
+        "background": [name if _COLOUR.fullmatch(name) else library.background(name).id for name in spec.background],
+        "masks": {texture: library.background(picture).id for texture, picture in spec.masks.items()},
+    }
+    return spec.model_copy(update=references)
+
+
+def _check_goal(spec: JobSpec, classifier: ClassifierInfo) -> None:
+    """Raise ``LabelError`` or ``SpecError`` for classes that there are not, and for a goal that contradicts itself."""
+    label = resolve_label(spec.label, classifier.classes, classifier.n_classes)
+    if spec.target_label is not None and label == resolve_label(
+        spec.target_label, classifier.classes, classifier.n_classes
+    ):
         raise SpecError(
-            f"The classifier {classifier.name!r} gives no gradients, so it cannot be attacked, "
-            "only be one of the judges. Upload a .pt2 (torch.export) file to attack it."
+            f"The target class {spec.target_label!r} is the object's own class: choose another one, or none to have "
+            "the object taken for anything else."
         )
-    resolve_label(spec.label, classifier.classes, classifier.n_classes)
-    judges = [_judge(spec, classifier, library.classifier(judge)) for judge in spec.judges]
-    background = spec.background
-    if not _COLOUR.fullmatch(background):
-        background = library.background(background).id
-    references = {"object": _reference(obj), "classifier": _reference(classifier), "judges": judges}
-    return spec.model_copy(update=references | {"background": background})
+    if spec.top_k >= classifier.n_classes:
+        raise SpecError(f"top_k must be less than the {classifier.n_classes} classes there are, got {spec.top_k}.")
+
+
+def _check_gradients(spec: JobSpec, classifier: ClassifierInfo) -> None:
+    """Raise ``SpecError`` where the attack needs gradients that the classifier does not give."""
+    if classifier.white_box:
+        if spec.queries is not None:
+            raise SpecError(f"queries are for classifiers that only give scores; {classifier.name!r} gives gradients.")
+        return
+    if spec.queries is None:
+        raise SpecError(
+            f"The classifier {classifier.name!r} gives no gradients: it can be one of the judges, or be attacked by "
+            "its scores (queries=10 asks it about ten images for each gradient)."
+        )
+    if spec.tau is not None or spec.keep is not None:
+        raise SpecError(f"tau and keep need saliency, and {classifier.name!r} gives no gradients: leave them out.")
+
+
+def _check_materials(spec: JobSpec, obj: ObjectInfo) -> None:
+    unknown = sorted(set(spec.materials) - set(obj.materials))
+    if unknown:
+        raise SpecError(f"There is no material {unknown}; {obj.name!r} has {obj.materials}.")
+    unknown = sorted(set(spec.masks) - set(obj.textures))
+    if unknown:
+        raise SpecError(f"There is no texture {unknown} to mask; {obj.name!r} has {sorted(obj.textures)}.")
+
+
+def _member(spec: JobSpec, classifier: ClassifierInfo, member: ClassifierInfo) -> str:
+    """A member of the ensemble must give gradients, and mean the same by its logits."""
+    if not member.white_box:
+        raise SpecError(f"{member.name!r} gives no gradients, so it can be a judge, but not in the ensemble.")
+    if member.n_classes != classifier.n_classes:
+        raise SpecError(
+            f"{member.name!r} has {member.n_classes} classes and {classifier.name!r} {classifier.n_classes}: they "
+            "cannot be attacked together. Name classifiers of the same classes."
+        )
+    return _judge(spec, classifier, member)
 
 
 def _judge(spec: JobSpec, classifier: ClassifierInfo, judge: ClassifierInfo) -> str:
