@@ -8,21 +8,13 @@ TROMPE_ASSETS=... python -m bench.attacks --csv docs/bench/attacks.csv
 import argparse
 import csv
 import itertools
-import json
-import os
-import shutil
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 from bench._common import running_renderer
-from trompe_server.artifacts import LocalArtifacts
-from trompe_server.attack_job import open_pipeline
-from trompe_server.library import Library
-from trompe_server.target import SailenvTarget
-from trompe_shared.api import Accuracy, JobSpec, Result
-from trompe_shared.object3d import load_object
+from bench._jobs import Paper
+from trompe_shared.api import Accuracy, Result
 
 OBJECTS = ("toilet_paper", "lamp_floor", "remote_controller", "plunger")
 SETTINGS: tuple[tuple[str, float | None], ...] = (
@@ -43,24 +35,28 @@ COLUMNS = (
 def main() -> None:
     """Run every object under every setting and print a row for each."""
     options = _options()
-    assets = Path(os.environ["TROMPE_ASSETS"])
     rows = []
     print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
     with tempfile.TemporaryDirectory() as folder, running_renderer() as target:
-        library = _library(Path(folder), assets, options.classifier)
-        names = json.loads((assets / "objects" / "objects.json").read_text())
-        runs = itertools.product(
-            names if options.objects == ["all"] else options.objects,
-            options.epsilon,
-            SETTINGS[:1] if options.plain else SETTINGS,
-            options.seeds,
-        )
-        for number, (name, epsilon, (surrogate, tau), seed) in enumerate(runs):
-            changes = {"surrogate": surrogate, "tau": tau, "seed": seed}
-            spec = _spec(name, library, assets, options, epsilon).model_copy(update=changes)
-            shutil.rmtree(library.calibrations.folder, ignore_errors=True)  # every run pays for its probes
+        paper = Paper(Path(folder), [f"{options.classifier}.pt2"])
+        settings = SETTINGS[:1] if options.plain else SETTINGS
+        for name, epsilon, (surrogate, tau), seed in itertools.product(
+            paper.named(options.objects), options.epsilon, settings, options.seeds
+        ):
+            spec = paper.spec(
+                name,
+                mixed=options.mixed,
+                classifier=options.classifier,
+                epsilon=epsilon,
+                surrogate=surrogate,
+                tau=tau,
+                seed=seed,
+                steps=options.steps,
+                pool=options.pool,
+                held_out=options.held_out,
+            )
             started = time.perf_counter()
-            result = _run(spec, library, target, Path(folder) / str(number))
+            result = paper.run(spec, target)
             rows.append(_row(name, result, time.perf_counter() - started))
             print("| " + " | ".join(rows[-1]) + " |", flush=True)
     if options.csv:
@@ -80,52 +76,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--held-out", type=int, default=60)
     parser.add_argument("--mixed", action="store_true", help="black, white and the photographs as backgrounds")
     parser.add_argument("--csv", type=Path)
-    if "TROMPE_ASSETS" not in os.environ:
-        sys.exit("TROMPE_ASSETS must name the folder with the paper's objects and the classifiers.")
     return parser.parse_args()
-
-
-def _library(folder: Path, assets: Path, classifier: str) -> Library:
-    library = Library(folder / "library")
-    names = json.loads((assets / "classifiers" / "imagenet_classes.json").read_text())
-    with (assets / "classifiers" / f"{classifier}.pt2").open("rb") as file:
-        library.add_classifier(file, f"{classifier}.pt2", classes=names)
-    return library
-
-
-def _spec(name: str, library: Library, assets: Path, options: argparse.Namespace, epsilon: float) -> JobSpec:
-    """The paper's protocol for an object: its distance, elevations and background."""
-    paper = json.loads((assets / "objects" / "objects.json").read_text())[name]
-    stored = library.add_object(load_object(assets / "objects" / name).to_zip(), name)
-    return JobSpec(
-        object=stored.id,
-        label=paper["imagenet_class"],
-        classifier=options.classifier,
-        epsilon=epsilon,
-        steps=options.steps,
-        distance=paper["distance"],
-        elevation=paper["elevation_range"],
-        background=[*_photographs(library, assets), "black", "white"] if options.mixed else paper["background"],
-        pool=options.pool,
-        held_out=options.held_out,
-    )
-
-
-def _photographs(library: Library, assets: Path) -> list[str]:
-    return [
-        library.add_background(file.read_bytes(), file.name).id
-        for file in sorted((assets / "backgrounds").glob("*.png"))
-    ]
-
-
-def _run(spec: JobSpec, library: Library, target: SailenvTarget, folder: Path) -> Result:
-    artifacts = LocalArtifacts(folder)
-    job = open_pipeline(spec, library=library, artifacts=artifacts, target=target)
-    for phase in job.phases():
-        report = job.run(phase, lambda _: None)
-        if report.state is not None:
-            break
-    return Result.model_validate_json(artifacts.read("result.json"))
 
 
 def _row(name: str, result: Result, seconds: float) -> list[str]:

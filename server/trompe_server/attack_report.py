@@ -113,6 +113,7 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
         label=scene.label,
         label_name=scene.class_name(scene.label) if scene.classifier.classes else None,
         classifier=scene.classifier.name,
+        ensemble=[member.name for member in scene.members[1:]],
         **spec.model_dump(include={"epsilon", "alpha", "tau", "seed", "steps"}),
         image_size=scene.size,
         surrogate=surrogate,

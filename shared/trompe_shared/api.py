@@ -317,6 +317,7 @@ class Result(_Schema):
     label: int
     label_name: str | None
     classifier: str
+    ensemble: list[str] = Field(default_factory=list, description="classifiers that were attacked together with it")
     epsilon: float
     alpha: float
     tau: float | None

@@ -62,15 +62,17 @@ def transfer_matrix(
 ) -> TransferMatrix:
     """The matrix of some results, of several objects or seeds, judged on the attack's own or on the held-out views.
 
-    Each cell is the mean of those results whose judge recognised the object in the share ``least_before`` of the views,
-    or more, before the attack. Rows and columns are in the order of the results.
+    An ensemble is a row of its own, named after its members. Each cell is the mean of those results whose judge
+    recognised the object in the share ``least_before`` of the views, or more, before the attack. Rows and columns are
+    in the order of the results.
     """
     found: dict[tuple[str, str], list[float]] = {}
     for result in results:
         judged = [(result.classifier, getattr(result, views))]
         judged += [(judge.classifier, getattr(judge, views)) for judge in result.judges]
+        attacked_together = " + ".join([result.classifier, *result.ensemble])
         for name, accuracy in judged:
-            found.setdefault((result.classifier, name), []).extend(_drop(accuracy, least_before))
+            found.setdefault((attacked_together, name), []).extend(_drop(accuracy, least_before))
     attacked = tuple(dict.fromkeys(row for row, _ in found))
     judging = tuple(dict.fromkeys(column for _, column in found))
     cells = [[found.get((row, column), []) for column in judging] for row in attacked]
