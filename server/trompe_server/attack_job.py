@@ -65,9 +65,12 @@ SHARES: Final = {"prepare": 0.15, "calibrate": 0.25, "attack": 0.45, "judge": 0.
 Image8 = NDArray[np.uint8]
 
 
-def open_pipeline(spec: JobSpec, *, library: Library, artifacts: Artifacts, target: TargetRenderer) -> "AttackJob":
+def open_pipeline(
+    spec: JobSpec, *, library: Library, artifacts: Artifacts, target: TargetRenderer, device: str = "cpu"
+) -> "AttackJob":
     """The phases of the job that ``spec`` describes. Raises ``TrompeError`` for what the user can mend."""
-    return AttackJob(spec, open_scene(spec, library=library, target=target), artifacts, library.calibrations)
+    scene = open_scene(spec, library=library, target=target, device=device)
+    return AttackJob(spec, scene, artifacts, library.calibrations)
 
 
 class AttackJob:
@@ -168,7 +171,9 @@ class AttackJob:
         """Rasterise all views while the renderer is busy with the probes."""
         scene = self.scene
         executor = ThreadPoolExecutor(1, thread_name_prefix="rasterise")
-        prepare = partial(prepare_geometry, scene.obj, scene.views, size=scene.size, sampling=sampling)
+        prepare = partial(
+            prepare_geometry, scene.obj, scene.views, size=scene.size, sampling=sampling, device=scene.device
+        )
         self._geometry = executor.submit(prepare)
         executor.shutdown(wait=False)
 
@@ -242,7 +247,7 @@ class AttackJob:
 
     @cached_property
     def _textures(self) -> dict[str, torch.Tensor]:
-        return textures_of(self.scene.obj)
+        return textures_of(self.scene.obj, device=self.scene.device)
 
     @cached_property
     def _calibration(self) -> Calibration:
@@ -253,7 +258,13 @@ class AttackJob:
         scene, clean = self.scene, self.files.load("clean")["own"]
         geometry = self._geometry.result() if self._geometry is not None else None
         return build_surrogate(
-            self._calibration, scene.obj, scene.views, clean, geometry=geometry, backdrops=scene.backdrops
+            self._calibration,
+            scene.obj,
+            scene.views,
+            clean,
+            geometry=geometry,
+            backdrops=scene.backdrops,
+            device=scene.device,
         )
 
     @cached_property
@@ -265,7 +276,9 @@ class AttackJob:
 
     @cached_property
     def _masks(self) -> torch.Tensor | None:
-        return None if self.spec.tau is None or self._maps is None else saliency_masks(self._maps, self.spec.tau)
+        if self.spec.tau is None or self._maps is None:
+            return None
+        return saliency_masks(self._maps, self.spec.tau).to(self.scene.device)
 
     @cached_property
     def _scores(self) -> Mapping[str, torch.Tensor] | None:

@@ -164,8 +164,8 @@ def _surrogate_accuracy(evidence: Evidence) -> Accuracy | None:
 def _surrogate_images(surrogate: Surrogate, obj: Object3D) -> NDArray[np.uint8]:
     """The surrogate's images of ``obj`` in 8 bits, (views, H, W, 3)."""
     with torch.no_grad():
-        shown = surrogate.render_all(surrogate.texels(textures_of(obj)))
-        images: NDArray[np.uint8] = shown.mul(255).round().byte().permute(0, 2, 3, 1).numpy()
+        shown = surrogate.render_all(surrogate.texels(textures_of(obj, device=surrogate.geometry.device)))
+        images: NDArray[np.uint8] = shown.mul(255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
     return images
 
 

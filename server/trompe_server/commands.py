@@ -22,6 +22,7 @@ R = TypeVar("R")
 _data = click.option(
     "--data", type=click.Path(path_type=Path, file_okay=False), help="Folder of data (or TROMPE_DATA)."
 )
+_device = click.option("--device", metavar="DEVICE", help="cpu, cuda or cuda:1 (or TROMPE_DEVICE). Default: cpu.")
 
 
 def _for_people(command: Callable[P, R]) -> Callable[P, R]:
@@ -37,8 +38,12 @@ def _for_people(command: Callable[P, R]) -> Callable[P, R]:
     return run
 
 
-def _settings(data: Path | None) -> Settings:
-    return Settings() if data is None else Settings(data=data.absolute())
+def _settings(data: Path | None, **others: object) -> Settings:
+    """The settings of the environment, and those that were given as options."""
+    given = {"data": data and data.absolute(), **others}
+    return Settings.model_validate(
+        Settings().model_dump() | {k: value for k, value in given.items() if value is not None}
+    )
 
 
 def _log_to_stderr() -> None:
@@ -62,17 +67,15 @@ def _announce(line: str) -> None:
     type=click.IntRange(1, 64),
     help="Renderer workers, which share each job's images (or TROMPE_RENDERERS). Default: 1.",
 )
+@_device
 @_data
 @_for_people
-def serve(host: str, port: int, renderers: int | None, data: Path | None) -> None:
+def serve(host: str, port: int, renderers: int | None, device: str | None, data: Path | None) -> None:
     """Run the service: REST API, one attack worker, its renderer workers, one folder of data."""
     from trompe_server.serving import run_service
 
     _log_to_stderr()
-    settings = _settings(data)
-    if renderers is not None:
-        settings = settings.model_copy(update={"renderers": renderers})
-    run_service(settings, host=host, port=port, announce=_announce)
+    run_service(_settings(data, device=device, renderers=renderers), host=host, port=port, announce=_announce)
 
 
 @click.command()
@@ -85,13 +88,14 @@ def serve(host: str, port: int, renderers: int | None, data: Path | None) -> Non
     metavar="HOST:PORT",
     help="A renderer worker that shows the objects. Several share the work.",
 )
+@_device
 @_for_people
-def worker(data: Path | None, renderers: tuple[str, ...]) -> None:
+def worker(data: Path | None, renderers: tuple[str, ...], device: str | None) -> None:
     """Run an attack worker, which takes jobs of a data folder one after the other."""
     from trompe_server.jobs.worker import run_worker
 
     _log_to_stderr()
-    run_worker(_settings(data), [_address(renderer) for renderer in renderers], announce=_announce)
+    run_worker(_settings(data, device=device), [_address(renderer) for renderer in renderers], announce=_announce)
 
 
 def _address(text: str) -> tuple[str, int]:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -49,7 +50,7 @@ class Scene:
 
     classifier: the first of those that are attacked, by which the result is judged. members: all of them, as the attack
     needs them. goal: what they should say. within: masks of the texels that may change. views: what is attacked;
-    ``held_out`` ones are only judged. backdrops: the pictures that views name, (H, W, 3).
+    ``held_out`` ones are only judged. backdrops: the pictures that views name, (H, W, 3). device: where torch computes.
     """
 
     obj: Object3D
@@ -63,6 +64,7 @@ class Scene:
     held_out: tuple[View, ...]
     target: TargetRenderer
     backdrops: Mapping[str, Image8]
+    device: str = "cpu"
 
     @property
     def label(self) -> int:
@@ -90,24 +92,29 @@ class Scene:
         return classes[index] if classes is not None else f"class {index}"
 
 
-def open_scene(spec: JobSpec, *, library: Library, target: TargetRenderer) -> Scene:
-    """Load what ``spec`` names. Raises ``TrompeError`` for what does not exist or does not fit together."""
+def open_scene(spec: JobSpec, *, library: Library, target: TargetRenderer, device: str = "cpu") -> Scene:
+    """Load what ``spec`` names, networks on ``device``.
+
+    Raises ``TrompeError`` for what does not exist or does not fit together.
+    """
     obj = load_object(library.object_bytes(spec.object))
     info = library.object(spec.object)
-    classifier = _stored_classifier(spec.classifier, library)
+    stored = partial(_stored_classifier, library=library, device=device)
+    classifier = stored(spec.classifier)
     distance, elevation = _framing(spec, obj, info.name if info.shipped else None)
     pictures = {name: _picture(name, library) for name in spec.background if _colour(name) is None}
     return Scene(
         obj,
         info.name,
         classifier,
-        _members(spec, classifier, library),
-        tuple(_stored_classifier(judge, library) for judge in spec.judges),
+        _members(spec, classifier, [stored(name) for name in spec.ensemble]),
+        tuple(stored(judge) for judge in spec.judges),
         _goal(spec, classifier),
         _within(spec, obj, library),
         *_views(spec, distance, elevation),
         BackdropTarget(target, pictures) if pictures else target,
         {name: fitted(picture, classifier.image_size) for name, picture in pictures.items()},
+        device,
     )
 
 
@@ -121,10 +128,9 @@ def _goal(spec: JobSpec, classifier: Classifier) -> Goal:
     return goal
 
 
-def _members(spec: JobSpec, classifier: Classifier, library: Library) -> tuple[WhiteBoxClassifier, ...]:
-    """What is attacked: the classifier (by its scores where it has no gradients) and its ensemble."""
+def _members(spec: JobSpec, classifier: Classifier, others: Sequence[Classifier]) -> tuple[WhiteBoxClassifier, ...]:
+    """What is attacked: the classifier (by its scores where it has no gradients) and the others of its ensemble."""
     first = classifier if isinstance(classifier, WhiteBoxClassifier) else _by_scores(spec, classifier)
-    others = [_stored_classifier(name, library) for name in spec.ensemble]
     blind = [other.name for other in others if not isinstance(other, WhiteBoxClassifier)]
     if blind:
         raise ClassifierError(f"{blind} give scores but no gradients (.onnx), so they cannot be in an ensemble.")
@@ -158,9 +164,9 @@ def _picture(reference: str, library: Library) -> Image8:
     return decode_rgb(library.background_bytes(reference), reference)
 
 
-def _stored_classifier(reference: str, library: Library) -> Classifier:
+def _stored_classifier(reference: str, *, library: Library, device: str) -> Classifier:
     info = library.classifier(reference)
-    return load_classifier(library.classifier_path(reference), name=info.name, classes=info.classes)
+    return load_classifier(library.classifier_path(reference), name=info.name, classes=info.classes, device=device)
 
 
 def _framing(spec: JobSpec, obj: Object3D, shipped: str | None) -> tuple[float, tuple[float, float]]:

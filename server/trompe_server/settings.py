@@ -22,6 +22,8 @@ class Settings(BaseSettings):
     """Largest upload, bytes."""
     stall_timeout: float = 1800.0
     """Seconds without progress after which a job's worker is stopped."""
+    device: str = "cpu"
+    """Where attack workers compute, as torch names it: cpu, cuda, cuda:1."""
     renderers: Annotated[int, Field(ge=1, le=64)] = 1
     """Renderer workers that ``serve`` starts."""
     renderer_patience: float = 10.0

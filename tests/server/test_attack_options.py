@@ -190,7 +190,20 @@ def test_an_ensemble_needs_gradients(library: Library, tmp_path: Path, monkeypat
     net = Scores(load_classifier("tiny"))
     monkeypatch.setattr(
         "trompe_server.scene._stored_classifier",
-        lambda name, _: net if name == "net" else load_classifier("tiny"),
+        lambda name, **_: net if name == "net" else load_classifier("tiny"),
     )
     with pytest.raises(ClassifierError, match=r"\['net'\] give scores but no gradients"):
         attacked(library, tmp_path / "job", ensemble=["net"])
+
+
+def test_a_device_that_is_not_there_is_told_before_any_work(library: Library, tmp_path: Path) -> None:
+    with pytest.raises(ClassifierError, match="'cuda:7' cannot be used here"):
+        open_pipeline(SPEC, library=library, artifacts=LocalArtifacts(tmp_path), target=FakeTarget(), device="cuda:7")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+def test_a_whole_job_runs_on_a_graphics_card(library: Library, tmp_path: Path) -> None:
+    job = open_pipeline(SPEC, library=library, artifacts=LocalArtifacts(tmp_path), target=FakeTarget(), device="cuda")
+    for phase in job.phases():
+        job.run(phase, lambda _: None)
+    assert (tmp_path / "result.json").exists()

@@ -73,7 +73,7 @@ class FakePipeline:
 
 
 def open_pipeline(
-    spec: JobSpec, *, library: Library, artifacts: LocalArtifacts, target: TargetRenderer
+    spec: JobSpec, *, library: Library, artifacts: LocalArtifacts, target: TargetRenderer, device: str
 ) -> FakePipeline:
     """A fake pipeline that behaves as the job's label says; "no object" cannot be opened."""
     if spec.label == "no object":

@@ -162,7 +162,7 @@ class Supervisor:
 
     def _work(self) -> list[str]:
         renderers = [word for port in self._ports for word in ("--renderer", f"127.0.0.1:{port}")]
-        return ["worker", "--data", str(self._settings.data), *renderers]
+        return ["worker", "--data", str(self._settings.data), "--device", self._settings.device, *renderers]
 
 
 def _accepts(host: str, port: int) -> bool:

@@ -108,7 +108,9 @@ def _job_opener(settings: Settings, renderers: Sequence[Address]) -> Callable[[J
         target = SailenvTarget(*renderers[0]) if len(renderers) == 1 else RendererPool(renderers)
         try:
             artifacts = LocalArtifacts(settings.artifacts(job.id))
-            pipeline = _named(settings.pipeline)(job.spec, library=library, artifacts=artifacts, target=target)
+            pipeline = _named(settings.pipeline)(
+                job.spec, library=library, artifacts=artifacts, target=target, device=settings.device
+            )
         except BaseException:
             target.close()
             raise
