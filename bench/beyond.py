@@ -173,11 +173,12 @@ def by_gradients(stage: Stage, relief: Relief, ranges: LightRanges, *, steps: in
 
 def direction(shares: torch.Tensor, ranges: LightRanges) -> torch.Tensor:
     """The unit vector towards the light at ``shares`` (2,) of the ranges of azimuth and elevation."""
-    (a0, a1), (e0, e1) = ranges.azimuth, ranges.elevation
-    azimuth = torch.deg2rad(a0 + shares[0] * (a1 - a0))
-    elevation = torch.deg2rad(e0 + shares[1].clamp(0, 1) * (e1 - e0))
-    flat = elevation.cos()
-    return torch.stack([flat * azimuth.sin(), elevation.sin(), flat * azimuth.cos()])
+    (low, high), elevations = ranges.azimuth, torch.tensor(ranges.elevation)
+    azimuth = torch.deg2rad(low + shares[0] * (high - low))
+    bottom, top = torch.deg2rad(elevations).sin()
+    height = bottom + shares[1].clamp(0, 1) * (top - bottom)
+    flat = (1 - height.square()).sqrt()
+    return torch.stack([flat * azimuth.sin(), height, flat * azimuth.cos()])
 
 
 def described(place: LightPlace) -> str:
