@@ -130,7 +130,7 @@ class Objective:
         logits = [member.logits(seen) for member in self.members]
         loss = torch.stack([self.goal.losses(each).sum() for each in logits]).mean()
         (pull,) = torch.autograd.grad(loss, seen)
-        pull = pull.nan_to_num(0, 0, 0)
+        pull.nan_to_num_(0, 0, 0)
         back = pull if everything else torch.zeros_like(shown).index_copy_(0, chosen, pull)
         shown.backward(back)  # type: ignore[no-untyped-call]
         reached = torch.stack([self.goal.reached(each) for each in logits]).all(0)
