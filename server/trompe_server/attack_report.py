@@ -39,7 +39,7 @@ from trompe_server.reports import (
     texture_sheet,
 )
 from trompe_server.scene import Scene
-from trompe_server.surrogate import Surrogate, textures_of
+from trompe_server.surrogate import Surrogate, behind, textures_of
 from trompe_server.surrogate.calibration import MAX_ERROR, MIN_EXPLAINED, Calibration
 from trompe_shared.api import Accuracy, JobSpec, Judgement, Result
 from trompe_shared.geometry import Camera
@@ -197,7 +197,8 @@ def _view_changes(evidence: Evidence) -> dict[str, Any]:
         return {"max_view_change": None}
     scene = evidence.scene
     before, after = (np.concatenate([each["own"], each["held_out"]]) for each in (evidence.before, evidence.after))
-    pixels = object_pixels(before, after, _behind(scene))
+    views = (*scene.views, *scene.held_out)
+    pixels = object_pixels(before, after, behind(views, scene.backdrops, scene.size))
     beyond = share_beyond(before, after, pixels, epsilon=evidence.spec.epsilon)
     seen = perceived_change(before, after, pixels)
     return {
@@ -207,15 +208,6 @@ def _view_changes(evidence: Evidence) -> dict[str, Any]:
         "texture_variation": total_variation(scene.obj.textures, evidence.painted.textures),
         **({} if seen is None else asdict(seen)),
     }
-
-
-def _behind(scene: Scene) -> NDArray[np.uint8]:
-    """What stands behind the object in each view, own ones first, (views, H, W, 3)."""
-    views = (*scene.views, *scene.held_out)
-    behind = np.empty((len(views), *scene.size, 3), np.uint8)
-    for image, view in zip(behind, views, strict=True):
-        image[:] = view.background if view.backdrop is None else scene.backdrops[view.backdrop]
-    return behind
 
 
 def _warnings(evidence: Evidence, target: Accuracy) -> list[str]:

@@ -13,10 +13,10 @@ from torch import Tensor
 from trompe_server.attack import (
     Budget,
     Goal,
+    ViewDistribution,
     framing_distance,
     grid_views,
     image_gradients,
-    random_views,
     saliency,
     saliency_masks,
 )
@@ -178,7 +178,7 @@ def test_a_grid_of_one_is_the_first_end_of_both_ranges() -> None:
 
 def held_out(n: int, seed: int) -> list[View]:
     generator = np.random.default_rng(seed)
-    return list(random_views(n, distance=2, elevation=(-10, 45), background=(9, 9, 9), generator=generator))
+    return ViewDistribution(2.0, (-10.0, 45.0), backgrounds=((9, 9, 9),)).sample(n, generator=generator)
 
 
 def test_held_out_views_fill_their_ranges_and_nothing_else() -> None:

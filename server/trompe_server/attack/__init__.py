@@ -6,7 +6,7 @@ from trompe_server.attack.goal import Goal
 from trompe_server.attack.saliency import image_gradients, saliency, saliency_masks
 from trompe_server.attack.state import AttackState, load_state, save_state, start
 from trompe_server.attack.texels import TexelMasks, best_texels, material_texels, movable, painted_texels, rank_texels
-from trompe_server.attack.views import ViewDistribution, framing_distance, grid_views, random_views
+from trompe_server.attack.views import ViewDistribution, framing_distance, grid_views
 
 __all__ = [
     "AttackState",
@@ -24,7 +24,6 @@ __all__ = [
     "material_texels",
     "movable",
     "painted_texels",
-    "random_views",
     "rank_texels",
     "saliency",
     "saliency_masks",

@@ -1,6 +1,5 @@
 """The views an attack is made for, and the ones it is judged on."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -11,7 +10,7 @@ from trompe_shared.errors import SpecError
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View
 from trompe_shared.object3d import Object3D
 
-__all__ = ["ViewDistribution", "framing_distance", "grid_views", "random_views"]
+__all__ = ["ViewDistribution", "framing_distance", "grid_views"]
 
 Range = tuple[float, float]
 Colour = tuple[int, int, int]
@@ -98,19 +97,3 @@ def grid_views(
         for e in np.linspace(*elevation, elevations)
         for a in np.linspace(0, 360, azimuths)
     ]
-
-
-def random_views(
-    n: int,
-    *,
-    distance: float,
-    elevation: tuple[float, float],
-    background: tuple[int, int, int],
-    generator: np.random.Generator,
-) -> Sequence[View]:
-    """``n`` views as one may meet the object, to be attacked as a pool or to be held out: ``ViewDistribution``'s own.
-
-    Any azimuth, elevations of the range, distance +-10 %, light from azimuth +-70 and elevation 35..88.
-    """
-    distribution = ViewDistribution(distance, elevation, backgrounds=(background,))
-    return distribution.sample(n, generator=generator)

@@ -6,41 +6,22 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from trompe_server.classifiers.protocol import Images, Logits, WhiteBoxClassifier, resize
+from trompe_server.classifiers.protocol import WhiteBoxClassifier, Wrapper, resize
 from trompe_shared.errors import ClassifierError
 
 __all__ = ["ResizedClassifier", "as_ensemble", "resized"]
 
 
 @dataclass(frozen=True)
-class ResizedClassifier:
+class ResizedClassifier(Wrapper):
     """``inner`` for images of ``image_size``, which it resizes to its own; so does their gradient come back."""
 
     inner: WhiteBoxClassifier
     image_size: tuple[int, int]
 
-    @property
-    def name(self) -> str:
-        """See ``Classifier``."""
-        return self.inner.name
-
-    @property
-    def n_classes(self) -> int:
-        """See ``Classifier``."""
-        return self.inner.n_classes
-
-    @property
-    def classes(self) -> tuple[str, ...] | None:
-        """See ``Classifier``."""
-        return self.inner.classes
-
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
         """Logits of sRGB images in [0, 1] of size ``image_size``, differentiable in them."""
         return self.inner.logits(resize(images, self.inner.image_size))
-
-    def predict(self, images: Images) -> Logits:
-        """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size, resized once, to the inner size."""
-        return self.inner.predict(images)
 
 
 def resized(classifier: WhiteBoxClassifier, size: tuple[int, int]) -> WhiteBoxClassifier:

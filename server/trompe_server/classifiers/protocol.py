@@ -16,6 +16,7 @@ __all__ = [
     "Classifier",
     "ScoringClassifier",
     "WhiteBoxClassifier",
+    "Wrapper",
     "check_classes",
     "fit_images",
     "in_batches",
@@ -116,3 +117,28 @@ def refuse_probabilities(outputs: NDArray[np.float32], file: str) -> None:
             f"{file!r} ends in a softmax: each output row is positive and sums to 1. "
             "Expected logits; export the network without its last softmax."
         )
+
+
+class Wrapper:
+    """What a wrapper around another classifier says of itself: what ``inner`` says."""
+
+    inner: Classifier
+
+    @property
+    def name(self) -> str:
+        """See ``Classifier``."""
+        return self.inner.name
+
+    @property
+    def n_classes(self) -> int:
+        """See ``Classifier``."""
+        return self.inner.n_classes
+
+    @property
+    def classes(self) -> tuple[str, ...] | None:
+        """See ``Classifier``."""
+        return self.inner.classes
+
+    def predict(self, images: Images) -> Logits:
+        """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size, resized once, to the inner size."""
+        return self.inner.predict(images)

@@ -20,14 +20,14 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from trompe_server.classifiers.protocol import Classifier, Images, Logits, ScoringClassifier
+from trompe_server.classifiers.protocol import Classifier, ScoringClassifier, Wrapper
 from trompe_shared.errors import ClassifierError, SpecError
 
 __all__ = ["ScoreBasedClassifier", "score_based"]
 
 
 @dataclass
-class ScoreBasedClassifier:
+class ScoreBasedClassifier(Wrapper):
     """``inner``, its gradient estimated; ``queries`` counts the images it was asked about, ``predict`` left out.
 
     An image for which no gradient is wanted (its loss is clamped, say) costs only the one query for its scores.
@@ -42,28 +42,9 @@ class ScoreBasedClassifier:
     queries: int = field(default=0, init=False)
 
     @property
-    def name(self) -> str:
-        """See ``Classifier``."""
-        return self.inner.name
-
-    @property
     def image_size(self) -> tuple[int, int]:
         """See ``Classifier``."""
         return self.inner.image_size
-
-    @property
-    def n_classes(self) -> int:
-        """See ``Classifier``."""
-        return self.inner.n_classes
-
-    @property
-    def classes(self) -> tuple[str, ...] | None:
-        """See ``Classifier``."""
-        return self.inner.classes
-
-    def predict(self, images: Images) -> Logits:
-        """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size; for judging, not counted."""
-        return self.inner.predict(images)
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
         """The true logits of sRGB images in [0, 1]; their gradient is an estimate, asked for when it is needed."""

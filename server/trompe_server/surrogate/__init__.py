@@ -4,6 +4,7 @@ from trompe_server.surrogate.sampling import SamplingModel
 from trompe_server.surrogate.surrogate import (
     Geometry,
     Surrogate,
+    behind,
     curve_surrogate,
     diffuse_surrogate,
     prepare_geometry,
@@ -14,6 +15,7 @@ __all__ = [
     "Geometry",
     "SamplingModel",
     "Surrogate",
+    "behind",
     "curve_surrogate",
     "diffuse_surrogate",
     "prepare_geometry",

@@ -33,6 +33,7 @@ __all__ = [
     "Geometry",
     "Surrogate",
     "ViewBatch",
+    "behind",
     "curve_surrogate",
     "diffuse_surrogate",
     "prepare_geometry",
@@ -304,12 +305,18 @@ def diffuse_surrogate(
     return Surrogate(geometry, "diffuse", base, shadings)
 
 
-def _behind(geometry: Geometry, views: Sequence[View], backdrops: Mapping[str, Image8]) -> UInt8[Tensor, "views H W 3"]:
-    """What each view shows where there is no object."""
-    full = np.empty((len(views), *geometry.size, 3), np.uint8)
-    for image, view in zip(full, views, strict=True):
+def behind(
+    views: Sequence[View], backdrops: Mapping[str, Image8], size: tuple[int, int]
+) -> UInt8[np.ndarray, "views H W 3"]:
+    """What each view shows where there is no object: its background, or the picture of ``backdrops`` that it names."""
+    images = np.empty((len(views), *size, 3), np.uint8)
+    for image, view in zip(images, views, strict=True):
         image[:] = view.background if view.backdrop is None else backdrops[view.backdrop]
-    return torch.from_numpy(full).to(geometry.device)
+    return images
+
+
+def _behind(geometry: Geometry, views: Sequence[View], backdrops: Mapping[str, Image8]) -> UInt8[Tensor, "views H W 3"]:
+    return torch.from_numpy(behind(views, backdrops, geometry.size)).to(geometry.device)
 
 
 def curve_surrogate(
@@ -330,13 +337,13 @@ def curve_surrogate(
     """
     base = torch.from_numpy(clean).to(geometry.device)
     levels = torch.tensor(list(greys), dtype=torch.uint8, device=base.device)
-    behind = _behind(geometry, views, backdrops)
+    uncovered = _behind(geometry, views, backdrops)
     shadings = [
         fit_curve(
             levels,
             torch.stack([batch.of(torch.from_numpy(probe).to(base.device)) for probe in probes]),
             batch.coverage,
-            batch.of(behind) / 255,
+            batch.of(uncovered) / 255,
             geometry.sampling.encoding,
         )
         for batch in geometry.batches
