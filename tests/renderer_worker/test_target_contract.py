@@ -10,7 +10,7 @@ import pytest
 from trompe_server.target import FakeTarget, RendererPool, SailenvTarget, TargetRenderer
 from trompe_shared.errors import RendererError
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import Object3D, object_from_files
+from trompe_shared.object3d import Object3D, encode_png, object_from_files
 
 SIZE = (40, 56)
 VIEWS = [View(Camera(0.3, azimuth, elevation)) for azimuth, elevation in ((0, 0), (60, 30), (0, 90), (10, -90))]
@@ -95,6 +95,29 @@ def test_every_way_to_a_worker_shows_exactly_the_same_bytes(
         with closing(target):
             for obj, images in zip(objects, expected, strict=True):
                 assert (target.render(obj, views, size=SIZE) == images).all()
+
+
+def test_an_object_of_which_alpha_alone_has_changed_is_not_shown_as_it_was(
+    worker: tuple[str, int], make_boxes: Boxes
+) -> None:
+    box = make_boxes(textures={"front": np.full((8, 8, 3), 200, np.uint8)})
+
+    def cut(columns: int) -> Object3D:
+        """The box, of whose front so many columns are cut out."""
+        alpha = np.full((8, 8), 255, np.uint8)
+        alpha[:, :columns] = 0
+        picture = np.dstack([box.textures["front_albedo.png"], alpha])
+        return object_from_files({**box.files, "front_albedo.png": encode_png(picture)})
+
+    objects = [cut(4), cut(2), box, cut(6)]
+    expected = []
+    for obj in objects:
+        with closing(SailenvTarget(*worker)) as fresh:
+            expected.append(fresh.render(obj, VIEWS[:1], size=SIZE))
+    assert len({image.tobytes() for image in expected}) == 4
+    with closing(SailenvTarget(*worker)) as target:
+        for obj, images in zip(objects, expected, strict=True):
+            assert (target.render(obj, VIEWS[:1], size=SIZE) == images).all()
 
 
 def test_many_textures_one_after_the_other_are_all_shown_right(target: SailenvTarget, make_boxes: Boxes) -> None:

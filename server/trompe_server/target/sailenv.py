@@ -14,6 +14,7 @@ from PIL import Image
 from trompe_shared.errors import ProtocolError, RendererError, RendererLostError
 from trompe_shared.geometry import View, light_travel_direction, sailenv_pose
 from trompe_shared.object3d import Object3D
+from trompe_shared.opacity import opacity_of
 from trompe_shared.sailenv import (
     COMMANDS,
     EXTENSIONS,
@@ -206,6 +207,8 @@ class _Connection:
             return True
         if not self._extended or not set(changed) <= obj.textures.keys():
             return False
+        if not all(np.array_equal(opacity_of(obj.files[name]), opacity_of(before.files[name])) for name in changed):
+            return False  # colours are sent, not what alpha cuts out
         pictures = [(name, (*obj.textures[name].shape[:2], obj.textures[name].tobytes())) for name in changed]
         try:
             self.ask("repaint_object", instance=instance, textures=pictures)
