@@ -207,7 +207,7 @@ class _Connection:
             return True
         if not self._extended or not set(changed) <= obj.textures.keys():
             return False
-        if not all(np.array_equal(opacity_of(obj.files[name]), opacity_of(before.files[name])) for name in changed):
+        if not all(_cut_alike(obj.files[name], before.files[name]) for name in changed):
             return False  # colours are sent, not what alpha cuts out
         pictures = [(name, (*obj.textures[name].shape[:2], obj.textures[name].tobytes())) for name in changed]
         try:
@@ -290,6 +290,14 @@ def _setting(view: View) -> list[tuple[str, Mapping[str, Any]]]:
         ("set_ambient_light_color", {"color": (round(255 * light.ambient),) * 3}),
         ("set_clear_color", {"color": tuple(view.background)}),
     ]
+
+
+def _cut_alike(one: bytes, other: bytes) -> bool:
+    """Whether the alpha of two albedo files cuts the same out of their surfaces."""
+    first, second = opacity_of(one), opacity_of(other)
+    if first is None or second is None:
+        return first is second
+    return np.array_equal(first, second)
 
 
 def _key(command: str, values: Mapping[str, Any]) -> tuple[str, Any]:
