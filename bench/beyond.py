@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from bench._common import BenchObject, assets, bench_objects, machine, markdown_table, running_renderer
-from trompe_server.attack import Goal, random_views
+from trompe_server.attack import Goal, ViewDistribution
 from trompe_server.attack.beyond import (
     LightPlace,
     LightRanges,
@@ -224,14 +224,9 @@ def attacks(stage: Stage, options: argparse.Namespace) -> Iterator[list[str]]:
 
 def staged(entry: BenchObject, target: SailenvTarget, network: NetworkClassifier, label: int) -> Stage:
     """The paper's 60 views of an object, and 60 held-out ones."""
-    held_out = random_views(
-        60,
-        distance=entry.distance,
-        elevation=entry.elevation,
-        background=entry.background,
-        generator=np.random.default_rng([0, 1]),
-    )
-    return Stage(entry, target, network, Goal(label), entry.views(), list(held_out))
+    unseen = ViewDistribution(entry.distance, entry.elevation, backgrounds=(entry.background,))
+    held_out = unseen.sample(60, generator=np.random.default_rng([0, 1]))
+    return Stage(entry, target, network, Goal(label), entry.views(), held_out)
 
 
 def main() -> None:

@@ -17,11 +17,11 @@ from trompe_server.attack import (
     Budget,
     Goal,
     Step,
+    ViewDistribution,
     attack,
     grid_views,
     load_state,
     movable,
-    random_views,
     save_state,
     start,
 )
@@ -203,7 +203,7 @@ def many_views(square: Object3D) -> Surrogate:
 
 def pool(n: int, *, seed: int) -> list[View]:
     generator = np.random.default_rng(seed)
-    return list(random_views(n, distance=2, elevation=(0, 40), background=(0, 0, 0), generator=generator))
+    return ViewDistribution(2, (0, 40), backgrounds=((0, 0, 0),)).sample(n, generator=generator)
 
 
 def losses(square: Object3D, surrogate: Surrogate, **options: Any) -> list[float]:
