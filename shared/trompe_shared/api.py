@@ -14,23 +14,35 @@ __all__ = [
     "Event",
     "Job",
     "JobList",
+    "JobRequest",
     "JobSpec",
     "JobState",
     "Judgement",
     "Loss",
     "ObjectInfo",
     "Optimiser",
+    "Priority",
     "Problem",
     "Progress",
     "Result",
     "SurrogateModel",
     "ViewPrediction",
     "ViewRanges",
+    "WorkerInfo",
 ]
 
 SurrogateModel = Literal["auto", "diffuse", "calibrated", "curve"]
 Optimiser = Literal["fgsm", "pgd", "momentum", "nesterov", "adam", "auto"]
 Loss = Literal["margin", "cross_entropy", "dlr"]
+Priority = Literal["interactive", "normal", "sweep"]
+Needs = Literal["any", "cpu", "cuda"]
+Labels = Annotated[
+    dict[
+        Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,62}$")],
+        Annotated[str, Field(min_length=1, max_length=200)],
+    ],
+    Field(max_length=32, description="names of your own and their values, to find jobs by"),
+]
 Range = tuple[float, float]
 Colour = tuple[
     Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)]
@@ -203,6 +215,18 @@ class JobSpec(_Schema):
         return self
 
 
+class JobRequest(JobSpec):
+    """A job to be queued: what to attack, and what the queue must know. The latter changes no result."""
+
+    priority: Priority = Field("normal", description="interactive jobs come first, sweeps last")
+    labels: Labels = Field(default_factory=dict)
+    needs: Needs = Field("any", description="what the worker that takes it must compute on")
+
+    def spec(self) -> JobSpec:
+        """The job alone."""
+        return JobSpec.model_validate(self.model_dump(include=set(JobSpec.model_fields)))
+
+
 class JobState(StrEnum):
     """States of a job. ``not_applicable`` (n.a.): no view was recognised before the attack, so nothing could drop."""
 
@@ -228,6 +252,7 @@ class Progress(_Schema):
     steps: int | None = None
     loss: float | None = None
     fooled: float | None = None
+    eta_seconds: float | None = Field(None, description="seconds until the job's end, as far as one can tell")
 
 
 class Job(_Schema):
@@ -236,6 +261,10 @@ class Job(_Schema):
     id: str
     state: JobState
     spec: JobSpec
+    priority: Priority = "normal"
+    labels: Labels = Field(default_factory=dict)
+    needs: Needs = "any"
+    worker: str | None = Field(None, description="the worker that runs it, or ran it last")
     created: datetime
     started: datetime | None = None
     finished: datetime | None = None
@@ -251,6 +280,18 @@ class JobList(_Schema):
 
     jobs: list[Job]
     next_cursor: str | None = None
+
+
+class WorkerInfo(_Schema):
+    """A process that runs jobs, as its last heartbeat told. ``job`` is the one that it works on."""
+
+    id: str
+    host: str
+    device: str
+    alive: bool
+    started: datetime
+    seen: datetime
+    job: str | None = None
 
 
 class Event(_Schema):
