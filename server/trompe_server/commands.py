@@ -1,7 +1,6 @@
-"""The commands that this package adds to ``trompe``: serve, worker, demo, doctor."""
+"""The commands that this package adds to ``trompe``: serve, worker, migrate, demo, doctor."""
 
 import functools
-import logging
 import subprocess
 import sys
 from collections.abc import Callable
@@ -10,17 +9,28 @@ from typing import ParamSpec, TypeVar
 
 import click
 
-from trompe_server.doctor import check_all
+from trompe_server.doctor import check_all, in_json, in_words
+from trompe_server.log import log_to_stderr
 from trompe_server.settings import Settings
 from trompe_shared.errors import TrompeError
 
-__all__ = ["demo", "doctor", "serve", "worker"]
+__all__ = ["demo", "doctor", "migrate", "serve", "worker"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 _data = click.option(
     "--data", type=click.Path(path_type=Path, file_okay=False), help="Folder of data (or TROMPE_DATA)."
+)
+_database = click.option(
+    "--database",
+    metavar="URL",
+    help="sqlite:///FILE or postgresql://... (or TROMPE_DATABASE). Default: in the data folder.",
+)
+_store = click.option(
+    "--store",
+    metavar="URL",
+    help="Folder or URL, such as s3://bucket, of files (or TROMPE_STORE). Default: the data folder.",
 )
 _device = click.option("--device", metavar="DEVICE", help="cpu, cuda or cuda:1 (or TROMPE_DEVICE). Default: cpu.")
 
@@ -46,12 +56,6 @@ def _settings(data: Path | None, **others: object) -> Settings:
     )
 
 
-def _log_to_stderr() -> None:
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    for chatty in ("httpx", "PIL", "OpenGL"):
-        logging.getLogger(chatty).setLevel(logging.WARNING)
-
-
 def _announce(line: str) -> None:
     click.echo(line)
     sys.stdout.flush()
@@ -63,45 +67,79 @@ def _announce(line: str) -> None:
     "--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="Port; 0 takes a free one."
 )
 @click.option(
+    "--workers",
+    type=click.IntRange(0, 64),
+    help="Attack workers, which share the cores (or TROMPE_WORKERS); 0 where all are elsewhere. Default: 1.",
+)
+@click.option(
     "--renderers",
-    type=click.IntRange(1, 64),
+    type=click.IntRange(0, 64),
     help="Renderer workers, which share each job's images (or TROMPE_RENDERERS). Default: 1.",
 )
 @_device
 @_data
+@_database
+@_store
 @_for_people
-def serve(host: str, port: int, renderers: int | None, device: str | None, data: Path | None) -> None:
-    """Run the service: REST API, one attack worker, its renderer workers, one folder of data."""
+def serve(host: str, port: int, data: Path | None, **options: str | int | None) -> None:
+    """Run the service: REST API, its attack workers and renderer workers, one folder of data."""
     from trompe_server.serving import run_service
 
-    _log_to_stderr()
-    run_service(_settings(data, device=device, renderers=renderers), host=host, port=port, announce=_announce)
+    log_to_stderr()
+    run_service(_settings(data, **options), host=host, port=port, announce=_announce)
 
 
 @click.command()
 @_data
+@_database
+@_store
 @click.option(
     "--renderer",
     "renderers",
-    required=True,
     multiple=True,
     metavar="HOST:PORT",
     help="A renderer worker that shows the objects. Several share the work.",
 )
+@click.option(
+    "--renderers-dns",
+    "names",
+    multiple=True,
+    metavar="NAME:PORT",
+    help="A name that the DNS resolves to the addresses of all renderer workers, looked up again and again.",
+)
 @_device
 @_for_people
-def worker(data: Path | None, renderers: tuple[str, ...], device: str | None) -> None:
-    """Run an attack worker, which takes jobs of a data folder one after the other."""
+def worker(data: Path | None, renderers: tuple[str, ...], names: tuple[str, ...], **options: str | None) -> None:
+    """Run an attack worker, which takes one job after the other, of any machine that shares database and store."""
+    from trompe_server.jobs.renderers import Renderers
     from trompe_server.jobs.worker import run_worker
 
-    _log_to_stderr()
-    run_worker(_settings(data, device=device), [_address(renderer) for renderer in renderers], announce=_announce)
+    if not renderers and not names:
+        raise click.UsageError("Say where the renderer workers are: --renderer HOST:PORT or --renderers-dns NAME:PORT.")
+    found = Renderers(tuple(_address(each) for each in renderers), tuple(_address(each) for each in names))
+    log_to_stderr()
+    run_worker(_settings(data, **options), found, announce=_announce)
+
+
+@click.command()
+@_data
+@_database
+@_for_people
+def migrate(data: Path | None, database: str | None) -> None:
+    """Make the database, or bring it up to date: once, before anything works with it."""
+    from trompe_server.jobs.worker import prepare_data
+
+    log_to_stderr()
+    prepare_data(_settings(data, database=database))
+    _announce("the database is up to date")
 
 
 def _address(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal():
-        raise click.BadParameter(f"{text!r} is not HOST:PORT, such as 127.0.0.1:8085", param_hint="--renderer")
+        raise click.BadParameter(
+            f"{text!r} is not HOST:PORT, such as 127.0.0.1:8085", param_hint="--renderer or --renderers-dns"
+        )
     return host, int(port)
 
 
@@ -115,9 +153,17 @@ def demo(out: Path) -> None:
 
 @click.command()
 @_data
-def doctor(data: Path | None) -> None:
+@_database
+@_store
+@_device
+@click.option("--json", "as_json", is_flag=True, help="Answer in JSON.")
+def doctor(data: Path | None, as_json: bool, **options: str | None) -> None:
     """Check that this machine can do the work, and say how to mend what it cannot."""
-    findings = check_all(_settings(data))
-    for finding in findings:
-        click.echo(f"{'ok  ' if finding.ok else 'FAIL'} {finding.what}: {finding.words}")
+    findings = []
+    for finding in check_all(_settings(data, **options)):
+        findings.append(finding)
+        if not as_json:
+            _announce(in_words(finding))
+    if as_json:
+        _announce(in_json(findings))
     sys.exit(0 if all(finding.ok for finding in findings) else 1)

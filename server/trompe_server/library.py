@@ -1,36 +1,41 @@
 """What jobs can name: objects, classifiers and backgrounds, uploaded (by the hash of their bytes) or shipped.
 
-Each uploaded thing is a folder ``<kind>/<id>`` with its bytes and an ``info.json``; one rename puts it in place.
+Each uploaded thing is a folder ``<kind>/<id>`` with its bytes and an ``info.json``, here or in an object store.
 """
 
 import hashlib
-import json
 import os
-import shutil
-import subprocess
-import sys
+import re
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import BinaryIO, Final, Generic, TypeVar
 
-from trompe_server.artifacts import LocalArtifacts
+from trompe_server.artifacts import Folder, LocalArtifacts
 from trompe_server.errors import AmbiguousError, NotFoundError
-from trompe_server.files import write_whole
+from trompe_server.files import no_space, write_whole
+from trompe_server.formats import import_file
+from trompe_server.sandbox import run_limited
 from trompe_shared.api import BackgroundInfo, ClassifierInfo, ObjectInfo
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
 from trompe_shared.object3d import decode_rgb, load_object
-from trompe_shared.shipped import shipped_objects
+from trompe_shared.shipped import ShippedObject, shipped_objects
 
 __all__ = ["Library"]
 
 INSPECTION_TIMEOUT: Final = 300.0
+INSPECTION_MEMORY: Final = 8 * 2**30
+"""Bytes of address space; networks of ImageNet's take less than half of it."""
 CLASSIFIER_ENDINGS: Final = {".pt2", ".pt", ".torchscript", ".onnx"}
 NAMED: Final = "torchvision:"
 """Begins the names of classifiers that torchvision brings."""
 _INFO: Final = "info.json"
+_UPLOAD: Final = "upload"
+"""An object as it came; beside it, ``data.zip`` is what it was turned into."""
+_ID: Final = re.compile(r"[0-9a-f]{64}")
 _PART: Final = 2**20
 
 
@@ -39,23 +44,29 @@ Info = TypeVar("Info", ObjectInfo, ClassifierInfo, BackgroundInfo)
 
 @dataclass(frozen=True)
 class _Shelf(Generic[Info]):
-    """Things of one kind. Shipped ones stand first, and their names mean them, whatever was uploaded."""
+    """Things of one kind. Shipped ones stand first, and their names mean them, whatever was uploaded.
+
+    A thing is there once its info is, which is written last.
+    """
 
     kind: str
-    folder: Path
+    folder: Folder
     model: type[Info]
     shipped: Callable[[], list[Info]]
 
     def all(self) -> list[Info]:
-        stored = sorted(self.folder.glob(f"[!.]*/{_INFO}"))
-        return self.shipped() + [self.model.model_validate_json(file.read_bytes()) for file in stored]
+        stored = (self.stored(identity) for identity in self.folder.folders())
+        return self.shipped() + [info for info in stored if info is not None]
 
     def find(self, reference: str) -> Info:
         """The thing with this id, name, or (from 6 characters) beginning of an id."""
+        if _ID.fullmatch(reference) and (stored := self.stored(reference)) is not None:
+            return stored
+        if shipped := [info for info in self.shipped() if info.name == reference]:
+            return shipped[0]
         known = self.all()
         for fits in (
             [info for info in known if info.id == reference],
-            [info for info in self.shipped() if info.name == reference],
             [info for info in known if info.name == reference],
             [info for info in known if len(reference) >= 6 and info.id.startswith(reference)],
         ):
@@ -69,37 +80,45 @@ class _Shelf(Generic[Info]):
             f"There is no {self.kind} {reference!r}. There are: {names}. Upload it, or name one of these."
         )
 
-    def payload(self, info: Info) -> Path:
-        return next(file for file in (self.folder / info.id).iterdir() if file.name.startswith("data"))
+    def place(self, info: Info) -> tuple[Folder, str]:
+        """The folder of an uploaded thing, and the name of its bytes there."""
+        folder = self.folder.within(info.id)
+        return folder, next(name for name in folder.names() if name.startswith("data"))
+
+    def payload(self, info: Info) -> bytes:
+        folder, name = self.place(info)
+        return folder.read(name)
 
     def put(self, info: Info, payload: Path) -> Info:
-        """Take the file ``payload`` (it is moved), or only renew the info where the same bytes are stored already."""
-        text = info.model_dump_json().encode()
-        place = self.folder / info.id
-        write_whole(payload.parent / _INFO, text)
-        try:
-            payload.parent.rename(place)
-        except OSError:
-            if not place.is_dir():
-                raise
-            write_whole(place / _INFO, text)
+        """Store the file ``payload``, or only renew the info where the same bytes are stored already."""
+        folder = self.folder.within(info.id)
+        if not folder.exists(_INFO):
+            folder.write_file(payload.name, payload)
+        folder.write(_INFO, info.model_dump_json().encode())
         return info
 
     def stored(self, identity: str) -> Info | None:
         """The uploaded thing with exactly this id."""
-        file = self.folder / identity / _INFO
-        return self.model.model_validate_json(file.read_bytes()) if file.exists() else None
+        try:
+            return self.model.model_validate_json(self.folder.within(identity).read(_INFO))
+        except FileNotFoundError:
+            return None
 
 
 class Library:
-    """What is stored below ``folder``, and what is shipped. References are ids, unique beginnings of ids, or names."""
+    """What is stored in ``folder``, and what is shipped. References are ids, unique beginnings of ids, or names.
 
-    def __init__(self, folder: Path) -> None:
-        self._objects = _Shelf("object", folder / "objects", ObjectInfo, _shipped_objects)
-        self._classifiers = _Shelf("classifier", folder / "classifiers", ClassifierInfo, _shipped_classifiers)
-        self._backgrounds = _Shelf("background", folder / "backgrounds", BackgroundInfo, list)
-        self.calibrations = LocalArtifacts(folder / "calibrations")
+    ``cache`` is a local folder for files that must have a path; without it there is a temporary one.
+    """
+
+    def __init__(self, folder: Folder | Path, *, cache: Path | None = None) -> None:
+        folder = LocalArtifacts(folder) if isinstance(folder, Path) else folder
+        self._objects = _Shelf("object", folder.within("objects"), ObjectInfo, _shipped_objects)
+        self._classifiers = _Shelf("classifier", folder.within("classifiers"), ClassifierInfo, _shipped_classifiers)
+        self._backgrounds = _Shelf("background", folder.within("backgrounds"), BackgroundInfo, list)
+        self.calibrations = folder.within("calibrations")
         """What jobs found out about the target, for later jobs."""
+        self._cache = cache or Path(tempfile.gettempdir(), f"trompe-cache-{os.getuid()}")
 
     def objects(self) -> list[ObjectInfo]:
         """All objects."""
@@ -112,14 +131,40 @@ class Library:
     def object_bytes(self, reference: str) -> bytes:
         """The archive of an object. Raises ``NotFoundError`` or ``AmbiguousError``."""
         info = self.object(reference)
-        return shipped_objects()[info.name].read() if info.shipped else self._objects.payload(info).read_bytes()
+        return shipped_objects()[info.name].read() if info.shipped else self._objects.payload(info)
 
-    def add_object(self, data: bytes, name: str) -> ObjectInfo:
-        """Store an object archive. Raises ``ObjectError`` for one that cannot be read; nothing is kept then."""
-        info = _describe_object(data, Path(name).stem or "object")
-        with _Intake(self._objects.folder) as intake:
-            payload = intake.folder / "data.zip"
-            write_whole(payload, data)
+    def original(self, reference: str) -> tuple[bytes, str] | None:
+        """The file that an object was uploaded as, and its name; ``None`` for a shipped one."""
+        info = self.object(reference)
+        if info.shipped:
+            return None
+        return self._objects.folder.within(info.id).read(_UPLOAD), info.filename or "object.zip"
+
+    def add_object(
+        self, file: BinaryIO, filename: str, *, name: str | None = None, max_texture: int | None = None
+    ) -> ObjectInfo:
+        """Store an object in any of the formats that are read, as it came and as SAILenv's zip.
+
+        ``max_texture`` is the longest side of a texture, in texels; larger ones are made smaller.
+        Raises ``ObjectError`` for a file that cannot be read; nothing is kept then.
+        """
+        with _intake() as intake:
+            upload = intake / _UPLOAD
+            identity = _copy(file, upload)
+            made = import_file(upload, name=filename, max_texture=max_texture)
+            info = ObjectInfo(
+                id=identity if max_texture is None else _identity(f"{identity} at most {max_texture}".encode()),
+                name=Path(name or filename).stem or "object",
+                materials=made.materials,
+                textures=dict(made.textures),
+                triangles=made.triangles,
+                radius=made.radius,
+                format=made.format,
+                filename=filename,
+            )
+            payload = intake / "data.zip"
+            write_whole(payload, made.archive)
+            self._objects.folder.within(info.id).write_file(_UPLOAD, upload)
             return self._objects.put(info, payload)
 
     def classifiers(self) -> list[ClassifierInfo]:
@@ -138,7 +183,20 @@ class Library:
         if reference.startswith(NAMED):
             return reference
         info = self.classifier(reference)
-        return info.name if info.shipped else str(self._classifiers.payload(info))
+        if info.shipped:
+            return info.name
+        folder, name = self._classifiers.place(info)
+        return str(folder.path(name) if isinstance(folder, LocalArtifacts) else self._local(info.id, folder, name))
+
+    def _local(self, identity: str, folder: Folder, name: str) -> Path:
+        """A copy on this machine of a stored file whose bytes have the hash ``identity``."""
+        path = self._cache / identity / name
+        if not path.exists():
+            with folder.open(name) as source, tempfile.NamedTemporaryFile() as copy:
+                if _copy(source, Path(copy.name)) != identity:
+                    raise ClassifierError(f"The stored file {identity[:12]} is damaged: upload the classifier again.")
+                write_whole(path, Path(copy.name))
+        return path
 
     def add_classifier(
         self, file: BinaryIO, filename: str, *, classes: Sequence[str] | None = None, name: str | None = None
@@ -153,8 +211,8 @@ class Library:
             raise ClassifierError(
                 f"{filename!r} is neither a .pt2 (torch.export), a TorchScript (.pt, .torchscript) nor an .onnx file."
             )
-        with _Intake(self._classifiers.folder) as intake:
-            payload = intake.folder / f"data{suffix}"
+        with _intake() as intake:
+            payload = intake / f"data{suffix}"
             identity = _copy(file, payload)
             found = _inspect(str(payload))
             _check_classes(classes, found)
@@ -176,7 +234,7 @@ class Library:
 
     def background_bytes(self, reference: str) -> bytes:
         """The image file of a background. Raises ``NotFoundError`` or ``AmbiguousError``."""
-        return self._backgrounds.payload(self.background(reference)).read_bytes()
+        return self._backgrounds.payload(self.background(reference))
 
     def add_background(self, data: bytes, name: str) -> BackgroundInfo:
         """Store an image file. Raises ``SpecError`` for one that is none; nothing is kept then."""
@@ -184,24 +242,17 @@ class Library:
             decode_rgb(data, name)
         except ObjectError as error:
             raise SpecError(f"The background {name!r} cannot be read as an image; send a PNG or a JPEG.") from error
-        with _Intake(self._backgrounds.folder) as intake:
-            payload = intake.folder / f"data{Path(name).suffix.lower()}"
+        with _intake() as intake:
+            payload = intake / f"data{Path(name).suffix.lower()}"
             write_whole(payload, data)
             return self._backgrounds.put(BackgroundInfo(id=_identity(data), name=Path(name).stem), payload)
 
 
-class _Intake:
-    """A hidden folder beside the stored things; whatever is left in it is removed at the end."""
-
-    def __init__(self, shelf: Path) -> None:
-        shelf.mkdir(parents=True, exist_ok=True)
-        self.folder = Path(tempfile.mkdtemp(dir=shelf, prefix=".intake-"))
-
-    def __enter__(self) -> "_Intake":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        shutil.rmtree(self.folder, ignore_errors=True)
+@contextmanager
+def _intake() -> Iterator[Path]:
+    """A folder for what comes in, until it is known to be good."""
+    with no_space(tempfile.gettempdir()), tempfile.TemporaryDirectory(prefix="trompe-intake-") as folder:
+        yield Path(folder)
 
 
 def _identity(data: bytes) -> str:
@@ -220,33 +271,31 @@ def _copy(source: BinaryIO, path: Path) -> str:
     return digest.hexdigest()
 
 
-def _describe_object(data: bytes, name: str, *, shipped: bool = False) -> ObjectInfo:
+def _describe_shipped(shipped: ShippedObject) -> ObjectInfo:
+    data = shipped.read()
     obj = load_object(data)
     return ObjectInfo(
         id=_identity(data),
-        name=name,
+        name=shipped.name,
         materials=sorted(obj.materials),
         textures={file: (image.shape[0], image.shape[1]) for file, image in obj.textures.items()},
         triangles=sum(len(part.faces) for part in obj.parts),
         radius=obj.radius,
-        shipped=shipped,
+        shipped=True,
     )
 
 
 def _inspect(path_or_name: str) -> dict[str, object]:
     """What a classifier is, read in a process of its own: this one stays free of torch and of what a file may do."""
-    command = [sys.executable, "-m", "trompe_server.classifiers.inspect", path_or_name]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=INSPECTION_TIMEOUT, check=False)
-        found = json.loads(done.stdout.strip().splitlines()[-1])
-    except (subprocess.TimeoutExpired, ValueError, IndexError) as error:
-        raise ClassifierError(
-            "The classifier could not be read: the process that tried ended without an answer. "
-            "Check that the file loads with torch.export.load or onnxruntime on this machine."
-        ) from error
-    if "error" in found:
-        raise ClassifierError(str(found["error"]))
-    return dict(found)
+    return dict(
+        run_limited(
+            "trompe_server.classifiers.inspect",
+            [path_or_name],
+            memory=INSPECTION_MEMORY,
+            seconds=INSPECTION_TIMEOUT,
+            failure=ClassifierError,
+        )
+    )
 
 
 @cache
@@ -266,7 +315,7 @@ def _check_classes(classes: Sequence[str] | None, found: dict[str, object]) -> N
 
 @cache
 def _shipped_objects() -> list[ObjectInfo]:
-    return [_describe_object(shipped.read(), name, shipped=True) for name, shipped in shipped_objects().items()]
+    return [_describe_shipped(shipped) for shipped in shipped_objects().values()]
 
 
 @cache

@@ -9,8 +9,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from trompe_shared.api import JobState, Progress
+from trompe_shared.errors import TrompeError
 
-__all__ = ["Artifacts", "PhaseReport", "Pipeline"]
+__all__ = ["VIEWS_AFTER", "VIEWS_BEFORE", "Artifacts", "DamagedFileError", "PhaseReport", "Pipeline"]
+
+VIEWS_BEFORE, VIEWS_AFTER = "views_before", "views_after"
+"""Names of the arrays (``.npz``) with all of the target's images, ``own`` and ``held_out``: (views, H, W, 3) uint8."""
 
 OnProgress = Callable[[Progress], None]
 
@@ -29,6 +33,12 @@ class Artifacts(Protocol):
     def exists(self, name: str) -> bool:
         """Whether there is a file ``name``."""
         ...
+
+
+class DamagedFileError(TrompeError):
+    """A file that an earlier phase left is missing or damaged; it is there again when that phase was run again."""
+
+    code = "damaged-file"
 
 
 @dataclass(frozen=True)
@@ -53,5 +63,7 @@ class Pipeline(Protocol):
         ...
 
     def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
-        """Run one phase. Raises ``TrompeError`` for what the user can mend."""
+        """Run one phase. Raises ``DamagedFileError`` where the phase before must be run again first, and other kinds of
+        ``TrompeError`` for what the user can mend.
+        """
         ...

@@ -1,19 +1,22 @@
 """``trompe serve``: children, database and HTTP server, put up in order and taken down in order."""
 
 import ipaddress
+import resource
 import signal
 import socket
 from collections.abc import Callable
 from types import FrameType
-from typing import NoReturn
+from typing import Any, Final, NoReturn
 
+import sqlalchemy as sa
 import uvicorn
 
+from trompe_server.access import Tokens
 from trompe_server.api.services import Services
 from trompe_server.app import create_app
+from trompe_server.artifacts import open_folder
 from trompe_server.errors import ServiceError
 from trompe_server.files import exclusive
-from trompe_server.jobs.engine import DbosQueue
 from trompe_server.jobs.store import JobStore
 from trompe_server.jobs.supervisor import Supervisor
 from trompe_server.jobs.worker import prepare_data
@@ -22,16 +25,23 @@ from trompe_server.settings import Settings
 
 __all__ = ["run_service"]
 
+BACKLOG: Final = 2048
+"""Connections that wait until they are accepted."""
+OPEN_FILES: Final = 65_536
+CHECKPOINT_PAGES: Final = 10_000
+"""Pages of 4 KiB that SQLite's log may have before the API moves them; the workers do at 1000."""
+
 
 def run_service(settings: Settings, *, host: str, port: int, announce: Callable[[str], None]) -> None:
     """Serve until SIGTERM or SIGINT. ``announce`` is given one line once everything is up; port 0 takes a free one.
 
     Raises ``ServiceError`` where the address, the data folder or one of the children is not to be had.
     """
-    _refuse_public(host, settings)
+    _refuse_without_renderers(settings)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _leave)
     prepare_data(settings)
+    _refuse_public(host, settings)
     with (
         exclusive(settings.data / "serve.lock", _in_use(settings)),
         _listen(host, port) as listener,
@@ -44,14 +54,36 @@ def run_service(settings: Settings, *, host: str, port: int, announce: Callable[
 def _serve_http(
     settings: Settings, supervisor: Supervisor, listener: socket.socket, announce: Callable[[str], None]
 ) -> None:
-    store, queue, library = JobStore(settings.database), DbosQueue(settings.database), Library(settings.library)
-    app = create_app(Services(settings, library, store, queue, supervisor.missing))
-    config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=5)
+    store, files = JobStore(settings.database_url, silence=settings.silence), open_folder(settings.store_url)
+    if store.engine.dialect.name == "sqlite":
+        sa.event.listen(store.engine, "connect", _leave_checkpoints_to_others)
+    library = Library(files.within("library"), cache=settings.data / "cache")
+    library.objects()  # those that are shipped are read now, not while the first request waits
+    tokens = Tokens(store.engine)
+    services = Services(settings, library, store, files, tokens, supervisor.renderer_infos, supervisor.missing)
+    app = create_app(services)
+    _allow_many_connections()
+    config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=5, backlog=BACKLOG, server_header=False)
     try:
         _Server(config, lambda: announce(f"trompe serving on {_url(listener)}")).run(sockets=[listener])
     finally:
-        queue.close()
         store.close()
+
+
+def _allow_many_connections() -> None:
+    """Ask the system for more open files, as far as it lets us have them: each connection is one."""
+    now, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if now not in {most, resource.RLIM_INFINITY} and now < OPEN_FILES:
+        wanted = OPEN_FILES if most == resource.RLIM_INFINITY else min(OPEN_FILES, most)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
+
+
+def _leave_checkpoints_to_others(connection: Any, _record: Any) -> None:
+    """Leave it to the workers to move what was written into the database file, which waits for the disk.
+
+    They write all the time, and nobody waits for their answer. Without them it happens here, later.
+    """
+    connection.execute(f"PRAGMA wal_autocheckpoint={CHECKPOINT_PAGES}")
 
 
 class _Server(uvicorn.Server):
@@ -69,7 +101,11 @@ class _Server(uvicorn.Server):
 def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=family, backlog=128)
+        listener = socket.create_server((host, port), family=family, backlog=BACKLOG)
+        # Connections inherit it. asyncio sets it by itself only where the socket names its protocol, and this one does
+        # not: without it every answer waits some 40 ms for the client's acknowledgement of its first half.
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return listener
     except OSError as error:
         raise ServiceError(
             f"Cannot listen on {host}:{port} ({error}). Choose another --port (0 takes a free one) or --host."
@@ -82,12 +118,26 @@ def _url(listener: socket.socket) -> str:
 
 
 def _refuse_public(host: str, settings: Settings) -> None:
-    if _is_loopback(host) or settings.allow_public:
+    if _is_loopback(host):
         return
-    raise ServiceError(
-        f"{host} can be reached from other machines, and the service asks nobody for a password. Use --host 127.0.0.1, "
-        "or set TROMPE_ALLOW_PUBLIC=1 where something in front of it decides who may come in."
-    )
+    store = JobStore(settings.database_url)
+    try:
+        closed = any(token.revoked is None for token in Tokens(store.engine).all())
+    finally:
+        store.close()
+    if not closed:
+        raise ServiceError(
+            f"{host} can be reached from other machines, and there is no token yet, so that anybody could come in. "
+            "Make one with: trompe token create NAME --right write; or use --host 127.0.0.1."
+        )
+
+
+def _refuse_without_renderers(settings: Settings) -> None:
+    if settings.workers and not settings.renderers:
+        raise ServiceError(
+            f"{settings.workers} attack workers have nothing to see by without a renderer: start some with "
+            "--renderers, or no attack worker with --workers 0, where workers elsewhere do the work."
+        )
 
 
 def _is_loopback(host: str) -> bool:

@@ -12,6 +12,7 @@ __all__ = [
     "BackgroundInfo",
     "ClassifierInfo",
     "Event",
+    "ExperimentInfo",
     "Job",
     "JobList",
     "JobRequest",
@@ -24,6 +25,7 @@ __all__ = [
     "Priority",
     "Problem",
     "Progress",
+    "RendererInfo",
     "Result",
     "SurrogateModel",
     "ViewPrediction",
@@ -62,6 +64,8 @@ class ObjectInfo(_Schema):
     textures: dict[str, tuple[int, int]] = Field(description="albedo file: (height, width) in texels")
     triangles: int
     radius: float = Field(description="metres")
+    format: str = Field(default="sailenv", description="what it came in: sailenv, obj, gltf, fbx, ply or stl")
+    filename: str | None = Field(default=None, description="name of the file that it was uploaded as")
     shipped: bool = False
 
 
@@ -168,7 +172,9 @@ class JobSpec(_Schema):
         None, description="scores asked per image and step, of a classifier that gives no gradients"
     )
     surrogate: SurrogateModel = "auto"
-    steps: Annotated[int, Field(ge=1, le=10_000)] = 30
+    steps: Annotated[int, Field(ge=1, le=10_000)] = Field(
+        90, description="at most so many; the attack ends sooner where all views are safely won"
+    )
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     distance: Annotated[float, Field(gt=0, le=1000)] | None = Field(
         None, description="metres; null is the shipped object's own, else it fills the frame"
@@ -252,7 +258,7 @@ class Progress(_Schema):
     steps: int | None = None
     loss: float | None = None
     fooled: float | None = None
-    eta_seconds: float | None = Field(None, description="seconds until the job's end, as far as one can tell")
+    eta_seconds: float | None = Field(default=None, description="seconds until the job's end, as far as one can tell")
 
 
 class Job(_Schema):
@@ -292,6 +298,21 @@ class WorkerInfo(_Schema):
     started: datetime
     seen: datetime
     job: str | None = None
+
+
+class RendererInfo(_Schema):
+    """A renderer worker. ``alive``: it accepts connections."""
+
+    address: str = Field(description="host:port")
+    alive: bool
+
+
+class ExperimentInfo(_Schema):
+    """The jobs with the label ``experiment=<name>``, counted by state. ``created`` is the time of the first one."""
+
+    name: str
+    jobs: dict[JobState, int]
+    created: datetime
 
 
 class Event(_Schema):
@@ -365,7 +386,7 @@ class Result(_Schema):
     surrogate_model: str
     surrogate_reason: str
     seed: int
-    steps: int
+    steps: int = Field(description="steps that the attack took; it ends sooner where all views are safely won")
     image_size: tuple[int, int]
     surrogate: Accuracy | None
     target: Accuracy

@@ -6,6 +6,8 @@ vertical field of view is 60 degrees. SAILenv (Unity) is left-handed: it uses th
 camera by Euler angles, and shows the mirror image of what a right-handed renderer shows.
 """
 
+import math
+import re
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -17,8 +19,10 @@ __all__ = [
     "Camera",
     "Light",
     "View",
+    "colour_of",
     "direction_to_angles",
     "euler_to_matrix",
+    "framing_distance",
     "light_travel_direction",
     "look_rotation",
     "sailenv_pose",
@@ -28,6 +32,8 @@ __all__ = [
 
 FIELD_OF_VIEW: Final = 60.0
 """Vertical field of view of every camera, degrees."""
+
+COLOURS: Final = {"white": (255, 255, 255), "black": (0, 0, 0)}
 
 Matrix = NDArray[np.float64]
 
@@ -150,3 +156,18 @@ def direction_to_angles(direction: Matrix) -> tuple[float, float]:
         raise ValueError(f"a light direction must be a finite vector of non-zero length, got {direction!r}")
     x, y, z = -np.asarray(direction, dtype=np.float64) / norm
     return float(np.degrees(np.arctan2(x, z))), float(np.degrees(np.arcsin(np.clip(y, -1.0, 1.0))))
+
+
+def framing_distance(radius: float) -> float:
+    """Distance, metres, at which an object of this radius fills most of the picture from every side."""
+    return 1.05 * radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
+
+
+def colour_of(text: str) -> tuple[int, int, int] | None:
+    """The colour (sRGB, 0..255) that a background's name means: white, black or #rrggbb; ``None`` for any other."""
+    if text in COLOURS:
+        return COLOURS[text]
+    if not re.fullmatch("#[0-9a-fA-F]{6}", text):
+        return None
+    red, green, blue = bytes.fromhex(text[1:])
+    return red, green, blue

@@ -10,6 +10,8 @@ import io
 import json
 import lzma
 import re
+import stat
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -34,13 +36,21 @@ __all__ = [
     "load_object",
     "object_from_files",
     "pack_zip",
+    "unpack",
     "unzip",
 ]
 
 MAX_ARCHIVE_BYTES: Final = 512 * 2**20
 MAX_MEMBERS: Final = 256
 MAX_TEXTURE_SIDE: Final = 8192
-MAX_FACES: Final = 2_000_000
+MAX_TEXELS: Final = 2 * MAX_TEXTURE_SIDE**2
+"""Of all albedo textures of an object together."""
+MAX_RATIO: Final = 200
+"""How many times its size an archive may unpack to, where that is much ..."""
+MUCH: Final = 64 * 2**20
+"""... which is more than this many bytes."""
+IMAGE_FORMATS: Final = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF", "GIF")
+"""What is read as a texture: of what Pillow knows, the kinds that run no other program."""
 
 _DAMAGED: Final = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError, EOFError, ValueError, OSError)
 """What ``zipfile`` raises for bytes that it cannot unpack."""
@@ -126,7 +136,7 @@ def encode_png(image: Image.Image | Texture) -> bytes:
 def decode_rgb(data: bytes, name: str) -> Texture:
     """Decode an image file to (H, W, 3) uint8. Raises ``ObjectError`` with ``name`` when it cannot be read."""
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with Image.open(io.BytesIO(data), formats=IMAGE_FORMATS) as image:
             if max(image.size) > MAX_TEXTURE_SIDE:
                 raise ObjectError(
                     f"Texture {name!r} is {image.size} pixels; at most {MAX_TEXTURE_SIDE} a side are read."
@@ -134,7 +144,7 @@ def decode_rgb(data: bytes, name: str) -> Texture:
             return np.array(image.convert("RGB"))
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise ObjectError(f"Texture {name!r} is too large ({error}); {MAX_TEXTURE_SIDE} a side are read.") from error
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, struct.error) as error:
         raise ObjectError(f"Texture {name!r} cannot be read as an image ({error}). Save it again as a PNG.") from error
 
 
@@ -167,23 +177,62 @@ def load_object(source: bytes | str | Path) -> Object3D:
 
 def unzip(data: bytes) -> dict[str, bytes]:
     """Members of a flat zip (one common folder is allowed and removed), within the limits. Raises ``ObjectError``."""
+    files = unpack(data)
+    if any("/" in name for name in files):
+        raise ObjectError("The archive must be flat: an .obj, its materials and its textures in one folder.")
+    return files
+
+
+def unpack(data: bytes) -> dict[str, bytes]:
+    """Members of a zip by their path below the folder that is common to all, in the order of the archive.
+
+    Raises ``ObjectError`` for an archive that is damaged, unpacks to too much, or holds what is no plain file below it.
+    """
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
     except _DAMAGED as error:
         raise ObjectError(f"The object is not a zip archive ({error}). Zip the folder that holds the .obj.") from error
     named = [info for info in archive.infolist() if info.filename]
     members = [info for info in named if not info.is_dir() and "__MACOSX" not in info.filename]
-    if len(members) > MAX_MEMBERS:
-        raise ObjectError(f"The archive has {len(members)} files; at most {MAX_MEMBERS} are read.")
-    if sum(info.file_size for info in members) > MAX_ARCHIVE_BYTES:
-        raise ObjectError(f"The archive unpacks to more than {MAX_ARCHIVE_BYTES >> 20} MiB.")
-    folders = {PurePosixPath(info.filename).parent for info in members}
-    if len(folders) > 1 or any(".." in folder.parts or folder.is_absolute() for folder in folders):
-        raise ObjectError("The archive must be flat: an .obj, its materials and its textures in one folder.")
+    _check_size(members, len(data))
+    paths = [_checked_path(info) for info in members]
+    common = _common_folder(paths)
+    names = ["/".join(path.parts[common:]) for path in paths]
+    if len(set(names)) < len(names):
+        raise ObjectError("The archive holds two files of one name; zip the folder again.")
     try:
-        return {PurePosixPath(info.filename).name: _read_member(archive, info) for info in members}
+        return {name: _read_member(archive, info) for name, info in zip(names, members, strict=True)}
     except _DAMAGED as error:
         raise ObjectError(f"The archive is damaged or encrypted ({error}). Zip the folder again.") from error
+
+
+def _check_size(members: list[zipfile.ZipInfo], packed: int) -> None:
+    if len(members) > MAX_MEMBERS:
+        raise ObjectError(f"The archive has {len(members)} files; at most {MAX_MEMBERS} are read.")
+    size = sum(info.file_size for info in members)
+    if size > MAX_ARCHIVE_BYTES:
+        raise ObjectError(f"The archive unpacks to more than {MAX_ARCHIVE_BYTES >> 20} MiB.")
+    if size > MUCH and size > MAX_RATIO * packed:
+        raise ObjectError(
+            f"The archive unpacks to {size // packed} times its size; at most {MAX_RATIO} times is read. "
+            "Save its textures as PNG."
+        )
+
+
+def _checked_path(info: zipfile.ZipInfo) -> PurePosixPath:
+    path = PurePosixPath(info.filename.replace("\\", "/"))
+    if path.is_absolute() or ".." in path.parts or re.match("[A-Za-z]:", info.filename):
+        raise ObjectError(f"The archive holds {info.filename[:80]!r}, which leads out of it; zip one folder.")
+    if stat.S_ISLNK(info.external_attr >> 16):
+        raise ObjectError(f"The archive holds the link {info.filename[:80]!r}; put the file itself there.")
+    return path
+
+
+def _common_folder(paths: list[PurePosixPath]) -> int:
+    """How many folders all ``paths`` have in common at their beginning."""
+    folders = [path.parts[:-1] for path in paths]
+    shortest = min(folders, key=len, default=())
+    return next((k for k, part in enumerate(shortest) if any(f[k] != part for f in folders)), len(shortest))
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
@@ -196,8 +245,8 @@ def object_from_files(files: Mapping[str, bytes]) -> Object3D:
     mesh = _mesh_name(files)
     name = mesh[: -len(".obj")]
     parts = parse_obj(files[mesh].decode("utf-8", "replace"), mesh)
-    if sum(len(part.faces) for part in parts) > MAX_FACES:
-        raise ObjectError(f"{mesh!r} has more than {MAX_FACES} triangles.")
+    if not any(np.ptp(part.vertices, axis=0).any() for part in parts):
+        raise ObjectError(f"{mesh!r} has no extent: all its corners are in one place.")
     materials = _materials(name, files)
     for part in parts:
         if part.material not in materials:
@@ -210,7 +259,10 @@ def object_from_files(files: Mapping[str, bytes]) -> Object3D:
     textures = {file: decode_rgb(_member(files, file), file) for file in albedos}
     for file in {f for m in used.values() for f in (m.normal, m.metallic) if f is not None}:
         decode_rgb(_member(files, file), file)
-    return Object3D(name, dict(files), parts, used, textures)
+    obj = Object3D(name, dict(files), parts, used, textures)
+    if obj.n_texels > MAX_TEXELS:
+        raise ObjectError(f"The albedo textures have {obj.n_texels} texels; at most {MAX_TEXELS} are read.")
+    return obj
 
 
 def _mesh_name(files: Mapping[str, bytes]) -> str:

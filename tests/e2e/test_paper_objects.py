@@ -1,5 +1,6 @@
 """The promise of the project on the paper's own objects: real renderer, real ImageNet network, the paper's 60 views."""
 
+import io
 import json
 import os
 from pathlib import Path
@@ -44,7 +45,7 @@ def run(
     """One whole job as the paper describes it: 6 azimuths x 10 elevations, epsilon 0.05, alpha 0.01."""
     assert ASSETS is not None
     paper = json.loads((Path(ASSETS) / "objects" / "objects.json").read_text())[name]
-    stored = library.add_object(load_object(Path(ASSETS) / "objects" / name).to_zip(), name)
+    stored = library.add_object(io.BytesIO(load_object(Path(ASSETS) / "objects" / name).to_zip()), name)
     spec = JobSpec(
         object=stored.id,
         label=paper["imagenet_class"],

@@ -6,7 +6,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from trompe_server import commands, doctor
+from trompe_server import commands
 from trompe_server.settings import Settings
 
 
@@ -16,11 +16,35 @@ def run(command: click.Command, *arguments: str) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::", "example.org"])
-def test_serve_refuses_to_be_seen_by_other_machines(tmp_path: Path, host: str) -> None:
-    status, words = run(commands.serve, "--host", host, "--port", "0", "--data", str(tmp_path / "data"))
+def test_serve_refuses_to_be_seen_by_other_machines_where_anybody_could_come_in(tmp_path: Path, host: str) -> None:
+    status, words = run(commands.serve, "--host", host, "--port", "0", "--data", str(tmp_path))
     assert status == 1
-    assert "TROMPE_ALLOW_PUBLIC=1" in words
-    assert not (tmp_path / "data").exists()
+    assert "trompe token create NAME" in words
+
+
+def test_attack_workers_without_a_renderer_are_refused(tmp_path: Path) -> None:
+    status, words = run(commands.serve, "--renderers", "0", "--data", str(tmp_path))
+    assert status == 1
+    assert "--workers 0" in words
+
+
+def test_a_worker_must_be_told_where_the_renderers_are(tmp_path: Path) -> None:
+    status, words = run(commands.worker, "--data", str(tmp_path))
+    assert status == 2
+    assert "--renderers-dns" in words
+
+
+@pytest.mark.parametrize("url", ["mysql://host/name", "nonsense", "sqlite://"])
+def test_a_database_that_cannot_be_used_is_refused_with_a_remedy(tmp_path: Path, url: str) -> None:
+    status, words = run(commands.migrate, "--data", str(tmp_path), "--database", url)
+    assert status == 1
+    assert "names no database" in words
+
+
+def test_migrating_makes_the_database_once_and_again(tmp_path: Path) -> None:
+    for _ in range(2):
+        assert run(commands.migrate, "--data", str(tmp_path)) == (0, "the database is up to date\n")
+    assert (tmp_path / "trompe.sqlite").exists()
 
 
 def test_serve_says_what_is_wrong_with_the_data_folder(tmp_path: Path) -> None:
@@ -41,21 +65,3 @@ def test_worker_refuses_a_renderer_that_is_no_address(tmp_path: Path, address: s
 def test_the_data_folder_is_set_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TROMPE_DATA", str(tmp_path))
     assert Settings().data == tmp_path
-
-
-def test_doctor_is_content_with_a_machine_that_can_do_the_work(tmp_path: Path) -> None:
-    findings = doctor.check_all(Settings(data=tmp_path))
-    assert [finding.words for finding in findings if not finding.ok] == []
-    assert {finding.what for finding in findings} == {"data folder", "torch", "rendering", "shipped objects"}
-
-
-def test_doctor_says_how_to_mend_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "file").touch()
-    monkeypatch.setattr(doctor, "_RENDER", "raise SystemExit('no EGL here')")
-    status, words = run(commands.doctor, "--data", str(tmp_path / "file" / "data"))
-    assert status == 1
-    assert "FAIL data folder" in words
-    assert "choose another with --data" in words
-    assert "FAIL rendering" in words
-    assert "no EGL here" in words
-    assert "apt install" in words

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
@@ -28,7 +29,7 @@ torch.export.save(torch.export.export(Net(), (torch.zeros(2, 3, 8, 12),), dynami
 
 
 def test_an_object_comes_back_byte_for_byte(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
-    info = Library(tmp_path).add_object(triangle_zip(), "triangle.zip")
+    info = Library(tmp_path).add_object(io.BytesIO(triangle_zip()), "triangle.zip")
     again = Library(tmp_path)
     assert again.object("triangle") == info
     assert again.object_bytes(info.id) == again.object_bytes(info.id[:6]) == triangle_zip()
@@ -39,14 +40,14 @@ def test_the_same_upload_from_many_sides_at_once_is_stored_once(
 ) -> None:
     library = Library(tmp_path)
     with ThreadPoolExecutor(8) as pool:
-        infos = list(pool.map(lambda _: library.add_object(triangle_zip(), "triangle.zip"), range(16)))
+        infos = list(pool.map(lambda _: library.add_object(io.BytesIO(triangle_zip()), "triangle.zip"), range(16)))
     assert len({info.id for info in infos}) == 1
     assert len(list(tmp_path.rglob("data.zip"))) == 1
     assert list(tmp_path.rglob(".*")) == []
 
 
 def test_short_beginnings_of_ids_are_not_taken(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
-    info = Library(tmp_path).add_object(triangle_zip(), "triangle.zip")
+    info = Library(tmp_path).add_object(io.BytesIO(triangle_zip()), "triangle.zip")
     with pytest.raises(NotFoundError, match="triangle"):
         Library(tmp_path).object(info.id[:5])
 
@@ -54,19 +55,24 @@ def test_short_beginnings_of_ids_are_not_taken(tmp_path: Path, triangle_zip: Cal
 def test_a_beginning_that_fits_two_ids_is_refused(
     tmp_path: Path, triangle_zip: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ids = iter(["abcdef1", "abcdef2"])
-    monkeypatch.setattr(library_module, "_identity", lambda _: next(ids))
+    ids, copy = iter(["abcdef1", "abcdef2"]), library_module._copy
+
+    def copy_and_name(source: BinaryIO, path: Path) -> str:
+        copy(source, path)
+        return next(ids)
+
+    monkeypatch.setattr(library_module, "_copy", copy_and_name)
     library = Library(tmp_path)
     library.objects()
     for name in ("one.zip", "two.zip"):
-        library.add_object(triangle_zip(), name)
+        library.add_object(io.BytesIO(triangle_zip()), name)
     with pytest.raises(AmbiguousError, match="abcdef1, abcdef2"):
         library.object("abcdef")
 
 
 def test_an_upload_that_cannot_be_read_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(ObjectError):
-        Library(tmp_path).add_object(b"no zip", "x.zip")
+        Library(tmp_path).add_object(io.BytesIO(b"no zip"), "x.zip")
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
 
 

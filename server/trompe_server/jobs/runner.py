@@ -1,29 +1,29 @@
-"""How a worker runs one job, phase by phase, under any engine that can call a step and remember what it returned."""
+"""How a worker runs one job: phase by phase, each noted when it is done, so that another worker can go on after it."""
 
 import logging
+import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final, TypeVar
 
-from sqlalchemy.exc import SQLAlchemyError
-
-from trompe_server.jobs.store import JobStore
-from trompe_server.pipeline import PhaseReport, Pipeline
-from trompe_shared.api import Job, JobState, Progress
+from trompe_server.database import DatabaseDownError, patiently
+from trompe_server.jobs.desk import Claim, Ending, JobDesk, LostJobError
+from trompe_server.pipeline import DamagedFileError, PhaseReport, Pipeline
+from trompe_shared.api import JobState, Progress
 from trompe_shared.errors import RendererError, TrompeError
 
-__all__ = ["JobRunner", "OpenedJob", "Outcome"]
+__all__ = ["JobRunner", "OpenedJob"]
 
 logger = logging.getLogger(__name__)
 
-Outcome = dict[str, Any]
-"""What a step returns and the engine keeps: ``{"state", "error", "note"}``, or ``{}`` when the job goes on."""
+T = TypeVar("T")
 
-Step = Callable[[str, Callable[[], Outcome]], Outcome]
-
-PROGRESS_INTERVAL: Final = 0.25
+PROGRESS_INTERVAL: Final = 1.0
 """Seconds between two writes of a job's progress."""
+DAMAGES: Final = 2
+"""So often a phase may find what it needs damaged and have it made again."""
 
 
 @dataclass(frozen=True)
@@ -34,124 +34,172 @@ class OpenedJob:
     close: Callable[[], None]
 
 
-OpenJob = Callable[[Job], OpenedJob]
+OpenJob = Callable[[Claim], OpenedJob]
 """Opens a job; raises ``TrompeError`` for what the user can mend."""
+TidyJob = Callable[[Claim, list[str]], None]
+"""Removes what a job that has ended needs no more: all files but the ones named."""
 
 
-class _Cancelled(BaseException):
-    """Unwinds a phase of a cancelled job; not an ``Exception``, so that no phase swallows it."""
+class _Stop(BaseException):
+    """Unwinds a phase; not an ``Exception``, so that no phase swallows it."""
+
+
+class _Cancelled(_Stop):
+    """The job shall be cancelled."""
+
+
+class _Lost(_Stop):
+    """The job is another worker's by now."""
 
 
 @dataclass
 class JobRunner:
-    """Runs jobs of ``store`` one at a time. ``current`` is the one that runs, ``touched`` when it last moved."""
+    """Runs jobs one at a time. ``current`` is the one that runs, ``touched`` when it last moved (monotonic).
 
-    store: JobStore
+    Setting ``lost`` makes the running job unwind at its next step; ``stopped`` ends waiting for a database that is
+    down.
+    """
+
+    desk: JobDesk
     open_job: OpenJob
-    current: str | None = None
+    tidy_job: TidyJob = lambda _claim, _kept: None
+    current: Claim | None = None
     touched: float = field(default_factory=time.monotonic)
+    lost: threading.Event = field(default_factory=threading.Event)
+    stopped: threading.Event = field(default_factory=threading.Event)
 
-    def run(self, job_id: str, step: Step) -> str:
-        """Run a job to its end, or go on with it; each phase is one ``step``. Never raises for what the job does."""
-        job = self.store.begin(job_id)
-        if job is None:
-            return self.store.get(job_id).state
-        self.current, self.touched = job_id, time.monotonic()
+    def run(self, claim: Claim) -> JobState | None:
+        """Run a job to its end, or go on with it; its state, or ``None`` where it was lost to another worker.
+
+        Never raises for what the job does.
+        """
+        self.lost.clear()
+        self.current, self.touched = claim, time.monotonic()
         try:
-            outcome = _guarded(job_id, lambda: self._run_phases(job, step))
-            self.store.finish(job_id, JobState(outcome["state"]), error=outcome.get("error"), note=outcome.get("note"))
+            ending = self._ending(claim)
+            kept = self.patiently(lambda: self.desk.finish(claim, ending))
+            self._tidy(claim, kept)
+            return ending.state
+        except (_Lost, LostJobError) as error:
+            logger.warning("job %s goes on elsewhere: %s", claim.job.id, error)
+            return None
         finally:
             self.current = None
-        return str(outcome["state"])
 
-    def _run_phases(self, job: Job, step: Step) -> Outcome:
-        phases = _Phases(job, self)
+    def patiently(self, action: Callable[[], T]) -> T:
+        """Do what asks the database, again and again while it is down."""
+        return patiently(action, stopped=self.stopped.is_set)
+
+    def _tidy(self, claim: Claim, kept: list[str]) -> None:
         try:
-            for name in phases.names():
-                outcome = step(name, lambda name=name: phases.run(name))  # type: ignore[misc]
-                if outcome:
-                    return outcome
-            return {"state": JobState.succeeded.value}
+            self.tidy_job(claim, kept)
+        except Exception:
+            logger.warning("what job %s needs no more could not be removed", claim.job.id, exc_info=True)
+
+    def _ending(self, claim: Claim) -> Ending:
+        """How the job ends; its failures are an ending, too."""
+        phases = _Phases(claim, self)
+        try:
+            return phases.run_all()
+        except _Cancelled:
+            return Ending(JobState.cancelled, note="cancelled")
+        except (LostJobError, DatabaseDownError):
+            raise
+        except TrompeError as error:
+            return Ending(JobState.failed, error=str(error))
+        except Exception as error:
+            logger.exception("job %s failed", claim.job.id)
+            message = f"{type(error).__name__}: {error}".strip().splitlines()[0][:500]
+            return Ending(JobState.failed, error=f"An unexpected error ended the job: {message}")
         finally:
             phases.close()
-
-    def report(self, job_id: str) -> Callable[[Progress], None]:
-        """A callback that writes progress now and then, and unwinds the phase when the job was cancelled."""
-        written = 0.0
-
-        def on_progress(progress: Progress) -> None:
-            nonlocal written
-            self.touched = time.monotonic()
-            if self.touched - written < PROGRESS_INTERVAL:
-                return
-            written = self.touched
-            try:
-                cancelled = self.store.advance(job_id, progress)
-            except SQLAlchemyError:
-                logger.warning("the progress of job %s could not be written; it runs on", job_id, exc_info=True)
-                return
-            if cancelled:
-                raise _Cancelled
-
-        return on_progress
 
 
 class _Phases:
     """The phases of one job in this process. The pipeline is opened anew when the renderer was lost."""
 
-    def __init__(self, job: Job, runner: JobRunner) -> None:
-        self._job, self._runner = job, runner
+    def __init__(self, claim: Claim, runner: JobRunner) -> None:
+        self._claim, self._runner = claim, runner
         self._opened: OpenedJob | None = None
+        self._eta = _Eta(claim.job.progress.fraction)
+        self._written = 0.0
 
-    def names(self) -> list[str]:
-        return self._open().pipeline.phases()
-
-    def run(self, phase: str) -> Outcome:
-        """Run one phase; what it did is written to the store, and its outcome returned for the engine to keep."""
-        return _guarded(self._job.id, lambda: self._run(phase))
+    def run_all(self) -> Ending:
+        """Run the phases that are left. One that finds damaged files has them made again by the phases before it."""
+        names, number = self._open().pipeline.phases(), self._claim.done
+        damages: Counter[int] = Counter()
+        while number < len(names):
+            try:
+                report = self._run(names[number])
+            except DamagedFileError as error:
+                damages[number] += 1
+                if number == 0 or damages[number] > DAMAGES:
+                    raise
+                logger.warning("job %s goes one phase back: %s", self._claim.job.id, error)
+                number -= 1
+                continue
+            if report.state is not None:
+                return Ending(report.state, note=report.note, progress=report.progress, public=report.public)
+            number += 1
+            self._note(report, done=number)
+        return Ending(JobState.succeeded)
 
     def close(self) -> None:
+        """Let go of the renderer."""
         if self._opened is not None:
             self._opened.close()
             self._opened = None
 
-    def _run(self, phase: str) -> Outcome:
-        if self._runner.store.cancel_requested(self._job.id):
-            raise _Cancelled
-        report = self._run_again_without_renderer(phase)
-        cancelled = self._runner.store.advance(self._job.id, report.progress, public=report.public)
-        self._runner.touched = time.monotonic()
-        if report.state is not None:
-            return {"state": report.state.value, "note": report.note}
+    def _run(self, phase: str) -> PhaseReport:
+        """Run a phase, and once more when the renderer went away: it is started again by whoever looks after it."""
+        try:
+            return self._open().pipeline.run(phase, self._on_progress)
+        except RendererError:
+            logger.warning("phase %s of job %s lost the renderer and is run again", phase, self._claim.job.id)
+            self.close()
+            return self._open().pipeline.run(phase, self._on_progress)
+
+    def _note(self, report: PhaseReport, *, done: int) -> None:
+        """Write that a phase is done; until that is written the next one does not begin."""
+        progress, desk = self._eta.told(report.progress), self._runner.desk
+        cancelled = self._runner.patiently(lambda: desk.advance(self._claim, progress, done=done, public=report.public))
+        self._runner.touched = self._written = time.monotonic()
         if cancelled:
             raise _Cancelled
-        return {}
 
-    def _run_again_without_renderer(self, phase: str) -> PhaseReport:
-        """Run a phase, and once more when the renderer went away: it is started again by whoever looks after it."""
-        on_progress = self._runner.report(self._job.id)
+    def _on_progress(self, progress: Progress) -> None:
+        """Write progress now and then, and unwind the phase when the job was cancelled or lost."""
+        self._runner.touched = time.monotonic()
+        if self._runner.lost.is_set():
+            raise _Lost("it was taken away")
+        if self._runner.touched - self._written < PROGRESS_INTERVAL:
+            return
+        self._written = self._runner.touched
         try:
-            return self._open().pipeline.run(phase, on_progress)
-        except RendererError:
-            logger.warning("phase %s of job %s lost the renderer and is run again", phase, self._job.id, exc_info=True)
-            self.close()
-            return self._open().pipeline.run(phase, on_progress)
+            cancelled = self._runner.desk.advance(self._claim, self._eta.told(progress))
+        except DatabaseDownError as error:
+            logger.warning("the progress of job %s could not be written, and it runs on: %s", self._claim.job.id, error)
+            return
+        except LostJobError as error:
+            raise _Lost(str(error)) from error
+        if cancelled:
+            raise _Cancelled
 
     def _open(self) -> OpenedJob:
         if self._opened is None:
-            self._opened = self._runner.open_job(self._job)
+            self._opened = self._runner.open_job(self._claim)
         return self._opened
 
 
-def _guarded(job_id: str, action: Callable[[], Outcome]) -> Outcome:
-    """What ``action`` returns, or the outcome that its failure or the job's cancellation means."""
-    try:
-        return action()
-    except _Cancelled:
-        return {"state": JobState.cancelled.value, "note": "cancelled"}
-    except TrompeError as error:
-        return {"state": JobState.failed.value, "error": str(error)}
-    except Exception as error:
-        logger.exception("job %s failed", job_id)
-        message = f"{type(error).__name__}: {error}".strip().splitlines()[0][:500]
-        return {"state": JobState.failed.value, "error": f"An unexpected error ended the job: {message}"}
+class _Eta:
+    """Tells how long a job still takes, as if it went on as fast as in this attempt so far."""
+
+    def __init__(self, fraction: float) -> None:
+        self._fraction, self._began = fraction, time.monotonic()
+
+    def told(self, progress: Progress) -> Progress:
+        """``progress`` with the seconds until the job's end, as soon as there is something to go by."""
+        gained, left = progress.fraction - self._fraction, 1.0 - progress.fraction
+        if gained <= 0.01:
+            return progress
+        return progress.model_copy(update={"eta_seconds": round((time.monotonic() - self._began) * left / gained, 1)})

@@ -1,232 +1,276 @@
-"""Our own record of jobs and of what happened to them: quick to list, whatever engine runs the jobs.
-
-It lives in the same SQLite file as the engine's tables, so that a job and its place in the queue are made in one
-transaction.
-"""
+"""The record of jobs as those see it who submit and watch them. What workers do with it is in ``desk``."""
 
 import secrets
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from datetime import UTC, datetime
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
 from typing import Any, Final
 
 import sqlalchemy as sa
+from sqlalchemy.exc import IntegrityError
 
-from trompe_server.errors import NotFoundError
-from trompe_shared.api import Event, Job, JobList, JobSpec, JobState, Progress
+from trompe_server.database import clock, connect, write
+from trompe_server.errors import ConflictError
+from trompe_server.jobs.migrate import migrate
+from trompe_server.jobs.tables import (
+    PRIORITIES,
+    append_event,
+    event_of,
+    events,
+    fresh,
+    job_of,
+    jobs,
+    labels,
+    locked,
+    time_of,
+    totals,
+    update_job,
+    workers,
+)
+from trompe_shared.api import Event, Job, JobList, JobRequest, JobState, Progress, WorkerInfo
 from trompe_shared.errors import SpecError
 
-__all__ = ["MAX_LOST", "JobStore"]
+__all__ = ["JobGroup", "JobStore", "Statistics"]
 
-MAX_LOST: Final = 3
-"""A job that ended this many workers is failed."""
 
-_metadata = sa.MetaData()
-_jobs = sa.Table(
-    "jobs",
-    _metadata,
-    sa.Column("number", sa.Integer, primary_key=True, autoincrement=True),
-    sa.Column("id", sa.String, unique=True, nullable=False),
-    sa.Column("state", sa.String, nullable=False, index=True),
-    sa.Column("spec", sa.JSON, nullable=False),
-    sa.Column("created", sa.Float, nullable=False),
-    sa.Column("started", sa.Float),
-    sa.Column("finished", sa.Float),
-    sa.Column("progress", sa.JSON, nullable=False),
-    sa.Column("attempts", sa.Integer, nullable=False, default=0),
-    sa.Column("lost", sa.Integer, nullable=False, default=0),
-    sa.Column("cancel_requested", sa.Boolean, nullable=False, default=False),
-    sa.Column("error", sa.String),
-    sa.Column("note", sa.String),
-    sa.Column("artifacts", sa.JSON, nullable=False, default=list),
-    sqlite_autoincrement=True,
-)
-_events = sa.Table(
-    "job_events",
-    _metadata,
-    sa.Column("job", sa.String, primary_key=True),
-    sa.Column("id", sa.Integer, primary_key=True),
-    sa.Column("time", sa.Float, nullable=False),
-    sa.Column("state", sa.String, nullable=False),
-    sa.Column("progress", sa.JSON, nullable=False),
-    sa.Column("message", sa.String),
-)
+@dataclass(frozen=True)
+class Statistics:
+    """The whole service at one moment. ``oldest_queued``: seconds that the oldest queued job waits, 0 without one.
+
+    The others are sums over all workers since the beginning: steps of attacks and their seconds, images that
+    classifiers were shown and their seconds, images that the target rendered and its seconds.
+    """
+
+    jobs: Mapping[JobState, int]
+    oldest_queued: float
+    attack_steps: float = 0.0
+    step_seconds: float = 0.0
+    classifier_images: float = 0.0
+    classifier_seconds: float = 0.0
+    target_renders: float = 0.0
+    target_seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class JobGroup:
+    """Jobs that have the same value of a label: how many in which state, and when the first was made."""
+
+    value: str
+    counts: Mapping[JobState, int]
+    created: datetime
 
 
 class JobStore:
-    """Jobs and their events in the SQLite file ``database``. Safe to use from many threads and processes."""
+    """Jobs and their events in the database at ``url``. Safe to use from many threads and processes.
 
-    def __init__(self, database: Path) -> None:
-        self._engine = sa.create_engine(f"sqlite:///{database}")
-        sa.event.listen(self._engine, "connect", _prepare_connection)
+    Every method raises ``DatabaseDownError``, a ``ServiceError``, where the database cannot be reached.
+    """
+
+    def __init__(self, url: str, *, silence: float = 30.0) -> None:
+        self._silence = silence
+        self.engine = connect(url)
 
     def migrate(self) -> None:
-        """Make the tables where they are missing, and put the file in WAL mode, which lasts."""
-        with self._engine.connect() as connection:
-            connection.exec_driver_sql("PRAGMA journal_mode=WAL")
-        with self._write() as connection:
-            _metadata.create_all(connection)
+        """Make the tables, or bring them up to date."""
+        migrate(self.engine)
 
     def close(self) -> None:
-        """Let go of the file."""
-        self._engine.dispose()
+        """Let go of the database."""
+        self.engine.dispose()
 
-    def create(self, spec: JobSpec, enqueue: Callable[[sa.Connection, str], None]) -> Job:
-        """A new queued job. ``enqueue`` puts its id in the engine's queue within the same transaction."""
-        job = secrets.token_hex(8)
-        with self._write() as connection:
-            row = {"id": job, "state": JobState.queued, "spec": spec.model_dump(mode="json"), "created": time.time()}
-            connection.execute(_jobs.insert().values(row | {"progress": Progress().model_dump(mode="json")}))
-            self._log(connection, job, "queued")
-            enqueue(connection, job)
-            return self._get(connection, job)
+    def create(
+        self,
+        request: JobRequest,
+        enqueue: Callable[[sa.Connection, str], None] | None = None,
+        *,
+        idempotency_key: str | None = None,
+    ) -> tuple[Job, bool]:
+        """A new queued job, and whether it is new: the same ``idempotency_key`` gives the job that it gave before.
+
+        Raises ``ConflictError`` where the key came with another request.
+        """
+        try:
+            with write(self.engine) as connection:
+                return self._create(connection, request, idempotency_key)
+        except IntegrityError:  # the same key at the same time, which has made the job meanwhile
+            with write(self.engine) as connection:
+                return self._create(connection, request, idempotency_key)
+
+    def _create(self, connection: sa.Connection, request: JobRequest, key: str | None) -> tuple[Job, bool]:
+        if key is not None:
+            known = connection.execute(sa.select(jobs).where(jobs.c.idempotency_key == key)).one_or_none()
+            if known is not None:
+                return _the_same(job_of(known), request, key), False
+        row = connection.execute(jobs.insert().values(_row(request, key)).returning(jobs)).one()
+        if request.labels:
+            pairs = [{"key": name, "value": value, "number": row.number} for name, value in request.labels.items()]
+            connection.execute(labels.insert(), pairs)
+        append_event(connection, row, "queued")
+        return job_of(row), True
 
     def get(self, job: str) -> Job:
         """The job with this id. Raises ``NotFoundError``."""
-        with self._engine.connect() as connection:
-            return self._get(connection, job)
+        with self.engine.connect() as connection:
+            return job_of(fresh(connection, job))
 
-    def page(self, *, state: JobState | None = None, limit: int = 50, cursor: str | None = None) -> JobList:
-        """One page of jobs, newest first. Raises ``SpecError`` for a cursor that is none of ours."""
-        query = sa.select(_jobs).order_by(_jobs.c.number.desc()).limit(limit + 1)
-        if state is not None:
-            query = query.where(_jobs.c.state == state)
+    def page(
+        self,
+        *,
+        state: JobState | None = None,
+        labels: Mapping[str, str] | None = None,
+        object: str | None = None,
+        classifier: str | None = None,
+        limit: int = 50,
+        cursor: str | None = None,
+    ) -> JobList:
+        """One page of jobs, newest first, of those that fit all filters. Raises ``SpecError`` for a cursor not ours."""
+        filters = {"state": state, "object": object, "classifier": classifier}
+        query = sa.select(jobs).where(*(jobs.c[name] == value for name, value in filters.items() if value is not None))
+        number: sa.ColumnElement[int] = jobs.c.number
+        for key, value in (labels or {}).items():
+            having = _having(key, value)
+            query = query.join(having, having.c.number == jobs.c.number)
+            number = having.c.number  # the order of the index of labels is the order of the page
         if cursor is not None:
-            if not cursor.isdecimal():
-                raise SpecError(f"{cursor!r} is not a cursor; pass next_cursor of the page before.")
-            query = query.where(_jobs.c.number < int(cursor))
-        with self._engine.connect() as connection:
-            rows = connection.execute(query).all()
+            query = query.where(number < _number(cursor))
+        with self.engine.connect() as connection:
+            rows = connection.execute(query.order_by(number.desc()).limit(limit + 1)).all()
         page = rows[:limit]
         return JobList(
-            jobs=[_job(row) for row in page], next_cursor=str(page[-1].number) if len(rows) > limit else None
+            jobs=[job_of(row) for row in page], next_cursor=str(page[-1].number) if len(rows) > limit else None
         )
+
+    def groups(self, key: str) -> list[JobGroup]:
+        """The values of a label, those of the newest jobs first."""
+        first = sa.func.min(jobs.c.created).label("first")
+        query = sa.select(labels.c.value, jobs.c.state, sa.func.count().label("amount"), first)
+        query = query.join(jobs, jobs.c.number == labels.c.number).where(labels.c.key == key)
+        found: dict[str, tuple[dict[JobState, int], float]] = {}
+        with self.engine.connect() as connection:
+            for row in connection.execute(query.group_by(labels.c.value, jobs.c.state)):
+                counts, created = found.get(row.value, ({}, row.first))
+                found[row.value] = counts | {JobState(row.state): row.amount}, min(created, row.first)
+        newest = sorted(found.items(), key=lambda item: item[1][1], reverse=True)
+        return [JobGroup(value, counts, time_of(created)) for value, (counts, created) in newest]  # type: ignore[arg-type]
+
+    def counts(self) -> dict[JobState, int]:
+        """How many jobs there are in each state."""
+        query = sa.select(jobs.c.state, sa.func.count().label("amount")).group_by(jobs.c.state)
+        with self.engine.connect() as connection:
+            found = {row.state: row.amount for row in connection.execute(query)}
+        return {state: found.get(state.value, 0) for state in JobState}
 
     def events(self, job: str, *, after: int = 0) -> list[Event]:
         """Events of a job with ids above ``after``, oldest first."""
-        query = sa.select(_events).where(_events.c.job == job, _events.c.id > after).order_by(_events.c.id)
-        with self._engine.connect() as connection:
-            return [_event(row) for row in connection.execute(query)]
+        query = sa.select(events).where(events.c.job == job, events.c.id > after).order_by(events.c.id)
+        with self.engine.connect() as connection:
+            return [event_of(row) for row in connection.execute(query)]
 
     def request_cancel(self, job: str) -> Job:
         """Cancel a queued job at once, and ask the worker of a running one to stop. Raises ``NotFoundError``."""
-        with self._write() as connection:
-            state = self._get(connection, job).state
-            if state is JobState.queued:
-                self._finish(connection, job, JobState.cancelled, message="cancelled before it started")
-            elif state is JobState.running:
-                self._update(connection, job, cancel_requested=True)
-                self._log(connection, job, "cancel requested")
-            return self._get(connection, job)
+        with write(self.engine) as connection:
+            row = locked(connection, job)
+            if row.state == JobState.queued:
+                end = {"state": JobState.cancelled.value, "finished": clock()}
+                row = update_job(connection, job, message="cancelled before it started", **end)
+            elif row.state == JobState.running and not row.cancel_requested:
+                row = update_job(connection, job, message="cancel requested", cancel_requested=True)
+            return job_of(row)
 
-    def begin(self, job: str) -> Job | None:
-        """Note that a worker takes the job up; None when there is nothing to do any more.
+    def delete(self, job: str) -> None:
+        """Forget a job that has ended; its artifacts are the caller's. Raises ``NotFoundError``, ``ConflictError``."""
+        with write(self.engine) as connection:
+            row = locked(connection, job)
+            if not JobState(row.state).final:
+                raise ConflictError(
+                    f"Job {job} is {row.state}: only jobs that have ended can be deleted. Cancel it first."
+                )
+            forget(connection, [row])
 
-        A job that is found running was lost by a worker that died; the third time it is failed.
-        """
-        with self._write() as connection:
-            row = self._row(connection, job)
-            if JobState(row.state).final:
-                return None
-            lost = row.lost + (row.state == JobState.running)
-            if row.cancel_requested:
-                self._finish(connection, job, JobState.cancelled, message="cancelled")
-                return None
-            if lost >= MAX_LOST:
-                self._finish(connection, job, JobState.failed, error=_killed_workers(lost), lost=lost)
-                return None
-            started = row.started or time.time()
-            self._update(connection, job, state=JobState.running, attempts=row.attempts + 1, lost=lost, started=started)
-            self._log(connection, job, "started" if row.attempts == 0 else "goes on after an interruption")
-            return self._get(connection, job)
+    def ended_before(self, seconds: float, *, limit: int = 100) -> list[str]:
+        """Ids of jobs that ended more than so many seconds ago, the oldest first."""
+        query = sa.select(jobs.c.id).where(jobs.c.finished < clock() - seconds).order_by(jobs.c.finished).limit(limit)
+        with self.engine.connect() as connection:
+            return list(connection.execute(query).scalars())
 
-    def give_back(self, job: str) -> None:
-        """A worker that stops in good order leaves the job to the next one; this does not count against the job."""
-        with self._write() as connection:
-            if self._row(connection, job).state == JobState.running:
-                self._update(connection, job, state=JobState.queued)
-                self._log(connection, job, "the worker stopped; the job goes on with the next one")
+    def workers(self) -> list[WorkerInfo]:
+        """The workers that there are or lately were."""
+        alive = (workers.c.seen > clock() - self._silence).label("alive")
+        with self.engine.connect() as connection:
+            rows = connection.execute(sa.select(workers, alive).order_by(workers.c.id)).all()
+        return [
+            WorkerInfo.model_validate(
+                {name: getattr(row, name) for name in ("id", "host", "device", "alive", "job")}
+                | {"started": time_of(row.started), "seen": time_of(row.seen)}
+            )
+            for row in rows
+        ]
 
-    def advance(self, job: str, progress: Progress, *, public: tuple[str, ...] = ()) -> bool:
-        """Note progress, and artifacts that are for the user. Returns whether the job shall be cancelled."""
-        with self._write() as connection:
-            row = self._row(connection, job)
-            artifacts = list(dict.fromkeys([*row.artifacts, *public]))
-            self._update(connection, job, progress=progress.model_dump(mode="json"), artifacts=artifacts)
-            self._log(connection, job)
-            return bool(row.cancel_requested)
-
-    def cancel_requested(self, job: str) -> bool:
-        """Whether the job shall be cancelled."""
-        with self._engine.connect() as connection:
-            return bool(self._row(connection, job).cancel_requested)
-
-    def finish(self, job: str, state: JobState, *, error: str | None = None, note: str | None = None) -> None:
-        """End the job; a job that has ended already stays as it is."""
-        with self._write() as connection:
-            if not JobState(self._row(connection, job).state).final:
-                self._finish(connection, job, state, message=error or note, error=error, note=note)
-
-    @contextmanager
-    def _write(self) -> Iterator[sa.Connection]:
-        """A transaction that holds the write lock from its beginning, so that what it read stays true."""
-        with self._engine.begin() as connection:
-            connection.exec_driver_sql("BEGIN IMMEDIATE")
-            yield connection
-
-    def _row(self, connection: sa.Connection, job: str) -> "sa.Row[Any]":
-        row = connection.execute(sa.select(_jobs).where(_jobs.c.id == job)).one_or_none()
-        if row is None:
-            raise NotFoundError(f"There is no job {job!r}. GET /v1/jobs lists them.")
-        return row
-
-    def _get(self, connection: sa.Connection, job: str) -> Job:
-        return _job(self._row(connection, job))
-
-    def _update(self, connection: sa.Connection, job: str, **values: Any) -> None:
-        connection.execute(_jobs.update().where(_jobs.c.id == job).values(**values))
-
-    def _finish(
-        self, connection: sa.Connection, job: str, state: JobState, *, message: str | None = None, **values: Any
-    ) -> None:
-        self._update(connection, job, state=state, finished=time.time(), **values)
-        self._log(connection, job, message or values.get("error"))
-
-    def _log(self, connection: sa.Connection, job: str, message: str | None = None) -> None:
-        """Append an event that shows the job as it is now."""
-        row = self._row(connection, job)
-        last = sa.select(sa.func.coalesce(sa.func.max(_events.c.id), 0)).where(_events.c.job == job)
-        number = connection.execute(last).scalar_one() + 1
-        values = {"job": job, "id": number, "time": time.time(), "state": row.state, "progress": row.progress}
-        connection.execute(_events.insert().values(values | {"message": message}))
+    def statistics(self) -> Statistics:
+        """Figures of the whole service."""
+        oldest = sa.select(clock() - jobs.c.created).where(jobs.c.state == JobState.queued.value)
+        with self.engine.connect() as connection:
+            waits = connection.execute(oldest.order_by(jobs.c.number).limit(1)).scalar_one_or_none()
+            sums: dict[str, float] = {row.name: row.value for row in connection.execute(sa.select(totals))}
+        return Statistics(self.counts(), max(0.0, waits or 0.0), **sums)
 
 
-def _prepare_connection(connection: Any, _record: Any) -> None:
-    connection.isolation_level = "IMMEDIATE"
-    connection.execute("PRAGMA busy_timeout=30000")
-    connection.execute("PRAGMA synchronous=NORMAL")
+def forget(connection: sa.Connection, rows: list[Any]) -> None:
+    """Delete jobs with all that the database knows of them."""
+    numbers = [row.number for row in rows]
+    connection.execute(labels.delete().where(labels.c.number.in_(numbers)))
+    connection.execute(events.delete().where(events.c.job.in_([row.id for row in rows])))
+    connection.execute(jobs.delete().where(jobs.c.number.in_(numbers)))
 
 
-def _killed_workers(lost: int) -> str:
-    return f"{lost} workers died while they ran this job, so it is not tried again; the log of the service says how."
-
-
-def _time(seconds: float | None) -> datetime | None:
-    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
-
-
-def _job(row: "sa.Row[Any]") -> Job:
-    times = {name: _time(getattr(row, name)) for name in ("created", "started", "finished")}
-    same = {
-        name: getattr(row, name)
-        for name in ("id", "state", "spec", "progress", "attempts", "error", "note", "artifacts")
+def _row(request: JobRequest, key: str | None) -> dict[str, Any]:
+    spec = request.spec().model_dump(mode="json")
+    return _NEW | {
+        "id": secrets.token_hex(8),
+        "spec": spec,
+        "object": request.object,
+        "classifier": request.classifier,
+        "priority": PRIORITIES[request.priority],
+        "needs": request.needs,
+        "labels": request.labels,
+        "idempotency_key": key,
+        "created": clock(),
     }
-    return Job.model_validate(same | times)
 
 
-def _event(row: "sa.Row[Any]") -> Event:
-    return Event.model_validate(
-        {"id": row.id, "time": _time(row.time), "state": row.state, "progress": row.progress, "message": row.message}
-    )
+_NEW: Final = {
+    "state": JobState.queued.value,
+    "progress": Progress().model_dump(mode="json"),
+    "done": 0,
+    "attempts": 0,
+    "lost": 0,
+    "events": 1,
+    "cancel_requested": False,
+    "artifacts": [],
+}
+
+
+def _the_same(job: Job, request: JobRequest, key: str) -> Job:
+    """``job``, if it is what ``request`` asks for."""
+    if (job.spec, job.priority, job.labels, job.needs) != (
+        request.spec(),
+        request.priority,
+        request.labels,
+        request.needs,
+    ):
+        raise ConflictError(
+            f"The idempotency key {key!r} came with another request before, which made job {job.id}; "
+            "use a new key for a new request."
+        )
+    return job
+
+
+def _having(key: str, value: str) -> sa.Subquery:
+    """The numbers of the jobs with this label."""
+    return sa.select(labels.c.number).where(labels.c.key == key, labels.c.value == value).subquery()
+
+
+def _number(cursor: str) -> int:
+    if not (cursor.isdecimal() and cursor.isascii() and len(cursor) < 19):
+        raise SpecError(f"{cursor!r} is not a cursor; pass next_cursor of the page before.")
+    return int(cursor)

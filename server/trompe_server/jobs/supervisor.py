@@ -1,13 +1,15 @@
-"""Looks after the children of ``trompe serve``, renderer and worker: starts them, again and again, and stops them."""
+"""Looks after the children of ``trompe serve``, renderers and workers: starts them, again and again, and stops them."""
 
 import logging
+import os
 import re
 import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from types import TracebackType
 from typing import Final, Self
@@ -15,6 +17,7 @@ from typing import Final, Self
 from trompe_server.errors import ServiceError
 from trompe_server.jobs.worker import READY
 from trompe_server.settings import Settings
+from trompe_shared.api import RendererInfo
 
 __all__ = ["Child", "Supervisor"]
 
@@ -25,6 +28,8 @@ BACKOFF: Final = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 STEADY: Final = 30.0
 """A child that ran for so many seconds starts again with the shortest wait."""
 STOP_PATIENCE: Final = 10.0
+NICE: Final = 10
+"""How far the children stand back for the API, which shall answer at once while they compute on all cores."""
 GIVE_UP: Final = 3
 """A child that died so often before it was ever ready will not come up."""
 
@@ -32,11 +37,19 @@ GIVE_UP: Final = 3
 class Child:
     """One supervised process. ``command`` is asked for its arguments at each start.
 
-    ``ready`` matches the line that it prints once it is up; its other lines are ours to pass on.
+    ``ready`` matches the line that it prints once it is up; its other lines are ours to pass on. ``environment`` is
+    what it is told besides our own.
     """
 
-    def __init__(self, name: str, command: Callable[[], list[str]], ready: re.Pattern[str]) -> None:
+    def __init__(
+        self,
+        name: str,
+        command: Callable[[], list[str]],
+        ready: re.Pattern[str],
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         self.name, self._command, self._ready = name, command, ready
+        self._environment = os.environ | (environment or {})
         self.match: re.Match[str] | None = None
         self.failures = 0
         self._process: subprocess.Popen[str] | None = None
@@ -95,8 +108,11 @@ class Child:
         """
         command = [sys.executable, "-m", "trompe_server.jobs.leash", *self._command()]
         pipe = subprocess.PIPE
-        with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, process_group=0) as process:
+        with subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, text=True, process_group=0, env=self._environment
+        ) as process:
             self._process = process
+            os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + NICE)
             if self._stopping.is_set():
                 process.terminate()
             assert process.stdout is not None
@@ -125,7 +141,9 @@ class Supervisor:
         self.renderers = [
             Child("renderer worker", partial(self._render, number), listening) for number in range(settings.renderers)
         ]
-        self.worker = Child("attack worker", self._work, re.compile(f"^{re.escape(READY)}$"))
+        ready = re.compile(f"^{re.escape(READY)}$")
+        environment = worker_environment(settings)
+        self.workers = [Child("attack worker", self._work, ready, environment) for _ in range(settings.workers)]
 
     def __enter__(self) -> Self:
         return self
@@ -141,28 +159,46 @@ class Supervisor:
         for renderer in self.renderers:
             renderer.start()
         self._ports = [int(renderer.wait_ready(deadline)[2]) for renderer in self.renderers]
-        self.worker.start()
-        self.worker.wait_ready(deadline)
+        for worker in self.workers:
+            worker.start()
+        for worker in self.workers:
+            worker.wait_ready(deadline)
 
     def stop(self) -> None:
-        """End all, the attack worker first."""
-        self.worker.stop()
-        for renderer in self.renderers:
-            renderer.stop()
+        """End all, the attack workers first."""
+        for children in (self.workers, self.renderers):
+            with ThreadPoolExecutor(max(1, len(children))) as pool:
+                list(pool.map(Child.stop, children))
 
     def missing(self) -> list[str]:
         """What is not up right now, in words; empty when all is well."""
-        words = [f"the {child.name} is not up" for child in (self.worker, *self.renderers) if not child.up]
+        words = [f"the {child.name} is not up" for child in (*self.workers, *self.renderers) if not child.up]
         if not words and not all(_accepts("127.0.0.1", port) for port in self._ports):
             words.append("a renderer worker does not answer")
         return words
+
+    def renderer_infos(self) -> list[RendererInfo]:
+        """The renderer workers, and which of them accept connections."""
+        return [RendererInfo(address=f"127.0.0.1:{port}", alive=_accepts("127.0.0.1", port)) for port in self._ports]
 
     def _render(self, number: int) -> list[str]:
         return ["render", "--host", "127.0.0.1", "--port", str(self._ports[number])]
 
     def _work(self) -> list[str]:
         renderers = [word for port in self._ports for word in ("--renderer", f"127.0.0.1:{port}")]
-        return ["worker", "--data", str(self._settings.data), "--device", self._settings.device, *renderers]
+        return ["worker", *renderers]
+
+
+def worker_environment(settings: Settings) -> dict[str, str]:
+    """What attack workers of one machine are told: the settings, and how many threads each may use."""
+    threads = max(1, len(os.sched_getaffinity(0)) // max(1, settings.workers))
+    return {
+        "TROMPE_DATA": str(settings.data.absolute()),
+        "TROMPE_DATABASE": settings.database_url,
+        "TROMPE_STORE": settings.store_url,
+        "TROMPE_DEVICE": settings.device,
+        "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(threads)),
+    }
 
 
 def _accepts(host: str, port: int) -> bool:

@@ -1,0 +1,70 @@
+"""A PostgreSQL of our own for the tests: a private cluster on a free port, which can be stopped and started again."""
+
+import os
+import pwd
+import secrets
+import shutil
+import socket
+import subprocess
+import tempfile
+from pathlib import Path
+
+import psycopg
+
+OPTIONS = "-c fsync=off -c full_page_writes=off -c max_connections=200"
+
+
+def find_programs() -> Path | None:
+    """The newest folder that has initdb."""
+    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda each: int(each.parts[-3]))
+    if found:
+        return found[-1].parent
+    here = shutil.which("initdb")
+    return Path(here).resolve().parent if here else None
+
+
+class Postgres:
+    """A cluster in a temporary folder. It must not run as root, so that root borrows the user nobody for it."""
+
+    def __init__(self, programs: Path) -> None:
+        self._programs = programs
+        self._user = "nobody" if os.geteuid() == 0 else None
+        self.folder = Path(tempfile.mkdtemp(prefix="trompe-pg-"))
+        if self._user is not None:
+            os.chown(self.folder, pwd.getpwnam(self._user).pw_uid, -1)
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+        self._do("initdb", "--username=trompe", "--auth=trust", "--encoding=UTF8", "--no-sync", "-D", self._data)
+
+    @property
+    def _data(self) -> str:
+        return str(self.folder / "data")
+
+    def start(self) -> None:
+        options = f"-p {self.port} -k {self.folder} -c listen_addresses=127.0.0.1 {OPTIONS}"
+        self._do("pg_ctl", "start", "--wait", "-D", self._data, "-l", str(self.folder / "log"), "-o", options)
+
+    def stop(self) -> None:
+        """Stop at once, as a crash would: connections are cut, nobody is waited for."""
+        self._do("pg_ctl", "stop", "--wait", "--mode=immediate", "-D", self._data)
+
+    def database(self) -> str:
+        """The URL of a new, empty database."""
+        name = f"t{secrets.token_hex(6)}"
+        with psycopg.connect(f"postgresql://trompe@127.0.0.1:{self.port}/postgres", autocommit=True) as connection:
+            connection.execute(f"CREATE DATABASE {name}")
+        return f"postgresql://trompe@127.0.0.1:{self.port}/{name}"
+
+    def close(self) -> None:
+        subprocess.run(
+            [self._programs / "pg_ctl", "stop", "--mode=immediate", "-D", self._data],
+            user=self._user,
+            capture_output=True,
+            check=False,
+        )
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _do(self, program: str, *arguments: str) -> None:
+        command = [str(self._programs / program), *arguments]
+        quiet = subprocess.DEVNULL
+        subprocess.run(command, user=self._user, cwd="/", stdin=quiet, stdout=quiet, stderr=quiet, check=True)

@@ -1,0 +1,323 @@
+"""Real worker processes on real databases, with a fake pipeline: what happens to jobs when things go wrong."""
+
+import contextlib
+import signal
+import time
+from typing import Any
+
+import pytest
+
+from trompe_server.artifacts import LocalArtifacts
+from trompe_server.jobs.fake import PHASES, trace
+from trompe_server.settings import Settings
+from trompe_shared.api import JobState
+
+Service = Any
+"""``processes.Service``, which lies beside this file."""
+
+
+def wait_until(condition: Any, *, seconds: float = 60.0) -> Any:
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+    return value
+
+
+def test_jobs_run_one_after_the_other_and_each_ends_as_its_pipeline_says(service: Service) -> None:
+    labels = ["fine", "hopeless", "broken", "bug", "no object", "flaky renderer"]
+    jobs = {label: service.submit(label) for label in labels}
+    with service.worker():
+        ended = {label: service.ended(job) for label, job in jobs.items()}
+
+    assert {label: job.state for label, job in ended.items()} == {
+        "fine": JobState.succeeded,
+        "hopeless": JobState.not_applicable,
+        "broken": JobState.failed,
+        "bug": JobState.failed,
+        "no object": JobState.failed,
+        "flaky renderer": JobState.succeeded,
+    }
+    assert ended["fine"].artifacts == ["result.json", "judge.txt"]
+    left = LocalArtifacts(service.folder(jobs["fine"]) / "1")
+    wait_until(lambda: left.names() == ["judge.txt", "result.json"])
+    assert ended["fine"].progress.fraction == 1.0
+    assert ended["hopeless"].note == "no view was recognised"
+    assert ended["broken"].error == "The object is broken; mend it."
+    assert ended["bug"].error == "An unexpected error ended the job: ZeroDivisionError: a mistake of ours"
+    assert ended["no object"].error == "The object went away."
+    assert all(job.attempts == 1 for job in ended.values())
+    starts = [ended[label].started for label in labels]
+    assert starts == sorted(starts)
+    for label in ("broken", "bug"):
+        assert trace(service.folder(jobs[label])).count("begin attack-001") == 1, "failing phases are not tried again"
+
+
+def test_a_job_whose_worker_is_killed_goes_on_at_its_last_phase(service: Service) -> None:
+    job, after = service.submit("gate"), service.submit("fine")
+    with service.worker() as first:
+        wait_until(lambda: service.in_gate(job))
+        first.end(signal.SIGKILL)
+    assert service.state(job) is JobState.running
+
+    service.open_gate(job)
+    with service.worker():
+        found = service.ended(job)
+        service.ended(after)
+
+    assert (found.state, found.attempts) == (JobState.succeeded, 2)
+    notes = trace(service.folder(job))
+    assert [note for note in notes if note.startswith("end")] == [f"end {phase}" for phase in PHASES]
+    assert notes.count("begin prepare") == notes.count("begin attack-000") == 1
+    assert notes.count("begin attack-001") == 2
+    messages = [event.message for event in service.store.events(job) if event.message]
+    assert [message.split(" ")[0] for message in messages[:2]] == ["queued", "started"]
+    assert "ended without a word" in messages[2]
+    assert "goes on with" in messages[3]
+
+
+def test_another_worker_takes_over_from_one_that_is_gone_for_good(service: Service) -> None:
+    job = service.submit("gate")
+    with service.worker() as first, service.worker() as second:
+        wait_until(lambda: service.in_gate(job))
+        holder = first if service.store.get(job).worker in first.words() else second
+        assert [info.alive for info in service.store.workers()] == [True, True]
+        assert [info.id for info in service.store.workers() if info.job == job] == [service.store.get(job).worker]
+        holder.end(signal.SIGKILL)
+        wait_until(lambda: service.store.get(job).attempts == 2)
+        service.open_gate(job)
+        found = service.ended(job)
+        assert found.worker in (second if holder is first else first).words()
+    assert found.state is JobState.succeeded
+    assert "silent for 2 s" in "".join(event.message or "" for event in service.store.events(job))
+
+
+def test_a_worker_that_was_frozen_notices_that_it_lost_its_job_and_does_no_harm(service: Service) -> None:
+    job = service.submit("gate")
+    with service.worker() as frozen:
+        wait_until(lambda: service.in_gate(job))
+        frozen.send(signal.SIGSTOP)
+        with service.worker() as healthy:
+            wait_until(lambda: service.store.get(job).attempts == 2)
+            frozen.send(signal.SIGCONT)
+            wait_until(lambda: "goes on elsewhere" in frozen.words())
+            assert service.state(job) is JobState.running
+            service.open_gate(job)
+            found = service.ended(job)
+            assert "goes on elsewhere" not in healthy.words()
+            healthy.end(signal.SIGKILL)
+            after = service.submit("fine")
+            assert service.ended(after).state is JobState.succeeded, "the one that was frozen goes on working"
+        assert "Traceback" not in frozen.words()
+    assert (found.state, found.attempts) == (JobState.succeeded, 2)
+    assert trace(service.folder(job)).count("end judge") == 1
+
+
+def test_a_frozen_worker_never_replaces_what_a_newer_attempt_wrote(service: Service) -> None:
+    job = service.submit("gate")
+    with service.worker() as frozen:
+        wait_until(lambda: service.in_gate(job))
+        frozen.send(signal.SIGSTOP)
+        with service.worker():
+            wait_until(lambda: service.store.get(job).attempts == 2)
+            service.open_gate(job)
+            service.ended(job)
+            result = service.artifacts(job).read("result.json")
+            frozen.send(signal.SIGCONT)  # it sees the gate open, and writes attack-001.txt of the first attempt
+            wait_until(lambda: "goes on elsewhere" in frozen.words())
+    assert service.artifacts(job).read("result.json") == result
+    assert not (service.folder(job) / "1" / "result.json").exists()
+    assert service.store.get(job).state is JobState.succeeded
+
+
+def test_a_job_that_kills_three_workers_is_failed_and_the_next_job_runs(service: Service) -> None:
+    job, after = service.submit("deadly"), service.submit("fine")
+    for _ in range(3):
+        with service.worker() as running:
+            assert running.process.wait(60) == -signal.SIGKILL
+    with service.worker():
+        found = service.ended(job)
+        assert service.ended(after).state is JobState.succeeded
+
+    assert found.state is JobState.failed
+    assert found.error is not None
+    assert "3 workers died" in found.error
+    assert found.attempts == 3
+
+
+def test_a_worker_that_is_asked_to_stop_gives_its_job_back_unharmed(service: Service) -> None:
+    job = service.submit("gate")
+    for _ in range(3):
+        with service.worker() as running:
+            wait_until(lambda: service.in_gate(job))
+            assert running.end(signal.SIGTERM) == 0
+        assert service.state(job) is JobState.queued
+        assert service.store.workers() == []
+    service.open_gate(job)
+    with service.worker():
+        assert service.ended(job).state is JobState.succeeded
+
+
+def test_cancelling_stops_a_running_job_within_its_phase_and_a_queued_one_at_once(service: Service) -> None:
+    running, queued, after = service.submit("gate"), service.submit("fine"), service.submit("fine")
+    with service.worker() as process:
+        wait_until(lambda: service.in_gate(running))
+        assert service.store.request_cancel(queued).state is JobState.cancelled
+        assert service.store.request_cancel(running).state is JobState.running
+        asked = time.monotonic()
+        assert service.ended(running).state is JobState.cancelled
+        assert time.monotonic() - asked < 5
+        assert service.ended(after).state is JobState.succeeded
+        words = process.words()
+
+    assert trace(service.folder(queued)) == []
+    assert "end attack-001" not in trace(service.folder(running))
+    assert "Traceback" not in words
+
+
+def test_a_job_cancelled_while_its_worker_is_dead_is_cancelled_by_the_next(service: Service) -> None:
+    job = service.submit("gate")
+    with service.worker() as running:
+        wait_until(lambda: service.in_gate(job))
+        running.end(signal.SIGKILL)
+    service.store.request_cancel(job)
+    with service.worker():
+        assert service.ended(job).state is JobState.cancelled
+    assert trace(service.folder(job)).count("begin attack-001") == 1
+
+
+def test_a_job_that_stands_still_costs_its_worker_the_job(service: Service) -> None:
+    job = service.submit("silent")
+    with service.worker(TROMPE_STALL_TIMEOUT="1") as running:
+        assert running.process.wait(60) == 75
+    assert service.state(job) is JobState.running
+
+
+def test_a_job_fails_with_a_remedy_where_no_renderer_answers(service: Service) -> None:
+    job = service.submit("fine")
+    with service.worker(renderers=["--renderer", "127.0.0.1:1"], TROMPE_RENDERER_PATIENCE="0.5"):
+        found = service.ended(job)
+    assert found.state is JobState.failed
+    assert found.error is not None
+    assert "No renderer answers at 127.0.0.1:1" in found.error
+    assert "trompe render" in found.error
+
+
+def test_renderers_are_found_by_a_name(service: Service) -> None:
+    job = service.submit("fine")
+    with service.worker(renderers=["--renderers-dns", f"localhost:{service.renderer}"]):
+        assert service.ended(job).state is JobState.succeeded
+
+
+def test_a_worker_without_a_gpu_leaves_alone_what_needs_one(service: Service) -> None:
+    needy, modest = service.submit("fine", needs="cuda"), service.submit("fine", needs="cpu", priority="sweep")
+    with service.worker():
+        assert service.ended(modest).state is JobState.succeeded
+        assert service.state(needy) is JobState.queued
+    with service.worker(TROMPE_DEVICE="cuda:0"):
+        assert service.ended(needy).state is JobState.succeeded
+
+
+def test_a_damaged_checkpoint_is_made_again_from_the_one_before(service: Service) -> None:
+    calm, job = service.submit("fine", seed=7), service.submit("gate", seed=7)
+    with service.worker() as first:
+        service.ended(calm)
+        wait_until(lambda: service.in_gate(job))
+        first.end(signal.SIGKILL)
+    (service.folder(job) / "1" / "attack-000.txt").write_bytes(b"half")
+    service.open_gate(job)
+    with service.worker() as second:
+        assert service.ended(job).state is JobState.succeeded
+        assert "goes one phase back" in second.words()
+    assert trace(service.folder(job)).count("begin prepare") == 1
+    assert trace(service.folder(job)).count("end attack-000") == 2
+
+
+def test_three_workers_share_the_jobs_and_none_is_run_twice(service: Service) -> None:
+    with contextlib.ExitStack() as stack:
+        for _ in range(3):
+            stack.enter_context(service.worker(TROMPE_FAKE_SECONDS="0.2"))
+        jobs = [service.submit("fine", seed=number) for number in range(12)]
+        ended = [service.ended(job) for job in jobs]
+        assert len(service.store.workers()) == 3
+    assert {job.state for job in ended} == {JobState.succeeded}
+    assert {job.attempts for job in ended} == {1}
+    assert len({job.worker for job in ended}) == 3
+    for job in jobs:
+        assert [note for note in trace(service.folder(job)) if note.startswith("begin")] == [
+            f"begin {phase}" for phase in PHASES
+        ]
+
+
+def test_a_worker_ends_with_its_parent(service: Service) -> None:
+    with service.worker() as running:
+        assert running.process.stdin is not None
+        running.process.stdin.close()
+        assert running.process.wait(20) == 0
+        running.process.stdin = running.process.stdout
+
+
+def test_lines_of_the_log_are_json_and_name_the_job_where_that_is_asked_for(service: Service) -> None:
+    import json
+
+    job = service.submit("bug")
+    with service.worker(TROMPE_LOG="json") as running:
+        service.ended(job)
+        lines = [json.loads(line) for line in running.words().splitlines() if line.startswith("{")]
+    (failed,) = [line for line in lines if line["level"] == "error"]
+    assert (failed["job"], failed["message"]) == (job, f"job {job} failed")
+    assert "ZeroDivisionError" in failed["traceback"]
+    assert all({"time", "level", "logger", "message", "process"} <= line.keys() for line in lines)
+
+
+class TestOutage:
+    """PostgreSQL goes away and comes back."""
+
+    @pytest.fixture
+    def service(self, postgres: Any, tmp_path: Any, renderer: int) -> Any:
+        import sys
+
+        settings = Settings(data=tmp_path, database=postgres.database(), silence=20.0)
+        service = sys.modules["processes"].Service(settings, renderer)
+        yield service
+        service.close()
+
+    def test_a_job_runs_on_and_ends_when_the_database_is_back(self, service: Service, postgres: Any) -> None:
+        job = service.submit("gate")
+        with service.worker() as running:
+            wait_until(lambda: service.in_gate(job))
+            postgres.stop()
+            service.open_gate(job)  # so that it wants to write its end while nobody listens
+            time.sleep(5)
+            assert running.process.poll() is None
+            postgres.start()
+            found = service.ended(job)
+            after = service.submit("fine")
+            assert service.ended(after).state is JobState.succeeded
+            assert "Trying again" in running.words()
+        assert (found.state, found.attempts) == (JobState.succeeded, 1)
+        assert trace(service.folder(job)).count("end judge") == 1
+
+    def test_the_api_s_side_says_so_and_goes_on(self, service: Service, postgres: Any) -> None:
+        from trompe_server.errors import ServiceError
+
+        job = service.submit("fine")
+        postgres.stop()
+        for call in (lambda: service.store.get(job), lambda: service.submit("fine"), service.store.statistics):
+            with pytest.raises(ServiceError, match="cannot be used just now"):
+                call()
+        postgres.start()
+        assert service.state(job) is JobState.queued
+
+    def test_a_stop_while_the_database_is_down_does_not_hang(self, service: Service, postgres: Any) -> None:
+        job = service.submit("gate")
+        with service.worker() as running:
+            wait_until(lambda: service.in_gate(job))
+            postgres.stop()
+            started = time.monotonic()
+            assert running.end(signal.SIGTERM) == 0
+            assert time.monotonic() - started < 10
+            postgres.start()
+        service.open_gate(job)
+        with service.worker():
+            assert service.ended(job).attempts == 2
