@@ -1,32 +1,58 @@
 """The web application: routes, errors and documentation put together."""
 
+import asyncio
 from importlib.metadata import version
+from typing import Final
 
 from fastapi import FastAPI
-from fastapi.responses import HTMLResponse, RedirectResponse
+from fastapi.responses import HTMLResponse
 
-from trompe_server.api import health, jobs, library
-from trompe_server.api.docs import DOCS_PAGE
-from trompe_server.api.middleware import BodyLimit, RequestId
+from trompe_server.api import experiments, fleet, health, jobs, library, metrics
+from trompe_server.api.contract import contract
+from trompe_server.api.docs import DOCS_HEADERS, DOCS_PAGE
+from trompe_server.api.downloads import Digests
+from trompe_server.api.guard import Guard
+from trompe_server.api.metrics import HttpMetrics
+from trompe_server.api.middleware import BodyLimit, Envelope, Failures
 from trompe_server.api.problems import answer_with_problems
 from trompe_server.api.services import Services
+from trompe_server.pages import add_pages
 
 __all__ = ["create_app"]
 
-DESCRIPTION = """Crafts adversarial 3D objects. Upload an object and a classifier (or use the shipped ones),
+DESCRIPTION: Final = """Crafts adversarial 3D objects. Upload an object and a classifier (or use the shipped ones),
 submit a job, follow its events, fetch its result. Errors are problem details (RFC 9457);
-each response carries `X-Request-ID`."""
+each response carries `X-Request-ID`. Where the server has tokens, send `Authorization: Bearer trompe_...`."""
+
+ROUTERS: Final = (
+    library.router,
+    jobs.router,
+    experiments.router,
+    fleet.router,
+    health.router,
+    metrics.router,
+)
 
 
 def create_app(services: Services) -> FastAPI:
     """The application over ``services``."""
     app = FastAPI(title="Trompe", version=version("trompe"), description=DESCRIPTION, docs_url=None, redoc_url=None)
-    app.state.services = services
-    app.add_middleware(BodyLimit, limit=services.settings.max_upload)
-    app.add_middleware(RequestId)
+    app.state.services, app.state.metrics, app.state.digests = services, HttpMetrics(), Digests()
+    app.state.uploads = asyncio.Semaphore(library.UPLOADS)
+    _wrap(app, services)
     answer_with_problems(app)
-    for router in (library.router, jobs.router, health.router):
+    for router in ROUTERS:
         app.include_router(router)
-    app.add_api_route("/", lambda: RedirectResponse("/docs"), include_in_schema=False)
-    app.add_api_route("/docs", lambda: HTMLResponse(DOCS_PAGE), include_in_schema=False)
+    app.add_api_route("/docs", lambda: HTMLResponse(DOCS_PAGE, headers=DOCS_HEADERS), include_in_schema=False)
+    add_pages(app)
+    app.openapi = lambda: contract(app)  # type: ignore[method-assign]
     return app
+
+
+def _wrap(app: FastAPI, services: Services) -> None:
+    """What each request passes through; the last one added is the outermost."""
+    settings = services.settings
+    app.add_middleware(BodyLimit, limit=settings.max_upload)
+    app.add_middleware(Guard, tokens=services.tokens, rate=settings.rate_limit)
+    app.add_middleware(Failures)
+    app.add_middleware(Envelope, metrics=app.state.metrics)

@@ -1,66 +1,118 @@
-"""Routes for jobs: submit, list, read, cancel, follow, fetch what came out."""
+"""Routes for jobs: submit, list, read, cancel, repeat, follow, fetch what came out, delete."""
 
-import asyncio
-from collections.abc import AsyncIterator
-from mimetypes import guess_type
-from typing import Annotated, Final
+from pathlib import PurePath
+from typing import Annotated, Any, Final
 
-from fastapi import APIRouter, Header, Query
-from fastapi.responses import FileResponse, Response
-from sse_starlette import EventSourceResponse, ServerSentEvent
+from fastapi import APIRouter, Body, Header, Query, Request
+from fastapi.responses import Response, StreamingResponse
+from sse_starlette import EventSourceResponse
 
+from trompe_server.api import examples
+from trompe_server.api.downloads import send_file, zip_stream
+from trompe_server.api.following import follow
 from trompe_server.api.problems import PROBLEMS
-from trompe_server.api.services import Services, ServicesDep, StoreDep
+from trompe_server.api.services import DigestsDep, ServicesDep, StoreDep
 from trompe_server.api.submission import checked_spec
 from trompe_server.errors import ConflictError, NotFoundError
 from trompe_server.jobs.store import JobStore
-from trompe_shared.api import Event, Job, JobList, JobSpec, JobState, Result
+from trompe_shared.api import Job, JobList, JobRequest, JobState, Result
+from trompe_shared.errors import SpecError
 
-__all__ = ["router"]
+__all__ = ["Cursor", "Limit", "router"]
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=PROBLEMS)
 
-EVENT_INTERVAL: Final = 0.25
-"""Seconds between two looks for new events."""
 RESULT: Final = "result.json"
-_STREAM: Final = (
-    'id: 3\nevent: progress\ndata: {"id": 3, "time": "2026-01-31T12:00:00Z", "state": "running", '
-    '"progress": {"phase": "attack-000", "fraction": 0.4}}\n\n'
+
+_NEW_OR_KNOWN: Final[dict[int | str, dict[str, Any]]] = {
+    200: {"model": Job, "description": "The job that the same request made before", **examples.JOB},
+    **examples.made(examples.JOB),
+}
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        description="a text of your own choice: sending it again with the same request makes no second job",
+        min_length=1,
+        max_length=255,
+    ),
+]
+Limit = Annotated[int, Query(ge=1, le=500)]
+Cursor = Annotated[str | None, Query(description="next_cursor of the page before", max_length=200)]
+LabelFilters = Annotated[
+    list[str], Query(alias="label", description="key:value; a job must have all of them", max_length=32)
+]
+
+
+@router.post(
+    "",
+    status_code=201,
+    responses=_NEW_OR_KNOWN,
 )
-
-
-@router.post("", status_code=201)
-def submit(services: ServicesDep, spec: JobSpec, response: Response) -> Job:
+def submit(
+    services: ServicesDep,
+    request: Annotated[JobRequest, Body(openapi_examples=examples.JOB_REQUESTS)],
+    response: Response,
+    idempotency_key: IdempotencyKey = None,
+) -> Job:
     """Queue an attack. What it names must exist; the job keeps the ids, so that later uploads do not change it."""
-    job = services.store.create(checked_spec(spec, services.library), services.queue.enqueue)
-    response.headers["Location"] = f"/v1/jobs/{job.id}"
-    return job
+    return _create(services.store, checked_spec(request, services.library), response, idempotency_key)
 
 
-@router.get("")
+@router.post("/check", status_code=204)
+def check_job(
+    services: ServicesDep, request: Annotated[JobRequest, Body(openapi_examples=examples.JOB_REQUESTS)]
+) -> None:
+    """Whether a job could be submitted: 204, or the problem that submitting it would meet. Nothing is queued."""
+    checked_spec(request, services.library)
+
+
+@router.get("", responses=examples.found(examples.JOB_LIST))
 def list_jobs(
     store: StoreDep,
     state: JobState | None = None,
-    limit: Annotated[int, Query(ge=1, le=500)] = 50,
-    cursor: Annotated[str | None, Query(description="next_cursor of the page before")] = None,
+    labels: LabelFilters = [],  # noqa: B006
+    object: Annotated[str | None, Query(description="id of the object, or name of a shipped one")] = None,
+    classifier: Annotated[str | None, Query(description="id of the classifier, or name of a shipped one")] = None,
+    limit: Limit = 50,
+    cursor: Cursor = None,
 ) -> JobList:
     """Jobs, newest first."""
-    return store.page(state=state, limit=limit, cursor=cursor)
+    wanted = _labels(labels)
+    return store.page(state=state, labels=wanted, object=object, classifier=classifier, limit=limit, cursor=cursor)
 
 
-@router.get("/{job}")
+@router.get("/{job}", responses=examples.found(examples.JOB))
 def read_job(store: StoreDep, job: str) -> Job:
     """One job."""
     return store.get(job)
 
 
-@router.post("/{job}/cancel")
-def cancel_job(services: ServicesDep, job: str) -> Job:
+@router.delete("/{job}", status_code=204)
+def delete_job(services: ServicesDep, job: str) -> None:
+    """Delete a job that has ended, with all its files."""
+    services.store.delete(job)
+    services.artifacts(job).delete()
+
+
+@router.post("/{job}/cancel", responses=examples.found(examples.JOB))
+def cancel_job(store: StoreDep, job: str) -> Job:
     """Cancel a job: a queued one at once, a running one within moments. A job that has ended stays as it is."""
-    found = services.store.request_cancel(job)
-    if found.state is JobState.cancelled:
-        services.queue.forget(job)
-    return found
+    return store.request_cancel(job)
+
+
+@router.post(
+    "/{job}/retry",
+    status_code=201,
+    responses=_NEW_OR_KNOWN,
+)
+def retry_job(services: ServicesDep, job: str, response: Response, idempotency_key: IdempotencyKey = None) -> Job:
+    """Queue the same attack once more, as a new job. The old one must have ended, and stays."""
+    old = services.store.get(job)
+    if not old.state.final:
+        raise ConflictError(f"Job {job} is {old.state} and goes on by itself; cancel it first to start it anew.")
+    request = JobRequest(**old.spec.model_dump(), priority=old.priority, labels=old.labels, needs=old.needs)
+    return _create(services.store, request, response, idempotency_key)
 
 
 @router.get(
@@ -69,7 +121,7 @@ def cancel_job(services: ServicesDep, job: str) -> Job:
     responses={
         200: {
             "description": "Server-sent events named `progress`; the data of each is an Event.",
-            "content": {"text/event-stream": {"example": _STREAM}},
+            "content": {"text/event-stream": {"example": examples.EVENT_STREAM}},
         }
     },
 )
@@ -80,55 +132,71 @@ def follow_job(
 ) -> EventSourceResponse:
     """Events of a job from its beginning, or after ``Last-Event-ID``, until it has ended."""
     store.get(job)
-    after = int(last_event_id) if last_event_id is not None and last_event_id.isdecimal() else 0
-    return EventSourceResponse(_events(store, job, after))
+    known = last_event_id is not None and last_event_id.isascii() and last_event_id.isdecimal()
+    return follow(store, job, after=min(int(last_event_id or 0), 2**31 - 1) if known else 0)
 
 
-@router.get("/{job}/result", responses={200: {"model": Result}})
-def read_result(services: ServicesDep, job: str) -> Response:
+@router.get("/{job}/result", response_model=Result, responses=examples.found(examples.RESULT) | examples.PART_ANSWERS)
+def read_result(services: ServicesDep, digests: DigestsDep, request: Request, job: str) -> Response:
     """The result of a job that has ended well."""
     found = services.store.get(job)
     if not found.state.final:
         raise ConflictError(
             f"Job {job} is {found.state}; its result is there once it has ended. Follow /v1/jobs/{job}/events."
         )
-    if not services.artifacts(job).exists(RESULT):
+    if RESULT not in found.artifacts:
         raise ConflictError(
             f"Job {job} ended as {found.state} without a result: {found.error or found.note or 'no reason given'}"
         )
-    return Response(services.artifacts(job).read(RESULT), media_type="application/json")
+    return _send(services, digests, request, found, RESULT)
 
 
-@router.get("/{job}/artifacts/{name}", response_class=FileResponse)
-def read_artifact(services: ServicesDep, job: str, name: str) -> FileResponse:
-    """A file that the job made, one of its ``artifacts``."""
-    return _artifact(services, services.store.get(job), name)
+@router.head("/{job}/artifacts/{name}", include_in_schema=False)
+@router.get(
+    "/{job}/artifacts/{name}", response_class=Response, responses=examples.found(examples.FILE) | examples.PART_ANSWERS
+)
+def read_artifact(services: ServicesDep, digests: DigestsDep, request: Request, job: str, name: str) -> Response:
+    """A file that the job made, one of its ``artifacts``: whole, or a range of its bytes. The ETag is their SHA-256."""
+    found = services.store.get(job)
+    if name not in found.artifacts:
+        known = ", ".join(found.artifacts) or "none yet"
+        raise NotFoundError(f"Job {job} has no artifact {name!r}. It has: {known}.")
+    return _send(services, digests, request, found, name)
 
 
-def _artifact(services: Services, job: Job, name: str) -> FileResponse:
-    if name not in job.artifacts:
-        known = ", ".join(job.artifacts) or "none yet"
-        raise NotFoundError(f"Job {job.id} has no artifact {name!r}. It has: {known}.")
-    return FileResponse(
-        services.artifacts(job.id).path(name),
-        filename=name,
-        media_type=guess_type(name)[0] or "application/octet-stream",
-        content_disposition_type="inline",
-    )
+@router.get("/{job}/archive", response_class=StreamingResponse, responses={200: examples.ARCHIVE})
+def read_archive(services: ServicesDep, job: str) -> StreamingResponse:
+    """All artifacts of a job as one zip."""
+    found = services.store.get(job)
+    if not found.artifacts:
+        raise NotFoundError(f"Job {job} is {found.state} and has no artifacts to pack.")
+    parts = zip_stream(services.artifacts(job), found.artifacts, time=found.finished or found.created)
+    disposition = f'attachment; filename="trompe-{PurePath(job).name}.zip"'
+    return StreamingResponse(parts, media_type="application/zip", headers={"Content-Disposition": disposition})
 
 
-async def _events(store: JobStore, job: str, after: int) -> AsyncIterator[ServerSentEvent]:
-    while True:
-        events = await asyncio.to_thread(store.events, job, after=after)
-        for event in events:
-            after = event.id
-            yield _message(event)
-        if events and events[-1].state.final:
-            return
-        if not events and (await asyncio.to_thread(store.get, job)).state.final:
-            return
-        await asyncio.sleep(EVENT_INTERVAL)
+def _create(store: JobStore, request: JobRequest, response: Response, key: str | None) -> Job:
+    job, new = store.create(request, idempotency_key=key)
+    response.status_code = 201 if new else 200
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    return job
 
 
-def _message(event: Event) -> ServerSentEvent:
-    return ServerSentEvent(data=event.model_dump_json(), id=str(event.id), event="progress")
+def _labels(texts: list[str]) -> dict[str, str]:
+    labels: dict[str, str] = {}
+    for text in texts:
+        name, _, value = text.partition(":")
+        if not (name and value):
+            raise SpecError(f"{text!r} is not a label; write it as key:value, such as label=experiment:mugs.")
+        if labels.setdefault(name, value) != value:
+            raise SpecError(f"The label {name!r} is asked for twice, and no job has two values of one label.")
+    return labels
+
+
+def _send(services: ServicesDep, digests: DigestsDep, request: Request, job: Job, name: str) -> Response:
+    artifacts = services.artifacts(job.id)
+    try:
+        digest = digests.of(artifacts, job.id, name, lasting=job.state.final)
+        return send_file(request, artifacts, name, digest=digest)
+    except FileNotFoundError as error:
+        raise NotFoundError(f"The file {name!r} of job {job.id} is not in the store any more.") from error

@@ -1,22 +1,42 @@
-"""What happens to every request: it gets an id, and a body that is too large is refused while it comes in."""
+"""What happens to every request, from the outside in: it gets an id, a line in the log and headers that keep browsers
+strict; what goes wrong becomes problem details; a body that is too large is refused while it comes in."""
 
+import logging
 import secrets
+import time
+from typing import Final
 
 from fastapi import Request
 from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from trompe_server.api.problems import REQUEST_ID, problem_response
+from trompe_server.api.metrics import HttpMetrics
+from trompe_server.api.problems import REQUEST_ID, failure_response, problem_response
 
-__all__ = ["BodyLimit", "RequestId"]
+__all__ = ["BodyLimit", "Envelope", "Failures"]
+
+logger = logging.getLogger(__name__)
+
+HEADERS: Final = {
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+"""Headers of each response that does not set them itself."""
 
 
-class RequestId:
-    """Gives each request an id, in ``scope["request_id"]`` and on the response."""
+class Envelope:
+    """Gives each request an id, in ``scope["request_id"]`` and on the response; counts it, and logs it when it is over.
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
+    Seconds are those until the response begins: a stream of events may last for hours.
+    """
+
+    def __init__(self, app: ASGIApp, *, metrics: HttpMetrics) -> None:
+        self._app, self._metrics = app, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -24,13 +44,54 @@ class RequestId:
             await self._app(scope, receive, send)
             return
         identity = scope["request_id"] = secrets.token_hex(8)
+        started = time.perf_counter()
 
-        async def send_with_id(message: Message) -> None:
+        async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message)[REQUEST_ID] = identity
+                headers = MutableHeaders(scope=message)
+                headers[REQUEST_ID] = identity
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+                self._note(scope, message["status"], time.perf_counter() - started)
             await send(message)
 
-        await self._app(scope, receive, send_with_id)
+        await self._app(scope, receive, send_with_headers)
+
+    def _note(self, scope: Scope, status: int, seconds: float) -> None:
+        self._metrics.count(scope, status, seconds)
+        wrote = scope["method"] not in {"GET", "HEAD"}
+        logger.log(
+            logging.INFO if wrote or status >= 500 else logging.DEBUG,
+            "%s %s %d in %.0f ms",
+            scope["method"],
+            scope["path"],
+            status,
+            1000 * seconds,
+            extra={"request": scope["request_id"], "token": scope.get("token"), "job": _job(scope)},
+        )
+
+
+class Failures:
+    """Answers with problem details when something goes wrong before the response has begun."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        begun = False
+
+        async def send_and_note(message: Message) -> None:
+            nonlocal begun
+            begun = True
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_and_note)
+        except Exception as error:
+            if begun or scope["type"] != "http":
+                raise
+            await failure_response(Request(scope), error)(scope, receive, send)
 
 
 class BodyLimit:
@@ -62,3 +123,8 @@ class BodyLimit:
 
     def _refusal(self) -> str:
         return f"The upload is larger than the {self._limit / 2**20:g} MiB that this server takes (TROMPE_MAX_UPLOAD)."
+
+
+def _job(scope: Scope) -> str | None:
+    job: str | None = scope.get("path_params", {}).get("job")
+    return job

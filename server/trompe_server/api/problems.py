@@ -1,6 +1,8 @@
 """Every error as problem details (RFC 9457, application/problem+json)."""
 
+import errno
 import logging
+import sqlite3
 from collections.abc import Sequence
 from http import HTTPStatus
 from typing import Any, Final
@@ -8,17 +10,21 @@ from typing import Any, Final
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 
+from trompe_server.database import DatabaseDownError
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_shared.api import Problem
 from trompe_shared.errors import TrompeError
 
-__all__ = ["PROBLEMS", "REQUEST_ID", "answer_with_problems", "problem_response"]
+__all__ = ["PROBLEMS", "REQUEST_ID", "answer_with_problems", "failure_response", "problem_response"]
 
 logger = logging.getLogger(__name__)
 
 REQUEST_ID: Final = "X-Request-ID"
+RETRY_AFTER: Final = 5
+"""Seconds after which a client may try again where something was not up."""
 
 _STATUS: Final[dict[type[TrompeError], int]] = {
     NotFoundError: 404,
@@ -35,10 +41,12 @@ _EXAMPLE: Final = {
     "request_id": "5f0c1e7a9b3d2846",
 }
 
+_SCHEMA: Final = {"$ref": "#/components/schemas/Problem"}
+
 PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
     "4XX": {
         "description": "What was wrong with the request: problem details (RFC 9457)",
-        "content": {"application/problem+json": {"schema": Problem.model_json_schema(), "example": _EXAMPLE}},
+        "content": {"application/problem+json": {"schema": _SCHEMA, "example": _EXAMPLE}},
     }
 }
 """What routes document about their errors."""
@@ -49,7 +57,6 @@ def answer_with_problems(app: FastAPI) -> None:
     app.add_exception_handler(TrompeError, _trompe_error)
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(HTTPException, _http_error)
-    app.add_exception_handler(Exception, _unexpected_error)
 
 
 def problem_response(
@@ -66,7 +73,7 @@ def problem_response(
         title=HTTPStatus(status).phrase,
         status=status,
         detail=detail,
-        instance=request.url.path,
+        instance=request.scope["path"],
         request_id=request.scope.get("request_id"),
         errors=errors,
     )
@@ -79,9 +86,7 @@ def problem_response(
 
 
 async def _trompe_error(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, TrompeError)
-    status = next((status for kind, status in _STATUS.items() if isinstance(error, kind)), 422)
-    return problem_response(request, status, code=error.code, detail=str(error))
+    return failure_response(request, error)
 
 
 async def _validation_error(request: Request, error: Exception) -> JSONResponse:
@@ -93,15 +98,51 @@ async def _validation_error(request: Request, error: Exception) -> JSONResponse:
 
 async def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
+    if _is_disk_full(error):
+        return _disk_full(request, error)
     response = problem_response(request, error.status_code, detail=error.detail)
     response.headers.update(error.headers or {})
     return response
 
 
-async def _unexpected_error(request: Request, error: Exception) -> JSONResponse:
+def failure_response(request: Request, error: Exception) -> JSONResponse:
+    """What is answered to an error that came up: one of ours, a full disk, a database that is away, or a mistake."""
+    if _is_disk_full(error):
+        return _disk_full(request, error)
+    if isinstance(error, PoolTimeoutError):
+        error = DatabaseDownError("The database has no connection free for this request.")
+    if isinstance(error, TrompeError):
+        return _refusal(request, error)
     logger.error("request %s failed", request.scope.get("request_id"), exc_info=error)
     detail = "The server made a mistake; its log says more under this request id."
     return problem_response(request, 500, code="internal", detail=detail)
+
+
+def _refusal(request: Request, error: TrompeError) -> JSONResponse:
+    status = next((status for kind, status in _STATUS.items() if isinstance(error, kind)), 422)
+    response = problem_response(request, status, code=error.code, detail=str(error))
+    if status == 503:
+        logger.warning("request %s: %s", request.scope.get("request_id"), error)
+        response.headers["Retry-After"] = str(RETRY_AFTER)
+    return response
+
+
+def _disk_full(request: Request, error: Exception) -> JSONResponse:
+    logger.error("request %s: the disk is full: %s", request.scope.get("request_id"), error)
+    general = "The server's disk is full; nothing of this request was kept. Whoever runs it must make room."
+    detail = str(error) if isinstance(error, TrompeError) else general
+    return problem_response(request, 507, code="disk-full", detail=detail)
+
+
+def _is_disk_full(error: BaseException | None) -> bool:
+    """Whether this error, or one that it was raised from, says that there is no room."""
+    if error is None:
+        return False
+    return (
+        (isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT})
+        or getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
+        or _is_disk_full(error.__cause__)
+    )
 
 
 def _field(location: Sequence[int | str]) -> str:

@@ -6,28 +6,32 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from trompe_server.artifacts import LocalArtifacts
-from trompe_server.jobs.engine import JobQueue
+from trompe_server.access import Tokens
+from trompe_server.api.downloads import Digests
+from trompe_server.artifacts import Folder, JobArtifacts, job_artifacts
 from trompe_server.jobs.store import JobStore
 from trompe_server.library import Library
 from trompe_server.settings import Settings
+from trompe_shared.api import RendererInfo
 
-__all__ = ["LibraryDep", "Services", "ServicesDep", "StoreDep"]
+__all__ = ["DigestsDep", "LibraryDep", "Services", "ServicesDep", "StoreDep"]
 
 
 @dataclass(frozen=True)
 class Services:
-    """Everything behind the API. ``missing`` says what is not up right now, in words."""
+    """Everything behind the API. ``missing`` says what is not up right now, in words; ``renderers`` asks each."""
 
     settings: Settings
     library: Library
     store: JobStore
-    queue: JobQueue
+    files: Folder
+    tokens: Tokens
+    renderers: Callable[[], list[RendererInfo]]
     missing: Callable[[], list[str]]
 
-    def artifacts(self, job: str) -> LocalArtifacts:
-        """The files of a job."""
-        return LocalArtifacts(self.settings.artifacts(job))
+    def artifacts(self, job: str) -> JobArtifacts:
+        """The files of a job, to be read."""
+        return job_artifacts(self.files, job)
 
 
 def _services(request: Request) -> Services:
@@ -43,6 +47,12 @@ def _store(request: Request) -> JobStore:
     return _services(request).store
 
 
+def _digests(request: Request) -> Digests:
+    digests: Digests = request.app.state.digests
+    return digests
+
+
 ServicesDep = Annotated[Services, Depends(_services)]
 LibraryDep = Annotated[Library, Depends(_library)]
 StoreDep = Annotated[JobStore, Depends(_store)]
+DigestsDep = Annotated[Digests, Depends(_digests)]

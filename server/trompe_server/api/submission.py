@@ -1,34 +1,41 @@
 """What a job names is looked up before it is queued: a mistake is told to the one who made it, at once."""
 
 import re
+from typing import TypeVar
 
+from trompe_server.checks import check_mask_size, check_saliency, check_same_classes
 from trompe_server.labels import resolve_label
 from trompe_server.library import Library
 from trompe_shared.api import ClassifierInfo, JobSpec, ObjectInfo
 from trompe_shared.errors import SpecError
+from trompe_shared.object3d import decode_rgb
 
 __all__ = ["checked_spec"]
+
+Spec = TypeVar("Spec", bound=JobSpec)
 
 _COLOUR = re.compile(r"white|black|#[0-9a-fA-F]{6}")
 
 
-def checked_spec(spec: JobSpec, library: Library) -> JobSpec:
+def checked_spec(spec: Spec, library: Library) -> Spec:
     """``spec`` with the ids of what it names.
 
-    Raises ``NotFoundError``, ``AmbiguousError``, ``LabelError`` or ``SpecError``.
+    Raises ``NotFoundError``, ``AmbiguousError``, ``LabelError``, ``ClassifierError`` or ``SpecError``.
     """
     obj = library.object(spec.object)
     classifier = library.classifier(spec.classifier)
     _check_goal(spec, classifier)
     _check_gradients(spec, classifier)
     _check_materials(spec, obj)
+    members = [library.classifier(name) for name in spec.ensemble]
+    check_same_classes([classifier, *members])
     references = {
         "object": _reference(obj),
         "classifier": _reference(classifier),
-        "ensemble": [_member(spec, classifier, library.classifier(name)) for name in spec.ensemble],
+        "ensemble": [_member(spec, classifier, member) for member in members],
         "judges": [_judge(spec, classifier, library.classifier(judge)) for judge in spec.judges],
         "background": [name if _COLOUR.fullmatch(name) else library.background(name).id for name in spec.background],
-        "masks": {texture: library.background(picture).id for texture, picture in spec.masks.items()},
+        "masks": {texture: _mask(texture, picture, obj, library) for texture, picture in spec.masks.items()},
     }
     return spec.model_copy(update=references)
 
@@ -58,8 +65,7 @@ def _check_gradients(spec: JobSpec, classifier: ClassifierInfo) -> None:
             f"The classifier {classifier.name!r} gives no gradients: it can be one of the judges, or be attacked by "
             "its scores (queries=10 asks it about ten images for each gradient)."
         )
-    if spec.tau is not None or spec.keep is not None:
-        raise SpecError(f"tau and keep need saliency, and {classifier.name!r} gives no gradients: leave them out.")
+    check_saliency(spec, classifier.name)
 
 
 def _check_materials(spec: JobSpec, obj: ObjectInfo) -> None:
@@ -71,15 +77,17 @@ def _check_materials(spec: JobSpec, obj: ObjectInfo) -> None:
         raise SpecError(f"There is no texture {unknown} to mask; {obj.name!r} has {sorted(obj.textures)}.")
 
 
+def _mask(texture: str, picture: str, obj: ObjectInfo, library: Library) -> str:
+    """Id of the picture that is painted over a texture; it must have the texture's size."""
+    pixels = decode_rgb(library.background_bytes(picture), picture)
+    check_mask_size(texture, size=obj.textures[texture], mask=pixels.shape[:2])
+    return library.background(picture).id
+
+
 def _member(spec: JobSpec, classifier: ClassifierInfo, member: ClassifierInfo) -> str:
-    """A member of the ensemble must give gradients, and mean the same by its logits."""
+    """A member of the ensemble must give gradients."""
     if not member.white_box:
         raise SpecError(f"{member.name!r} gives no gradients, so it can be a judge, but not in the ensemble.")
-    if member.n_classes != classifier.n_classes:
-        raise SpecError(
-            f"{member.name!r} has {member.n_classes} classes and {classifier.name!r} {classifier.n_classes}: they "
-            "cannot be attacked together. Name classifiers of the same classes."
-        )
     return _judge(spec, classifier, member)
 
 

@@ -1,0 +1,108 @@
+"""The command ``trompe token``: makes, lists and revokes tokens, in the database itself and so without a server."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import click
+
+from trompe_server.access import Right, Token, Tokens
+from trompe_server.commands import _data, _database, _for_people, _settings
+from trompe_server.settings import Settings
+
+__all__ = ["token"]
+
+_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+
+
+def _where(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options that say which database is meant."""
+    return _data(_database(command))
+
+
+@click.group()
+def token() -> None:
+    """Make, list and revoke tokens, which decide who may use the service."""
+
+
+@token.command()
+@click.argument("name")
+@click.option(
+    "--right",
+    type=click.Choice([right.value for right in Right]),
+    default=Right.write.value,
+    show_default=True,
+    help="Whether it may only look, or also submit, cancel, delete and upload.",
+)
+@_json
+@_where
+@_for_people
+def create(name: str, right: str, as_json: bool, data: Path | None, database: str | None) -> None:
+    """Make a token called NAME. Its secret is shown this once and kept nowhere."""
+    with _tokens(_settings(data, database=database)) as tokens:
+        secret = tokens.create(name, Right(right))
+    if as_json:
+        click.echo(json.dumps({"name": name, "right": right, "secret": secret}))
+        return
+    click.echo(secret)
+    click.echo("Keep it now: it is not shown again. Clients take it as TROMPE_TOKEN or token=.", err=True)
+
+
+@token.command("list")
+@_json
+@_where
+@_for_people
+def show(as_json: bool, data: Path | None, database: str | None) -> None:
+    """List all tokens, also those that were revoked."""
+    with _tokens(_settings(data, database=database)) as tokens:
+        rows = [_row(each) for each in tokens.all()]
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    if not rows:
+        click.echo("There are no tokens: the service is open, and listens on this machine alone.", err=True)
+    for row in rows:
+        state = f"revoked {row['revoked']}" if row["revoked"] else f"last used {row['last_used'] or 'never'}"
+        click.echo(f"{row['name']:24} {row['right']:6} created {row['created']}  {state}")
+
+
+@token.command()
+@click.argument("name")
+@_where
+@_for_people
+def revoke(name: str, data: Path | None, database: str | None) -> None:
+    """Make the token NAME worthless; servers that run know it a second later."""
+    with _tokens(_settings(data, database=database)) as tokens:
+        tokens.revoke(name)
+    click.echo(f"revoked {name}", err=True)
+
+
+@contextmanager
+def _tokens(settings: Settings) -> Iterator[Tokens]:
+    """The tokens of the service that these settings mean; its database is made where there is none."""
+    from trompe_server.jobs.store import JobStore
+    from trompe_server.jobs.worker import prepare_data
+
+    prepare_data(settings)
+    store = JobStore(settings.database_url)
+    try:
+        yield Tokens(store.engine)
+    finally:
+        store.close()
+
+
+def _row(each: Token) -> dict[str, str | None]:
+    return {
+        "name": each.name,
+        "right": each.right.value,
+        "created": _when(each.created),
+        "last_used": _when(each.last_used),
+        "revoked": _when(each.revoked),
+    }
+
+
+def _when(time: datetime | None) -> str | None:
+    return None if time is None else time.isoformat(timespec="seconds")

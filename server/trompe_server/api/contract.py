@@ -1,0 +1,44 @@
+"""The OpenAPI document: what FastAPI finds out by itself, and what it cannot know."""
+
+from typing import Any, Final
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from trompe_server.api.guard import OPEN_PATHS
+from trompe_shared.api import Event, Problem
+
+__all__ = ["contract"]
+
+_REFERENCES: Final = "#/components/schemas/{model}"
+_OF_FASTAPI: Final = ("HTTPValidationError", "ValidationError")
+
+
+def contract(app: FastAPI) -> dict[str, Any]:
+    """The document of ``app``, made once."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        _name_schemas(document["components"]["schemas"])
+        _ask_for_tokens(document)
+        for operations in document["paths"].values():
+            for operation in operations.values():
+                operation["responses"].pop("422", None)  # it is one of "4XX", and no HTTPValidationError
+        app.openapi_schema = document
+    return app.openapi_schema
+
+
+def _name_schemas(schemas: dict[str, Any]) -> None:
+    """Add those that no route returns by itself, and remove those of errors that are never sent."""
+    for model in (Event, Problem):
+        schema = model.model_json_schema(ref_template=_REFERENCES)
+        schemas |= schema.pop("$defs", {}) | {model.__name__: schema}
+    for name in _OF_FASTAPI:
+        schemas.pop(name, None)
+
+
+def _ask_for_tokens(document: dict[str, Any]) -> None:
+    """Everything takes a token; without one only what is open, unless the service has no tokens at all."""
+    document["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+    document["security"] = [{"token": []}, {}]
+    for path in OPEN_PATHS & set(document["paths"]):
+        document["paths"][path]["get"]["security"] = []

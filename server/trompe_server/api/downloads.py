@@ -1,0 +1,127 @@
+"""Files on their way out, in parts: whole or by range, with the hash of their bytes as ETag, or many as a zip."""
+
+import hashlib
+import re
+import zipfile
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from datetime import datetime
+from mimetypes import guess_type
+from typing import BinaryIO, Final, cast
+
+from fastapi import Request
+from fastapi.responses import Response, StreamingResponse
+
+from trompe_server.api.problems import problem_response
+from trompe_server.artifacts import JobArtifacts
+
+__all__ = ["Digests", "send_file", "zip_stream"]
+
+PART: Final = 256 * 2**10
+REMEMBERED: Final = 10_000
+_RANGE: Final = re.compile(r"bytes=(\d*)-(\d*)")
+_PACKED: Final = frozenset({".gif", ".jpg", ".npz", ".png", ".webp", ".zip"})
+"""Endings of files that do not get smaller by packing them."""
+
+
+class Digests:
+    """SHA-256 of files that do not change any more, remembered: a file is read for it once."""
+
+    def __init__(self) -> None:
+        self._known: OrderedDict[tuple[str, str], str] = OrderedDict()
+
+    def of(self, artifacts: JobArtifacts, job: str, name: str, *, lasting: bool) -> str:
+        """The hash of a file of a job, in hex; remembered where the file is ``lasting``."""
+        if lasting and (job, name) in self._known:
+            return self._known[job, name]
+        hashed = hashlib.sha256()
+        for part in _parts(artifacts.open(name), range(artifacts.size(name))):
+            hashed.update(part)
+        digest = hashed.hexdigest()
+        if lasting:
+            self._known[job, name] = digest
+            while len(self._known) > REMEMBERED:
+                self._known.popitem(last=False)
+        return digest
+
+
+def send_file(request: Request, artifacts: JobArtifacts, name: str, *, digest: str) -> Response:
+    """The file ``name``: 304 where the client has it, 206 for one range of it (several are answered with the whole)."""
+    size, etag = artifacts.size(name), f'"{digest}"'
+    headers = {"ETag": etag, "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
+    if _has(request.headers.get("if-none-match"), etag):
+        return Response(status_code=304, headers=headers)
+    asked = _asked_range(request, size, etag)
+    if asked is not None and not 0 <= asked.start < asked.stop:
+        detail = f"The file has {size} bytes; {request.headers['range']!r} asks for none of them."
+        response = problem_response(request, 416, code="no-such-range", detail=detail)
+        response.headers["Content-Range"] = f"bytes */{size}"
+        return response
+    part = asked or range(size)
+    headers |= {"Content-Length": str(len(part)), "Content-Disposition": f'inline; filename="{name}"'}
+    if asked is not None:
+        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
+    body: Iterable[bytes] = () if request.method == "HEAD" else _parts(artifacts.open(name), part)
+    media_type = guess_type(name)[0] or "application/octet-stream"
+    return StreamingResponse(body, 200 if asked is None else 206, headers, media_type)
+
+
+def zip_stream(artifacts: JobArtifacts, names: Iterable[str], *, time: datetime) -> Iterator[bytes]:
+    """A zip of the files ``names`` as it comes into being, all dated ``time``. No more than a part is in memory."""
+    sink = _Sink()
+    with zipfile.ZipFile(cast(BinaryIO, sink), "w") as archive:
+        for name in names:
+            info = zipfile.ZipInfo(name, time.timetuple()[:6])
+            info.compress_type = zipfile.ZIP_STORED if name[name.rfind(".") :] in _PACKED else zipfile.ZIP_DEFLATED
+            info.file_size = artifacts.size(name)
+            with archive.open(info, "w") as member:
+                for part in _parts(artifacts.open(name), range(info.file_size)):
+                    member.write(part)
+                    yield sink.take()
+    yield sink.take()
+
+
+class _Sink:
+    """What a zip is written to: it can be asked for what was written since."""
+
+    def __init__(self) -> None:
+        self._written = bytearray()
+
+    def write(self, data: bytes) -> int:
+        self._written += data
+        return len(data)
+
+    def flush(self) -> None:
+        pass
+
+    def take(self) -> bytes:
+        taken = bytes(self._written)
+        self._written.clear()
+        return taken
+
+
+def _parts(file: BinaryIO, wanted: range) -> Iterator[bytes]:
+    with file:
+        file.seek(wanted.start)
+        left = len(wanted)
+        while left and (part := file.read(min(PART, left))):
+            left -= len(part)
+            yield part
+
+
+def _has(header: str | None, etag: str) -> bool:
+    """Whether ``If-None-Match`` names this ETag; a weak one does for it."""
+    return header is not None and any(each.strip().removeprefix("W/") in {etag, "*"} for each in header.split(","))
+
+
+def _asked_range(request: Request, size: int, etag: str) -> range | None:
+    """The bytes that the request asks for, which may be none; ``None`` where it asks for the whole."""
+    match = _RANGE.fullmatch(request.headers.get("range", ""))
+    if match is None or match[0] == "bytes=-" or request.headers.get("if-range", etag) != etag:
+        return None
+    first, last = match[1], match[2]
+    if not first:
+        return range(max(0, size - int(last)), size)
+    if last and int(last) < int(first):
+        return None
+    return range(int(first), min(int(last) + 1, size) if last else size)

@@ -1,0 +1,215 @@
+"""The examples of the OpenAPI document. A test posts the requests and checks the answers against their schemas."""
+
+from typing import Any, Final
+
+__all__ = [
+    "ARCHIVE",
+    "BACKGROUND",
+    "BACKGROUND_LIST",
+    "CLASSIFIER",
+    "CLASSIFIER_LIST",
+    "EVENT_STREAM",
+    "EXPERIMENT_LIST",
+    "FILE",
+    "HEALTHY",
+    "JOB",
+    "JOB_LIST",
+    "JOB_REQUESTS",
+    "OBJECT",
+    "OBJECT_LIST",
+    "PART_ANSWERS",
+    "READY",
+    "RENDERER_LIST",
+    "RESULT",
+    "WORKER_LIST",
+    "found",
+    "made",
+]
+
+Content = dict[str, Any]
+Answers = dict[int | str, dict[str, Any]]
+
+
+def _json(example: Any) -> Content:
+    return {"content": {"application/json": {"example": example}}}
+
+
+def found(content: Content, description: str = "What was asked for") -> Answers:
+    """The answer 200 with this example."""
+    return {200: {"description": description, **content}}
+
+
+def made(content: Content, description: str = "What was made") -> Answers:
+    """The answer 201 with this example."""
+    return {201: {"description": description, **content}}
+
+
+JOB_REQUESTS: Final[dict[str, Any]] = {
+    "shortest": {
+        "summary": "The shipped mug against the shipped classifier",
+        "value": {"object": "mug", "label": "mug"},
+    },
+    "labelled": {
+        "summary": "A job of a series: it waits behind others, and is found by its labels",
+        "value": {
+            "object": "mug",
+            "label": "mug",
+            "classifier": "tiny",
+            "epsilon": 0.02,
+            "steps": 60,
+            "seed": 7,
+            "priority": "sweep",
+            "labels": {"experiment": "mugs", "epsilon": "0.02"},
+        },
+    },
+    "targeted": {
+        "summary": "To be taken for a bottle, before two backgrounds, where saliency is highest",
+        "value": {
+            "object": "mug",
+            "label": "mug",
+            "target_label": "bottle",
+            "background": ["black", "#a0c0e0"],
+            "keep": 0.2,
+        },
+    },
+}
+
+_JOB: Final[dict[str, Any]] = {
+    "id": "8f14e45fceea167a",
+    "state": "running",
+    "spec": {"object": "mug", "label": "mug", "classifier": "tiny", "epsilon": 0.02, "alpha": 0.004},
+    "priority": "sweep",
+    "labels": {"experiment": "mugs"},
+    "needs": "any",
+    "worker": "gpu-1-4711",
+    "created": "2026-01-31T12:00:00Z",
+    "started": "2026-01-31T12:00:01Z",
+    "finished": None,
+    "progress": {
+        "phase": "attack",
+        "fraction": 0.6,
+        "step": 18,
+        "steps": 30,
+        "loss": 1.5,
+        "fooled": 0.4,
+        "eta_seconds": 12.0,
+    },
+    "attempts": 1,
+    "error": None,
+    "note": None,
+    "artifacts": [],
+}
+_OBJECT: Final = {
+    "id": "2c624232cdd221771294dfbb310aca000a0df6ac8b66b696d90ef06fdefb64a3",
+    "name": "vase",
+    "materials": ["glaze"],
+    "textures": {"glaze.png": [512, 512]},
+    "triangles": 960,
+    "radius": 0.11,
+    "shipped": False,
+}
+_CLASSIFIER: Final = {
+    "id": "tiny",
+    "name": "tiny",
+    "white_box": True,
+    "image_size": [128, 128],
+    "n_classes": 3,
+    "classes": ["ball", "bottle", "mug"],
+    "shipped": True,
+}
+_BACKGROUND: Final = {"id": "19581e27de7ced00ff1ce50b2047e7a567c76b1cbaebabe5ef03f7c3017bb5b7", "name": "beach"}
+_WORKER: Final = {
+    "id": "gpu-1-4711",
+    "host": "gpu-1",
+    "device": "cuda:0",
+    "alive": True,
+    "started": "2026-01-31T09:00:00Z",
+    "seen": "2026-01-31T12:00:03Z",
+    "job": "8f14e45fceea167a",
+}
+_EXPERIMENT: Final = {
+    "name": "mugs",
+    "jobs": {"succeeded": 11, "running": 1, "queued": 4},
+    "created": "2026-01-31T11:00:00Z",
+}
+
+JOB: Final = _json(_JOB)
+JOB_LIST: Final = _json({"jobs": [_JOB], "next_cursor": "41"})
+OBJECT: Final = _json(_OBJECT)
+OBJECT_LIST: Final = _json([_OBJECT])
+CLASSIFIER: Final = _json(_CLASSIFIER)
+CLASSIFIER_LIST: Final = _json([_CLASSIFIER])
+BACKGROUND: Final = _json(_BACKGROUND)
+BACKGROUND_LIST: Final = _json([_BACKGROUND])
+WORKER_LIST: Final = _json([_WORKER])
+RENDERER_LIST: Final = _json([{"address": "127.0.0.1:8085", "alive": True}])
+EXPERIMENT_LIST: Final = _json([_EXPERIMENT])
+HEALTHY: Final = _json({"status": "ok"})
+READY: Final = _json({"status": "ready"})
+
+EVENT_STREAM: Final = (
+    'id: 3\nevent: progress\ndata: {"id": 3, "time": "2026-01-31T12:00:00Z", "state": "running", '
+    '"progress": {"phase": "attack", "fraction": 0.4}}\n\n'
+)
+ARCHIVE: Final[dict[str, Any]] = {
+    "description": "A zip of all artifacts.",
+    "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
+}
+_ACCURACY: Final = {
+    "views": 60,
+    "a_before": 0.95,
+    "a_after": 0.05,
+    "a_drop": 0.947,
+    "a_drop_interval": [0.88, 1.0],
+    "a_before_interval": [0.86, 0.98],
+    "a_after_interval": [0.02, 0.14],
+}
+_VIEW: Final = {
+    "azimuth": 60.0,
+    "elevation": 20.0,
+    "distance": 0.35,
+    "light_azimuth": 0.0,
+    "light_elevation": 75.0,
+    "before": 2,
+    "before_confidence": 0.97,
+    "before_true_confidence": 0.97,
+    "after": 1,
+    "after_confidence": 0.81,
+    "after_true_confidence": 0.09,
+}
+RESULT: Final = _json(
+    {
+        "spec": {"object": "mug", "label": "mug"},
+        "object": "mug",
+        "label": 2,
+        "label_name": "mug",
+        "classifier": "tiny",
+        "epsilon": 0.05,
+        "alpha": 0.01,
+        "tau": 0.05,
+        "surrogate_model": "curve",
+        "surrogate_reason": "the cheapest within tolerance",
+        "seed": 0,
+        "steps": 30,
+        "image_size": [128, 128],
+        "surrogate": _ACCURACY,
+        "target": _ACCURACY,
+        "held_out": _ACCURACY,
+        "transfer_gap": 0.0,
+        "texels_altered": 0.62,
+        "mean_texel_change": 0.031,
+        "max_view_change": 0.049,
+        "seconds": {"prepare": 3.1, "calibrate": 6.4, "attack": 21.0, "judge": 3.0},
+        "probe_renders": 304,
+        "versions": {"trompe": "0.1.0"},
+        "views": [_VIEW],
+        "held_out_views": [_VIEW],
+    }
+)
+
+_BYTES: Final = {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}
+FILE: Final = _BYTES
+PART_ANSWERS: Final[Answers] = {
+    206: {"description": "The range of it that was asked for.", **_BYTES},
+    304: {"description": "The client has it already (If-None-Match)."},
+}

@@ -1,0 +1,36 @@
+"""Routes for experiments. One is no record of its own: it is the jobs with the label ``experiment=<name>``."""
+
+from typing import Final
+
+from fastapi import APIRouter
+
+from trompe_server.api import examples
+from trompe_server.api.jobs import Cursor, Limit
+from trompe_server.api.problems import PROBLEMS
+from trompe_server.api.services import StoreDep
+from trompe_server.errors import NotFoundError
+from trompe_shared.api import ExperimentInfo, JobList
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/v1/experiments", tags=["experiments"], responses=PROBLEMS)
+
+LABEL: Final = "experiment"
+
+
+@router.get("", responses=examples.found(examples.EXPERIMENT_LIST))
+def list_experiments(store: StoreDep) -> list[ExperimentInfo]:
+    """Experiments with their jobs counted by state, the newest first."""
+    return [
+        ExperimentInfo(name=group.value, jobs=dict(group.counts), created=group.created)
+        for group in store.groups(LABEL)
+    ]
+
+
+@router.get("/{name:path}", responses=examples.found(examples.JOB_LIST))
+def read_experiment(store: StoreDep, name: str, limit: Limit = 50, cursor: Cursor = None) -> JobList:
+    """The jobs of an experiment, newest first."""
+    page = store.page(labels={LABEL: name}, limit=limit, cursor=cursor)
+    if not page.jobs and cursor is None:
+        raise NotFoundError(f"There is no experiment {name!r}. GET /v1/experiments lists them.")
+    return page

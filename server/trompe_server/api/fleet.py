@@ -1,0 +1,24 @@
+"""Routes for what does the work: attack workers and renderer workers."""
+
+from fastapi import APIRouter
+
+from trompe_server.api import examples
+from trompe_server.api.problems import PROBLEMS
+from trompe_server.api.services import ServicesDep, StoreDep
+from trompe_shared.api import RendererInfo, WorkerInfo
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/v1", tags=["workers"], responses=PROBLEMS)
+
+
+@router.get("/workers", responses=examples.found(examples.WORKER_LIST))
+def list_workers(store: StoreDep) -> list[WorkerInfo]:
+    """Attack workers, as their last heartbeats told."""
+    return store.workers()
+
+
+@router.get("/renderers", responses=examples.found(examples.RENDERER_LIST))
+def list_renderers(services: ServicesDep) -> list[RendererInfo]:
+    """Renderer workers that this server knows, and whether they accept connections."""
+    return services.renderers()

@@ -1,0 +1,63 @@
+"""A job's events as a stream (SSE) that a client can take up again where it broke off."""
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator
+from typing import Final
+
+import anyio
+from sse_starlette import EventSourceResponse, ServerSentEvent
+
+from trompe_server.database import DatabaseDownError
+from trompe_server.errors import NotFoundError
+from trompe_server.jobs.store import JobStore
+from trompe_shared.api import Event
+
+__all__ = ["follow"]
+
+logger = logging.getLogger(__name__)
+
+INTERVAL: Final = 0.25
+"""Seconds between two looks for new events of a job in which something happens."""
+PATIENCE: Final = 2.0
+"""The most that the interval grows to while nothing happens: hundreds of waiting jobs may be followed at once."""
+KEEP_ALIVE: Final = 15
+"""Seconds between two comments that keep the connection from being taken for dead."""
+GRACE: Final = 2.0
+"""Seconds that streams have to end in good order when the server stops."""
+
+
+def follow(store: JobStore, job: str, *, after: int) -> EventSourceResponse:
+    """Events with ids above ``after`` until the job has ended or is deleted, or the server stops."""
+    stopping = anyio.Event()
+    messages = _messages(store, job, after, stopping)
+    return EventSourceResponse(messages, ping=KEEP_ALIVE, shutdown_event=stopping, shutdown_grace_period=GRACE)
+
+
+async def _messages(store: JobStore, job: str, after: int, stopping: anyio.Event) -> AsyncIterator[ServerSentEvent]:
+    interval = INTERVAL
+    while not stopping.is_set():
+        events, over = await asyncio.to_thread(_look, store, job, after)
+        for event in events:
+            after = event.id
+            yield ServerSentEvent(data=event.model_dump_json(), id=str(event.id), event="progress")
+        if over:
+            return
+        interval = INTERVAL if events else min(1.5 * interval, PATIENCE)
+        with anyio.move_on_after(interval):
+            await stopping.wait()
+
+
+def _look(store: JobStore, job: str, after: int) -> tuple[list[Event], bool]:
+    """New events, and whether there will be no more. A database that is away is waited for.
+
+    The state is read first: a job that had ended by then has all its events.
+    """
+    try:
+        over = store.get(job).state.final
+        return store.events(job, after=after), over
+    except NotFoundError:
+        return [], True
+    except DatabaseDownError:
+        logger.warning("the events of job %s cannot be read; its followers wait", job)
+        return [], False

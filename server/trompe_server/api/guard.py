@@ -1,0 +1,180 @@
+"""Who may come in. Every path is closed unless it is listed as open, so that a new route is safe by default.
+
+Without any token the service is open, which ``serve`` allows on loopback alone. A page in a browser could still send
+requests there; two headers that browsers add and pages cannot forge tell them apart (``Host`` and ``Origin``).
+"""
+
+import asyncio
+import hmac
+import ipaddress
+import math
+import time
+from collections.abc import Mapping
+from typing import Final
+from urllib.parse import SplitResult, urlsplit
+
+from fastapi import Request
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from trompe_server.access import Right, Token, Tokens, hash_secret
+from trompe_server.api.problems import problem_response
+from trompe_server.api.rate import RateLimit
+
+__all__ = ["COOKIE", "OPEN_PATHS", "Guard"]
+
+OPEN_PATHS: Final = frozenset({"/docs", "/openapi.json", "/healthz", "/readyz", "/login", "/logout"})
+"""What needs no token: whether the service is up, what it offers, and where browsers sign in and out."""
+OPEN_FOLDER: Final = "/static/"
+"""Files that go with the pages and are the same everywhere."""
+COOKIE: Final = "trompe_token"
+"""Holds the token of someone who signed in by a browser."""
+UNLIMITED_PATHS: Final = frozenset({"/healthz"})
+READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+FRESH: Final = 1.0
+"""Seconds for which the tokens are not looked up again: so long a revoked one may still work."""
+_CREATE: Final = "`trompe token create NAME --right read|write` makes one."
+
+
+class _RefusedError(Exception):
+    """A request that is not let in."""
+
+    def __init__(self, status: int, code: str, detail: str, **headers: str) -> None:
+        super().__init__(detail)
+        self.status, self.code = status, code
+        self.headers = {name.replace("_", "-"): value for name, value in headers.items()}
+
+
+class Guard:
+    """Lets requests in by token, by rate and, where there are no tokens, by where they come from."""
+
+    def __init__(self, app: ASGIApp, *, tokens: Tokens, rate: float) -> None:
+        self._app, self._tokens, self._limit = app, tokens, RateLimit(rate)
+        self._known: Mapping[str, Token] = {}
+        self._looked_up = -math.inf
+        self._lock = asyncio.Lock()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request, or refuse it."""
+        if scope["type"] == "http":
+            request = Request(scope)
+            try:
+                await self._admit(request)
+            except _RefusedError as refusal:
+                response = problem_response(request, refusal.status, code=refusal.code, detail=str(refusal))
+                response.headers.update(refusal.headers)
+                await response(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
+
+    async def _admit(self, request: Request) -> None:
+        """Raise ``_RefusedError`` unless the request may be served."""
+        path = request.scope["path"]  # not request.url.path, which a made-up Host header can change
+        address = request.client.host if request.client else "unknown"
+        try:
+            _check_origin(request)
+            is_open = path in OPEN_PATHS or path.startswith(OPEN_FOLDER)
+            token = None if is_open else await self._identify(request)
+        except _RefusedError:
+            self._check_rate(address)
+            raise
+        if path not in UNLIMITED_PATHS:
+            self._check_rate(address if token is None else f"token {token.name}")
+        if token is not None:
+            await self._check_right(token, request)
+
+    async def _identify(self, request: Request) -> Token | None:
+        """The token of a request; ``None`` where there are none to ask for."""
+        known = await self._fresh_tokens()
+        if not known:
+            _check_host(request)
+            return None
+        token = _find(known, _secret(request))
+        if token is None or token.revoked is not None:
+            raise _unauthorized(f"The token is not known, or was revoked. {_CREATE}", ', error="invalid_token"')
+        request.scope["token"] = token.name
+        return token
+
+    async def _check_right(self, token: Token, request: Request) -> None:
+        if request.method not in READING and token.right is not Right.write:
+            raise _RefusedError(
+                403,
+                "read-only",
+                f"The token {token.name!r} may only read, and {request.method} writes. {_CREATE}",
+                WWW_Authenticate='Bearer realm="trompe", error="insufficient_scope", scope="write"',
+            )
+        if self._tokens.to_be_noted(token.name):
+            await asyncio.to_thread(self._tokens.note_used, token.name)
+
+    def _check_rate(self, client: str) -> None:
+        wait = self._limit.wait(client)
+        if wait:
+            raise _RefusedError(
+                429,
+                "too-many-requests",
+                f"That were too many requests; the next one is served in {wait:.2f} s (TROMPE_RATE_LIMIT).",
+                Retry_After=str(math.ceil(wait)),
+            )
+
+    async def _fresh_tokens(self) -> Mapping[str, Token]:
+        """The tokens as they were at most ``FRESH`` seconds ago."""
+        async with self._lock:
+            if time.monotonic() - self._looked_up > FRESH:
+                self._known = await asyncio.to_thread(self._tokens.by_hash)
+                self._looked_up = time.monotonic()
+            return self._known
+
+
+def _secret(request: Request) -> str:
+    """The secret that a request shows: in its header, or in the cookie of a browser that signed in."""
+    if "authorization" not in request.headers and COOKIE in request.cookies:
+        if request.method not in READING and "origin" not in request.headers:
+            raise _RefusedError(403, "other-origin", "A browser that writes must say from which page (Origin).")
+        return request.cookies[COOKIE]
+    scheme, _, secret = request.headers.get("authorization", "").partition(" ")
+    if scheme.lower() != "bearer" or not secret:
+        raise _unauthorized("This needs a token: send `Authorization: Bearer trompe_...`.")
+    return secret.strip()
+
+
+def _find(known: Mapping[str, Token], secret: str) -> Token | None:
+    """The token with this secret, in a time that does not tell how much of its hash was right."""
+    wanted = hash_secret(secret)
+    found = [token for sha256, token in known.items() if hmac.compare_digest(sha256, wanted)]
+    return found[0] if found else None
+
+
+def _check_origin(request: Request) -> None:
+    """Refuse a write that a page of another site makes: no other site is allowed in (CORS is closed)."""
+    origin = request.headers.get("origin")
+    if origin is None or request.method in READING:
+        return
+    if _split(origin).netloc != request.headers.get("host"):
+        raise _RefusedError(403, "other-origin", f"Pages of {origin} may not write here.")
+
+
+def _check_host(request: Request) -> None:
+    """Without tokens, refuse a public name: behind it may be a page whose name was made to point to this machine."""
+    name = _split(f"//{request.headers.get('host', '')}").hostname or ""
+    if "." in name and not _is_address(name):
+        raise _RefusedError(
+            403, "other-host", f"The service has no tokens and is known by its address, not as {name!r}. {_CREATE}"
+        )
+
+
+def _split(url: str) -> SplitResult:
+    try:
+        return urlsplit(url)
+    except ValueError as error:
+        raise _RefusedError(400, "no-address", f"{url[:80]!r} is no address ({error}).") from error
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _unauthorized(detail: str, error: str = "") -> _RefusedError:
+    return _RefusedError(401, "unauthorized", detail, WWW_Authenticate=f'Bearer realm="trompe"{error}')

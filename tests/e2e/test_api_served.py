@@ -1,0 +1,218 @@
+"""The API of a running ``trompe serve``: real sockets, many requests at once, streams, the examples of the docs.
+
+The pipeline is a fake one; all that is asked here is what the API makes of it.
+"""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from trompe_server.access import Right, Tokens
+from trompe_server.jobs.fake import PHASES, trace
+from trompe_server.jobs.store import JobStore
+from trompe_server.jobs.worker import prepare_data
+from trompe_server.settings import Settings
+from trompe_shared.api import JobRequest, JobState
+from trompe_shared.shipped import shipped_objects
+
+ROOT = Path(__file__).parents[2]
+JOB = {"object": "mug", "label": "mug"}
+
+
+class Serve:
+    """A running ``trompe serve`` that has tokens: ``client`` may write, ``reader`` may read."""
+
+    def __init__(self, data: Path, **environment: str) -> None:
+        self.settings = Settings(data=data)
+        prepare_data(self.settings)
+        self.store = JobStore(self.settings.database_url)
+        self.tokens = Tokens(self.store.engine)
+        self.secret = self.tokens.create("writer", Right.write)
+        own = {"TROMPE_PIPELINE": "trompe_server.jobs.fake:open_pipeline", "TROMPE_RATE_LIMIT": "0"}
+        with (data / "serve.log").open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "trompe_server.jobs.leash", "serve", "--port", "0", "--data", str(data)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env=os.environ | own | environment,
+                text=True,
+            )
+        assert self.process.stdout is not None
+        self.url = self.process.stdout.readline().split()[-1]
+        self.client = self.client_of(self.secret)
+        self.reader = self.client_of(self.tokens.create("reader", Right.read))
+
+    def client_of(self, secret: str) -> httpx.Client:
+        limits = httpx.Limits(max_connections=None)
+        headers = {"Authorization": f"Bearer {secret}"}
+        return httpx.Client(base_url=self.url, headers=headers, timeout=60, limits=limits, trust_env=False)
+
+    def close(self) -> None:
+        self.client.close()
+        self.reader.close()
+        self.store.close()
+        if self.process.poll() is None:
+            self.process.terminate()
+        self.process.wait(60)
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe is not None
+            pipe.close()
+
+
+@contextmanager
+def serving(data: Path, **environment: str) -> Iterator[Serve]:
+    running = Serve(data, **environment)
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+@pytest.fixture(scope="module")
+def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serve]:
+    with serving(tmp_path_factory.mktemp("api") / "data") as running:
+        yield running
+
+
+def wait_until(condition: Callable[[], Any], *, seconds: float = 60.0) -> Any:
+    """What ``condition`` returns once it is true; fails after ``seconds``."""
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.05)
+    return value
+
+
+def all_ended(serve: Serve) -> bool:
+    counts = serve.store.counts()
+    return counts[JobState.queued] + counts[JobState.running] == 0
+
+
+def test_a_thousand_jobs_submitted_at_once_are_all_there_and_none_twice(serve: Serve) -> None:
+    """Every tenth request is sent twice with the same key, as by a client that lost the answer."""
+    numbers = [*range(1000), *range(0, 1000, 10)]
+    start = threading.Barrier(len(numbers))
+
+    def submit(number: int) -> tuple[int, int, str]:
+        start.wait(60)
+        body = JOB | {"seed": number, "labels": {"experiment": "thousand"}}
+        answer = serve.client.post("/v1/jobs", json=body, headers={"Idempotency-Key": f"thousand {number}"})
+        return number, answer.status_code, answer.json()["id"]
+
+    with ThreadPoolExecutor(len(numbers)) as pool:
+        answers = list(pool.map(submit, numbers))
+    assert Counter(status for _, status, _ in answers) == {201: 1000, 200: 100}
+    ids = {number: job for number, _, job in answers}
+    assert len(set(ids.values())) == 1000
+
+    listed, cursor = [], None
+    while cursor != "":
+        params = {"limit": 500, "label": "experiment:thousand"} | ({"cursor": cursor} if cursor else {})
+        page = serve.reader.get("/v1/jobs", params=params).json()
+        listed += page["jobs"]
+        cursor = page["next_cursor"] or ""
+    assert {job["spec"]["seed"]: job["id"] for job in listed} == ids
+    assert len(listed) == 1000
+    with ThreadPoolExecutor(4) as pool:
+        cancel = [f"/v1/jobs/{job['id']}/cancel" for job in listed[:-20]]
+        assert all(answer.is_success for answer in pool.map(serve.client.post, cancel))
+    wait_until(lambda: all_ended(serve))
+    for job in listed[-20:]:
+        folder = serve.settings.data / "jobs" / job["id"]
+        assert serve.store.get(job["id"]).state is JobState.succeeded
+        assert [note for note in trace(folder) if note.startswith("end")] == [f"end {phase}" for phase in PHASES]
+
+
+def test_a_revoked_token_is_worthless_within_moments(serve: Serve) -> None:
+    with serve.client_of(serve.tokens.create("guest", Right.read)) as guest:
+        wait_until(lambda: guest.get("/v1/jobs").status_code == 200, seconds=3)
+        serve.tokens.revoke("guest")
+        wait_until(lambda: guest.get("/v1/jobs").status_code == 401, seconds=3)
+
+
+def test_a_stream_of_events_is_taken_up_again_where_it_broke_off(serve: Serve) -> None:
+    job = serve.store.create(JobRequest.model_validate(JOB | {"label": "gate"}))[0].id
+    seen: list[int] = []
+
+    def follow(*, until: Callable[[dict[str, Any]], bool]) -> None:
+        last = {"Last-Event-ID": str(seen[-1])} if seen else {}
+        with serve.reader.stream("GET", f"/v1/jobs/{job}/events", headers=last) as stream:
+            for line in stream.iter_lines():
+                if line.startswith("data: "):
+                    event = json.loads(line.removeprefix("data: "))
+                    seen.append(event["id"])
+                    if until(event):
+                        return
+
+    follow(until=lambda event: event["progress"]["phase"] == "attack-001")
+    (serve.settings.data / "jobs" / job / "go").touch()
+    follow(until=lambda event: event["state"] == "succeeded")
+    assert seen == list(range(1, len(seen) + 1))
+
+
+def test_streams_end_when_the_server_stops_and_it_stops_at_once(tmp_path: Path) -> None:
+    with serving(tmp_path / "data") as serve:
+        job = serve.store.create(JobRequest.model_validate(JOB | {"label": "gate"}))[0].id
+        with serve.reader.stream("GET", f"/v1/jobs/{job}/events") as stream:
+            events = stream.iter_lines()
+            next(events)
+            asked = time.monotonic()
+            serve.process.send_signal(signal.SIGTERM)
+            rest = list(events)
+            assert time.monotonic() - asked < 4, "the stream is closed before the server gives up waiting for it"
+        assert not any("succeeded" in line for line in rest)
+        assert serve.process.wait(30) == 0
+
+
+def test_a_large_upload_does_not_fill_the_memory_of_the_server(serve: Serve) -> None:
+    """200 MiB that are no classifier: they are refused, and on their way they are in files alone."""
+
+    def parts() -> Iterator[bytes]:
+        yield b'--b\r\nContent-Disposition: form-data; name="file"; filename="x.onnx"\r\n\r\n'
+        for _ in range(200):
+            yield bytes(2**20)
+        yield b"\r\n--b--\r\n"
+
+    Path(f"/proc/{serve.process.pid}/clear_refs").write_text("5")  # what was the peak so far is forgotten
+    before = peak_memory(serve)
+    headers = {"Content-Type": "multipart/form-data; boundary=b"}
+    answer = serve.client.post("/v1/classifiers", content=parts(), headers=headers)
+    assert answer.status_code == 422, answer.text
+    assert peak_memory(serve) - before < 50 * 2**20
+
+
+def peak_memory(serve: Serve) -> int:
+    """The most memory that the server has had so far, bytes."""
+    status = Path(f"/proc/{serve.process.pid}/status").read_text()
+    return 1024 * int(re.search(r"VmHWM:\s+(\d+) kB", status)[1])  # type: ignore[index]
+
+
+def test_the_examples_of_the_documentation_work(serve: Serve, tmp_path: Path) -> None:
+    """All blocks of docs/api.md, as one script, in a folder with an object and the server's address and token."""
+    for program in ("curl", "jq"):
+        if shutil.which(program) is None:
+            pytest.skip(f"there is no {program} here; install it: sudo apt-get install {program}")
+    blocks = re.findall(r"^```bash\n(.*?)^```", (ROOT / "docs" / "api.md").read_text(), re.DOTALL | re.MULTILINE)
+    assert len(blocks) >= 8
+    (tmp_path / "vase.zip").write_bytes(shipped_objects()["bottle"].read())
+    own = {"TROMPE_SERVER": serve.url, "TROMPE_TOKEN": serve.secret, "TROMPE_DATA": str(serve.settings.data)}
+    environment = {**os.environ, **own, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    script = "set -euo pipefail\n" + "\n".join(blocks)
+    done = subprocess.run(["bash", "-xc", script], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr + done.stdout

@@ -1,0 +1,137 @@
+"""The REST API over a real library, store and files; no worker runs, so jobs stay where a test puts them."""
+
+import asyncio
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from trompe_server import library as library_module
+from trompe_server.access import Right, Tokens
+from trompe_server.api import guard
+from trompe_server.api.services import Services
+from trompe_server.app import create_app
+from trompe_server.artifacts import job_artifacts, open_folder
+from trompe_server.database import clock, write
+from trompe_server.jobs.store import JobStore
+from trompe_server.jobs.tables import update_job
+from trompe_server.library import Library
+from trompe_server.settings import Settings
+from trompe_shared.api import JobState, RendererInfo
+from trompe_shared.errors import ClassifierError
+
+CLASSES = ["mug, cup", "vase", "toilet tissue, toilet paper"]
+
+
+class Api:
+    """Requests to the application, made in this process; ``headers`` go with each of them."""
+
+    def __init__(self, services: Services) -> None:
+        self.services, self.headers = services, {}
+        self.app = create_app(services)
+
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        return asyncio.run(self._request(method, path, options))
+
+    async def _request(self, method: str, path: str, options: dict[str, Any]) -> httpx.Response:
+        transport = httpx.ASGITransport(self.app, raise_app_exceptions=False)
+        async with httpx.AsyncClient(transport=transport, base_url="http://trompe", headers=self.headers) as client:
+            return await client.request(method, path, **options)
+
+    def get(self, path: str, **options: Any) -> httpx.Response:
+        return self.request("GET", path, **options)
+
+    def post(self, path: str, **options: Any) -> httpx.Response:
+        return self.request("POST", path, **options)
+
+    def delete(self, path: str, **options: Any) -> httpx.Response:
+        return self.request("DELETE", path, **options)
+
+    def upload_object(self, data: bytes, name: str = "triangle.zip") -> httpx.Response:
+        return self.post("/v1/objects", files={"file": (name, data)})
+
+    def upload_classifier(self, data: bytes, name: str = "net.pt2", **form: str) -> httpx.Response:
+        return self.post("/v1/classifiers", files={"file": (name, data)}, data=form)
+
+    def submit(self, *, key: str | None = None, **spec: Any) -> httpx.Response:
+        headers = {"Idempotency-Key": key} if key else {}
+        body = {"object": "triangle", "label": 0, "classifier": "net"} | spec
+        return self.post("/v1/jobs", json=body, headers=headers)
+
+    def job(self, **spec: Any) -> str:
+        """The id of a new job."""
+        answer = self.submit(**spec)
+        assert answer.status_code == 201, answer.text
+        return str(answer.json()["id"])
+
+    def token(self, name: str, right: str) -> dict[str, str]:
+        """The header that a new token is sent in."""
+        return {"Authorization": f"Bearer {self.services.tokens.create(name, Right(right))}"}
+
+    def problem(self, response: httpx.Response, status: int) -> dict[str, Any]:
+        """The problem details of a response, checked to be well formed."""
+        assert response.status_code == status, response.text
+        assert response.headers["content-type"] == "application/problem+json"
+        body: dict[str, Any] = response.json()
+        assert body["status"] == status
+        assert body["request_id"] == response.headers["x-request-id"]
+        return body
+
+    def tell(self, job: str, message: str, **values: Any) -> None:
+        """Write to a job's record what a worker would write."""
+        with write(self.services.store.engine) as connection:
+            update_job(connection, job, message=message, **values)
+
+    def end(self, job: str, state: JobState = JobState.succeeded, **files: bytes) -> None:
+        """End a job with these files, whose names have '__' for '.'."""
+        artifacts = job_artifacts(self.services.files, job, attempt=1)
+        named = {name.replace("__", "."): data for name, data in files.items()}
+        for name, data in named.items():
+            artifacts.write(name, data)
+        self.tell(job, "ended", state=state.value, finished=clock(), artifacts=list(named))
+
+
+@pytest.fixture
+def missing() -> list[str]:
+    """What the service says is not up; a test fills it."""
+    return []
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    return Settings(data=tmp_path, max_upload=100_000)
+
+
+@pytest.fixture
+def api(settings: Settings, missing: list[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Api]:
+    """An API whose classifiers are read by their first byte: b"W" is white box, b"B" is not, others are broken.
+
+    What it knows of tokens is never older than the request.
+    """
+    monkeypatch.setattr(library_module, "_inspect", _inspect)
+    monkeypatch.setattr(guard, "FRESH", -1.0)
+    store, files = JobStore(settings.database_url), open_folder(settings.store_url)
+    store.migrate()
+    renderers = [RendererInfo(address="127.0.0.1:8085", alive=True)]
+    library = Library(files.within("library"))
+    yield Api(Services(settings, library, store, files, Tokens(store.engine), lambda: renderers, lambda: missing))
+    store.close()
+
+
+@pytest.fixture
+def stocked(api: Api, triangle_zip: Callable[..., bytes]) -> Api:
+    """An API with an object and a classifier with class names."""
+    assert api.upload_object(triangle_zip()).status_code == 201
+    assert api.upload_classifier(b"W", classes=json.dumps(CLASSES)).status_code == 201
+    return api
+
+
+def _inspect(path: str) -> dict[str, object]:
+    kinds = {b"W": {"white_box": True, "n_classes": 3}, b"B": {"white_box": False, "n_classes": 3}}
+    found = kinds.get(Path(path).read_bytes()[:1])
+    if found is None:
+        raise ClassifierError("The classifier is broken.")
+    return found | {"image_size": [224, 224]}

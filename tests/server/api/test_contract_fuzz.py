@@ -1,0 +1,77 @@
+"""Whatever is sent, whether the contract allows it or not: no 5xx, and answers as the contract says."""
+
+import json
+import random
+import warnings
+from contextlib import suppress
+
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, given, settings
+from hypothesis.errors import Unsatisfiable
+from schemathesis import GenerationMode
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_headers_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
+
+from trompe_server.access import Right
+from trompe_server.api import examples
+from trompe_shared.api import JobRequest, JobState
+
+RESULT = json.dumps(examples.RESULT["content"]["application/json"]["example"]).encode()
+CHECKS = [
+    schemathesis.checks.not_a_server_error,
+    content_type_conformance,
+    response_headers_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+]
+
+
+def schema_of(api):
+    """The contract as schemathesis reads it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return schemathesis.openapi.from_asgi("/openapi.json", api.app)
+
+
+@pytest.mark.parametrize("mode", [GenerationMode.POSITIVE, GenerationMode.NEGATIVE], ids=["allowed", "wrong"])
+@pytest.mark.parametrize("right", [None, Right.read, Right.write], ids=["open", "reader", "writer"])
+def test_nothing_that_is_sent_is_a_server_error(stocked, right, mode):
+    if right is not None:
+        stocked.headers = stocked.token("fuzz", right)
+    schema = schema_of(stocked)
+    seen = set()
+    for found in schema.get_all_operations():
+        seen |= fuzz(found.ok(), stocked, mode)
+    assert {404, 200 if mode is GenerationMode.POSITIVE else 422} <= seen
+    assert (403 in seen) == (right is Right.read)
+
+
+def fuzz(operation, api, mode) -> set[int]:
+    """Send made-up requests of one operation, half of them about a job that is there; statuses of the answers."""
+    request = JobRequest(object="mug", label="mug")
+    job, seen, luck = api.services.store.create(request)[0].id, set(), random.Random(0)
+    api.end(job, JobState.succeeded, result__json=RESULT, digits__txt=b"0123456789")
+
+    @settings(
+        max_examples=20 if mode is GenerationMode.POSITIVE else 8,
+        derandomize=True,
+        deadline=None,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(operation.as_strategy(generation_mode=mode))
+    def send(case) -> None:
+        if "job" in case.path_parameters and luck.random() < 0.5:
+            case.path_parameters["job"] = job
+        answer = case.call(headers=api.headers)
+        seen.add(answer.status_code)
+        case.validate_response(answer, checks=CHECKS)
+
+    with suppress(Unsatisfiable):  # there is nothing wrong to send to an operation that takes nothing
+        send()
+    return seen

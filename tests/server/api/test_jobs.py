@@ -1,0 +1,225 @@
+"""Jobs over HTTP: submit once, find again, cancel, repeat, delete."""
+
+import asyncio
+import json
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from trompe_shared.api import JobState
+from trompe_shared.object3d import encode_png
+
+GIF = bytes.fromhex("47494638396101000100800000000000ffffff2c00000000010001000002024401003b")
+"""A picture of one pixel."""
+
+
+def test_a_job_keeps_the_ids_of_what_it_names(stocked):
+    answer = stocked.submit(label="CUP", judges=["net"])
+    job = answer.json()
+    assert answer.status_code == 201
+    assert answer.headers["location"] == f"/v1/jobs/{job['id']}"
+    assert job["state"] == "queued"
+    assert job["spec"]["object"] == stocked.get("/v1/objects/triangle").json()["id"]
+    assert job["spec"]["classifier"] == job["spec"]["judges"][0] == stocked.get("/v1/classifiers/net").json()["id"]
+    assert stocked.get(f"/v1/jobs/{job['id']}").json() == job
+
+
+def test_ensemble_masks_and_backgrounds_are_kept_by_id_too(stocked):
+    member = stocked.upload_classifier(b"W2", "member.pt2").json()
+    white = encode_png(np.full((8, 8, 3), 255, np.uint8))
+    picture = stocked.post("/v1/backgrounds", files={"file": ("beach.png", white)}).json()
+    answer = stocked.submit(
+        ensemble=["member"], masks={"paint.png": "beach"}, materials=["paint"], background=["beach", "#00ff00"]
+    )
+    spec = answer.json()["spec"]
+    assert spec["ensemble"] == [member["id"]]
+    assert spec["masks"] == {"paint.png": picture["id"]}
+    assert spec["background"] == [picture["id"], "#00ff00"]
+
+
+def test_a_mask_of_another_size_than_its_texture_is_refused_at_once(stocked):
+    stocked.post("/v1/backgrounds", files={"file": ("beach.gif", GIF)})
+    refusal = stocked.problem(stocked.submit(masks={"paint.png": "beach"}), 422)
+    assert "is 1 x 1 pixels, the texture 8 x 8" in refusal["detail"]
+
+
+def test_an_ensemble_whose_classes_have_other_names_is_refused_at_once(stocked):
+    others = json.dumps(["mug, cup", "toilet tissue, toilet paper", "vase"])
+    stocked.upload_classifier(b"W2", "member.pt2", classes=others)
+    refusal = stocked.problem(stocked.submit(ensemble=["member"]), 422)
+    assert "class 1 is 'vase' for one and 'toilet tissue, toilet paper' for the other" in refusal["detail"]
+
+
+def test_a_classifier_without_gradients_can_be_attacked_by_its_scores(stocked):
+    stocked.upload_classifier(b"B", "judge.onnx")
+    assert stocked.submit(classifier="judge", queries=10).status_code == 201
+
+
+@pytest.mark.parametrize(
+    ("spec", "status", "words"),
+    [
+        pytest.param({"object": "trumpet"}, 404, "no object 'trumpet'", id="object"),
+        pytest.param({"classifier": "resnet"}, 404, "no classifier 'resnet'", id="classifier"),
+        pytest.param({"judges": ["resnet"]}, 404, "no classifier 'resnet'", id="judge"),
+        pytest.param({"label": "vaze"}, 422, "did you mean 'vase'?", id="label"),
+        pytest.param({"label": 3}, 422, "indices are 0..2", id="index"),
+        pytest.param({"background": "beach"}, 404, "no background 'beach'", id="background"),
+        pytest.param({"background": "#12345"}, 404, "no background '#12345'", id="colour"),
+        pytest.param({"ensemble": ["resnet"]}, 404, "no classifier 'resnet'", id="ensemble"),
+        pytest.param({"masks": {"paint.png": "beach"}}, 404, "no background 'beach'", id="mask"),
+        pytest.param({"masks": {"wood.png": "beach"}}, 422, "no texture ['wood.png'] to mask", id="texture"),
+        pytest.param({"materials": ["paint", "wood"]}, 422, "no material ['wood']", id="material"),
+        pytest.param({"target_label": "vaze"}, 422, "did you mean 'vase'?", id="target"),
+        pytest.param({"target_label": "mug"}, 422, "is the object's own class", id="target is the label"),
+        pytest.param({"top_k": 3}, 422, "less than the 3 classes", id="top k"),
+        pytest.param({"queries": 10}, 422, "'net' gives gradients", id="queries of a white box"),
+        pytest.param({"classifier": "judge"}, 422, "gives no gradients", id="black box"),
+        pytest.param({"classifier": "judge", "queries": 4, "tau": 0.1}, 422, "need saliency", id="its tau"),
+        pytest.param({"classifier": "judge", "queries": 4, "keep": 0.1}, 422, "need saliency", id="its saliency"),
+        pytest.param({"ensemble": ["judge"]}, 422, "not in the ensemble", id="black box in the ensemble"),
+    ],
+)
+def test_a_job_that_names_what_is_not_there_is_refused_at_once(stocked, spec: dict[str, Any], status: int, words: str):
+    stocked.upload_classifier(b"B", "judge.onnx")
+    assert words in stocked.problem(stocked.submit(**spec), status)["detail"]
+    assert stocked.get("/v1/jobs").json()["jobs"] == []
+
+
+def test_invalid_fields_are_listed_one_by_one(api):
+    refusal = api.problem(api.post("/v1/jobs", json={"object": "mug", "epsilon": 2, "colour": "red"}), 422)
+    assert {error["field"] for error in refusal["errors"]} == {"label", "epsilon", "colour"}
+    assert all(error["message"] for error in refusal["errors"])
+    contradiction = api.problem(
+        api.post("/v1/jobs", json={"object": "mug", "label": 0, "epsilon": 0.01, "alpha": 0.5}), 422
+    )
+    assert "alpha (0.5) is the step" in contradiction["detail"]
+
+
+def test_jobs_are_listed_newest_first_in_pages_and_by_state(stocked):
+    ids = [stocked.submit().json()["id"] for _ in range(5)]
+    stocked.post(f"/v1/jobs/{ids[2]}/cancel")
+    seen, cursor = [], None
+    while cursor != "":
+        page = stocked.get("/v1/jobs", params={"limit": 2} | ({"cursor": cursor} if cursor else {})).json()
+        assert len(page["jobs"]) <= 2
+        seen += [job["id"] for job in page["jobs"]]
+        cursor = page["next_cursor"] or ""
+    assert seen == ids[::-1]
+    cancelled = stocked.get("/v1/jobs", params={"state": "cancelled"}).json()
+    assert [job["id"] for job in cancelled["jobs"]] == [ids[2]]
+
+
+def test_cancelling_a_queued_job_ends_it_and_cancelling_again_changes_nothing(stocked):
+    job = stocked.submit().json()["id"]
+    cancelled = stocked.post(f"/v1/jobs/{job}/cancel").json()
+    assert cancelled["state"] == "cancelled"
+    assert stocked.post(f"/v1/jobs/{job}/cancel").json() == cancelled
+
+
+def test_the_same_request_with_the_same_key_makes_one_job(stocked):
+    first = stocked.submit(key="sweep 1", seed=1)
+    again = stocked.submit(key="sweep 1", seed=1)
+    assert (first.status_code, again.status_code) == (201, 200)
+    assert again.json() == first.json()
+    assert again.headers["location"] == first.headers["location"]
+    assert stocked.submit(key="sweep 2", seed=1).json()["id"] != first.json()["id"]
+    refusal = stocked.problem(stocked.submit(key="sweep 1", seed=2), 409)
+    assert "came with another request" in refusal["detail"]
+    assert len(stocked.get("/v1/jobs").json()["jobs"]) == 2
+
+
+@pytest.mark.parametrize("key", ["", "x" * 256])
+def test_a_key_has_a_sensible_length(stocked, key):
+    refusal = stocked.problem(stocked.post("/v1/jobs", json={}, headers={"Idempotency-Key": key}), 422)
+    assert "idempotency-key" in {error["field"] for error in refusal["errors"]}
+
+
+def test_many_at_once_with_the_same_key_make_one_job(stocked):
+    async def at_once() -> list[httpx.Response]:
+        body = {"object": "triangle", "label": 0, "classifier": "net"}
+        transport = httpx.ASGITransport(stocked.app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://trompe") as client:
+            posts = (client.post("/v1/jobs", json=body, headers={"Idempotency-Key": "k"}) for _ in range(20))
+            return await asyncio.gather(*posts)
+
+    answers = asyncio.run(at_once())
+    assert sorted(answer.status_code for answer in answers) == [200] * 19 + [201]
+    assert len({answer.json()["id"] for answer in answers}) == 1
+
+
+def test_jobs_are_found_by_labels_object_and_classifier(stocked, triangle_zip):
+    other = stocked.upload_object(triangle_zip(colour=(0, 0, 255)), "blue.zip").json()["id"]
+    red = stocked.job(labels={"team": "a", "run": "1"})
+    blue = stocked.job(object="blue", labels={"team": "a", "run": "x:y"})
+    tiny = stocked.job(object="mug", classifier="tiny", labels={"team": "b"})
+
+    def ids(**params):
+        return [job["id"] for job in stocked.get("/v1/jobs", params=params).json()["jobs"]]
+
+    assert ids(label="team:a") == [blue, red]
+    assert ids(label=["team:a", "run:x:y"]) == [blue]
+    assert ids(object=other) == [blue]
+    assert ids(classifier="tiny") == [tiny]
+    assert ids(object=other, classifier="tiny") == []
+    assert ids(label=["team:a", "team:a"]) == [blue, red]
+    twice = stocked.problem(stocked.get("/v1/jobs", params={"label": ["team:a", "team:b"]}), 422)
+    assert "no job has two values" in twice["detail"]
+    for wrong in ("team", ":a", "team:"):
+        assert "key:value" in stocked.problem(stocked.get("/v1/jobs", params={"label": wrong}), 422)["detail"]
+
+
+def test_a_job_shows_what_the_queue_knows_of_it(stocked):
+    job = stocked.submit(priority="sweep", needs="cuda", labels={"team": "a"}).json()
+    assert (job["priority"], job["needs"], job["labels"]) == ("sweep", "cuda", {"team": "a"})
+    assert "priority" not in job["spec"]
+
+
+def test_a_job_that_has_ended_is_repeated_as_a_new_one(stocked):
+    old = stocked.job(label="CUP", seed=3, labels={"experiment": "e"}, priority="sweep")
+    assert "is queued" in stocked.problem(stocked.post(f"/v1/jobs/{old}/retry"), 409)["detail"]
+    stocked.end(old, JobState.failed)
+    answer = stocked.post(f"/v1/jobs/{old}/retry", headers={"Idempotency-Key": "again"})
+    new, before = answer.json(), stocked.get(f"/v1/jobs/{old}").json()
+    assert (answer.status_code, answer.headers["location"]) == (201, f"/v1/jobs/{new['id']}")
+    assert (new["state"], before["state"]) == ("queued", "failed")
+    for same in ("spec", "labels", "priority", "needs"):
+        assert new[same] == before[same]
+    assert new["id"] != old
+    once_more = stocked.post(f"/v1/jobs/{old}/retry", headers={"Idempotency-Key": "again"})
+    assert (once_more.status_code, once_more.json()["id"]) == (200, new["id"])
+
+
+def test_a_job_that_has_ended_can_be_deleted_with_its_files(stocked):
+    job = stocked.job()
+    assert "is queued" in stocked.problem(stocked.delete(f"/v1/jobs/{job}"), 409)["detail"]
+    stocked.end(job, result__json=b"{}")
+    assert stocked.delete(f"/v1/jobs/{job}").status_code == 204
+    stocked.problem(stocked.get(f"/v1/jobs/{job}"), 404)
+    stocked.problem(stocked.delete(f"/v1/jobs/{job}"), 404)
+    assert stocked.services.artifacts(job).names() == []
+
+
+def test_an_experiment_is_the_jobs_with_its_label(stocked):
+    assert stocked.get("/v1/experiments").json() == []
+    mugs = [stocked.job(labels={"experiment": "mugs"}) for _ in range(3)]
+    stocked.job()
+    vases = stocked.job(labels={"experiment": "vases/2"})
+    stocked.post(f"/v1/jobs/{mugs[0]}/cancel")
+    listed = {each["name"]: each for each in stocked.get("/v1/experiments").json()}
+    assert {name: each["jobs"] for name, each in listed.items()} == {
+        "mugs": {"cancelled": 1, "queued": 2},
+        "vases/2": {"queued": 1},
+    }
+    assert listed["mugs"]["created"] == stocked.get(f"/v1/jobs/{mugs[0]}").json()["created"]
+    page = stocked.get("/v1/experiments/mugs", params={"limit": 2}).json()
+    rest = stocked.get("/v1/experiments/mugs", params={"cursor": page["next_cursor"]}).json()
+    assert [job["id"] for job in page["jobs"] + rest["jobs"]] == mugs[::-1]
+    assert [job["id"] for job in stocked.get("/v1/experiments/vases%2F2").json()["jobs"]] == [vases]
+    assert "no experiment 'cups'" in stocked.problem(stocked.get("/v1/experiments/cups"), 404)["detail"]
+
+
+def test_workers_and_renderers_are_listed(api):
+    assert api.get("/v1/workers").json() == []
+    assert api.get("/v1/renderers").json() == [{"address": "127.0.0.1:8085", "alive": True}]

@@ -1,0 +1,58 @@
+"""The API while PostgreSQL is away: 503 at once, nothing lost, and all is well when it is back."""
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from trompe_server.access import Right, Tokens
+from trompe_server.api import guard
+from trompe_server.api.services import Services
+from trompe_server.app import create_app
+from trompe_server.artifacts import open_folder
+from trompe_server.jobs.store import JobStore
+from trompe_server.library import Library
+from trompe_server.settings import Settings
+
+JOB = {"object": "mug", "label": "mug"}
+
+
+@pytest.fixture
+def services(postgres: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Services]:
+    """The API's side of a service on a PostgreSQL of its own. Tokens are never older than the request."""
+    monkeypatch.setattr(guard, "FRESH", -1.0)
+    settings = Settings(data=tmp_path, database=postgres.database())
+    store, files = JobStore(settings.database_url), open_folder(settings.store_url)
+    store.migrate()
+    library, tokens = Library(tmp_path / "library"), Tokens(store.engine)
+    yield Services(settings, library, store, files, tokens, list, list)
+    store.close()
+
+
+def test_a_database_that_stops_is_answered_with_503_until_it_is_back(services: Services, postgres: Any) -> None:
+    asyncio.run(_stop_and_start(services, postgres))
+
+
+async def _stop_and_start(services: Services, postgres: Any) -> None:
+    headers = {"Authorization": f"Bearer {services.tokens.create('ci', Right.write)}"}
+    transport = httpx.ASGITransport(create_app(services), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://trompe", headers=headers) as client:
+        job = (await client.post("/v1/jobs", json=JOB)).json()["id"]
+        stream = asyncio.create_task(client.get(f"/v1/jobs/{job}/events"))
+        await asyncio.sleep(0.5)
+        await asyncio.to_thread(postgres.stop)
+        for method, path in [("GET", "/v1/jobs"), ("GET", "/readyz"), ("GET", "/metrics"), ("POST", "/v1/jobs")] * 2:
+            answer = await asyncio.wait_for(client.request(method, path, json=JOB), 10)
+            assert (answer.status_code, answer.headers["retry-after"]) == (503, "5"), (method, path)
+        assert (await client.get("/healthz")).status_code == 200
+        assert not stream.done(), "followers wait until it is back"
+
+        await asyncio.to_thread(postgres.start)
+        listed = (await client.get("/v1/jobs")).json()["jobs"]
+        assert [each["id"] for each in listed] == [job]
+        await client.post(f"/v1/jobs/{job}/cancel")
+        followed = (await asyncio.wait_for(stream, 20)).text
+        assert '"cancelled"' in followed
