@@ -1,39 +1,55 @@
-"""Thin client of a Trompe server: ``Client(url).attack(...)`` gives a job to wait for. Needs no torch and no numpy."""
+"""Thin client of a Trompe server: ``Client().attack(...)`` gives a job to wait for. Needs no torch and no numpy."""
 
+from trompe_client._async_client import AsyncClient
 from trompe_client._client import Client
 from trompe_client._errors import (
     APIError,
     BadRequest,
+    BrokenDownload,
     ClientError,
     Conflict,
     ContractError,
     EmbeddedServerError,
+    Forbidden,
     JobCancelled,
     JobError,
     JobFailed,
     NotFound,
     ServerFault,
     ServerUnreachable,
+    TooMany,
+    Unauthorized,
     WaitTimeout,
 )
-from trompe_client._job import JobHandle
+from trompe_client._job import AsyncJobHandle, JobHandle
+from trompe_client._many import Attack, Outcome
 from trompe_client._plan import AttackOptions
+from trompe_client._retry import Retries
 
 __all__ = [
     "APIError",
+    "AsyncClient",
+    "AsyncJobHandle",
+    "Attack",
     "AttackOptions",
     "BadRequest",
+    "BrokenDownload",
     "Client",
     "ClientError",
     "Conflict",
     "ContractError",
     "EmbeddedServerError",
+    "Forbidden",
     "JobCancelled",
     "JobError",
     "JobFailed",
     "JobHandle",
     "NotFound",
+    "Outcome",
+    "Retries",
     "ServerFault",
     "ServerUnreachable",
+    "TooMany",
+    "Unauthorized",
     "WaitTimeout",
 ]

@@ -1,16 +1,29 @@
 """What is said to the server and how its answers are read. No I/O: any HTTP library can carry a ``Request``.
 
-One function per request of the contract; ``Client`` sends them, and so can any other shell.
+One function per request of the contract; ``_operations`` puts them together.
 """
 
+import secrets
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from datetime import UTC, datetime
+from functools import cache
+from typing import Any, Final, Generic, TypeVar
 from urllib.parse import quote
 
 from pydantic import TypeAdapter, ValidationError
 
-from trompe_client._errors import APIError, BadRequest, Conflict, ContractError, NotFound, ServerFault
+from trompe_client._errors import (
+    APIError,
+    BadRequest,
+    Conflict,
+    ContractError,
+    Forbidden,
+    NotFound,
+    ServerFault,
+    TooMany,
+    Unauthorized,
+)
 from trompe_client._plan import Upload
 from trompe_shared.api import (
     BackgroundInfo,
@@ -18,28 +31,55 @@ from trompe_shared.api import (
     Event,
     Job,
     JobList,
+    JobRequest,
     JobSpec,
     JobState,
     ObjectInfo,
     Problem,
+    RendererInfo,
     Result,
+    WorkerInfo,
 )
 
 T = TypeVar("T")
 
+SHORT_PAGE: Final = 50
+LONG_PAGE: Final = 500
+"""Jobs on a page of a list: as many as people look at; and as many as a server gives."""
+
 
 @dataclass(frozen=True)
 class Request(Generic[T]):
-    """One request, and ``read``, which makes the answer's body into a value."""
+    """One request, and ``read``, which makes the answer's body into a value.
+
+    Every request of the contract can be sent twice with the effect of once: what makes a job carries a key, and what
+    stores a file stores the same bytes once.
+    """
 
     method: str
     path: str
     read: Callable[[bytes], T]
-    params: Mapping[str, str] = field(default_factory=dict)
+    params: tuple[tuple[str, str], ...] = ()
     headers: Mapping[str, str] = field(default_factory=dict)
     json: str | None = None
     upload: Upload | None = None
     job_id: str | None = None
+
+
+@dataclass(frozen=True)
+class JobFilter:
+    """Which jobs to list: all those that are as it says."""
+
+    state: JobState | None = None
+    labels: Mapping[str, str] = field(default_factory=dict)
+    object: str | None = None
+    classifier: str | None = None
+
+    def params(self) -> list[tuple[str, str]]:
+        """As the parameters of a request."""
+        words = {"state": self.state, "object": self.object, "classifier": self.classifier}
+        given = [(name, str(word)) for name, word in words.items() if word is not None]
+        return given + [("label", f"{name}:{value}") for name, value in self.labels.items()]
 
 
 def upload_object(upload: Upload) -> Request[ObjectInfo]:
@@ -62,13 +102,32 @@ def classifiers() -> Request[list[ClassifierInfo]]:
     return Request("GET", "/v1/classifiers", _reader(list[ClassifierInfo]))
 
 
-def submit(spec: JobSpec) -> Request[Job]:
-    return Request("POST", "/v1/jobs", _reader(Job), json=spec.model_dump_json())
+def backgrounds() -> Request[list[BackgroundInfo]]:
+    return Request("GET", "/v1/backgrounds", _reader(list[BackgroundInfo]))
 
 
-def jobs(*, state: JobState | None = None, cursor: str | None = None) -> Request[JobList]:
-    params = {"state": state and state.value, "cursor": cursor}
-    return Request("GET", "/v1/jobs", _reader(JobList), params={k: v for k, v in params.items() if v})
+def workers() -> Request[list[WorkerInfo]]:
+    return Request("GET", "/v1/workers", _reader(list[WorkerInfo]))
+
+
+def renderers() -> Request[list[RendererInfo]]:
+    return Request("GET", "/v1/renderers", _reader(list[RendererInfo]))
+
+
+def new_key() -> str:
+    """A key that no other job has: with it, a submission can be repeated and makes one job."""
+    return secrets.token_hex(16)
+
+
+def submit(spec: JobSpec, *, key: str) -> Request[Job]:
+    """A job, made once for ``key``; all that a ``JobSpec`` leaves open has ``JobRequest``'s defaults."""
+    body = JobRequest.model_validate(spec.model_dump()).model_dump_json()
+    return Request("POST", "/v1/jobs", _reader(Job), headers={"Idempotency-Key": key}, json=body)
+
+
+def jobs(wanted: JobFilter, *, limit: int, cursor: str | None = None) -> Request[JobList]:
+    params = [*wanted.params(), ("limit", str(limit)), *([("cursor", cursor)] if cursor else [])]
+    return Request("GET", "/v1/jobs", _reader(JobList), params=tuple(params))
 
 
 def job(job_id: str) -> Request[Job]:
@@ -77,6 +136,15 @@ def job(job_id: str) -> Request[Job]:
 
 def cancel(job_id: str) -> Request[Job]:
     return Request("POST", f"{_job_path(job_id)}/cancel", _reader(Job), job_id=job_id)
+
+
+def retry(job_id: str, *, key: str) -> Request[Job]:
+    headers = {"Idempotency-Key": key}
+    return Request("POST", f"{_job_path(job_id)}/retry", _reader(Job), headers=headers, job_id=job_id)
+
+
+def delete(job_id: str) -> Request[None]:
+    return Request("DELETE", _job_path(job_id), lambda _body: None, job_id=job_id)
 
 
 def events(job_id: str, *, after: int | None) -> Request[bytes]:
@@ -91,7 +159,17 @@ def result(job_id: str) -> Request[Result]:
 
 
 def artifact(job_id: str, name: str) -> Request[bytes]:
-    return Request("GET", f"{_job_path(job_id)}/artifacts/{quote(name)}", bytes, job_id=job_id)
+    return _file(job_id, f"artifacts/{quote(name)}")
+
+
+def archive(job_id: str) -> Request[bytes]:
+    return _file(job_id, "archive")
+
+
+def _file(job_id: str, path: str) -> Request[bytes]:
+    """A file as it is: compressed on its way, neither its ranges nor its checksum would be those of its bytes."""
+    identity = {"Accept-Encoding": "identity"}
+    return Request("GET", f"{_job_path(job_id)}/{path}", bytes, headers=identity, job_id=job_id)
 
 
 class EventParser:
@@ -111,7 +189,7 @@ class EventParser:
         return event
 
 
-def error_from(status: int, body: bytes, *, request_id: str | None, job_id: str | None) -> APIError:
+def error_from(status: int, headers: Mapping[str, str], body: bytes, *, job_id: str | None) -> APIError:
     """The error that a refusing answer stands for; a body that is no problem document is quoted."""
     try:
         problem = Problem.model_validate_json(body)
@@ -120,21 +198,44 @@ def error_from(status: int, body: bytes, *, request_id: str | None, job_id: str 
         problem = Problem(
             title=f"HTTP {status}, not from Trompe's API", status=status, detail=f"The answer was {said!r}"
         )
-    kinds: dict[int, type[APIError]] = {404: NotFound, 409: Conflict}
-    kind = kinds.get(status, ServerFault if status >= 500 else BadRequest)
-    return kind(problem, request_id=request_id, job_id=job_id)
+    kind = _KINDS.get(status, ServerFault if status >= 500 else BadRequest)
+    pause = _retry_after(headers.get("Retry-After"))
+    return kind(problem, request_id=headers.get("X-Request-ID"), job_id=job_id, retry_after=pause)
+
+
+_KINDS: Final[dict[int, type[APIError]]] = {
+    401: Unauthorized,
+    403: Forbidden,
+    404: NotFound,
+    409: Conflict,
+    429: TooMany,
+}
+
+
+def _retry_after(header: str | None) -> float | None:
+    """Seconds to wait, from either form that the header can have."""
+    if header is None or header.isdecimal():
+        return None if header is None else float(header)
+    from email.utils import parsedate_to_datetime  # rarely needed, and it brings much with it
+
+    try:
+        return max(0.0, (parsedate_to_datetime(header) - datetime.now(UTC)).total_seconds())
+    except (ValueError, TypeError):
+        return None
 
 
 def _job_path(job_id: str) -> str:
     return f"/v1/jobs/{quote(job_id, safe='')}"
 
 
+@cache
 def _reader(schema: Any) -> Callable[[bytes], Any]:
     """A function from a JSON body to ``schema``. The function raises ``ContractError``."""
+    adapter: TypeAdapter[Any] = TypeAdapter(schema)
 
     def read(body: bytes) -> Any:
         try:
-            return TypeAdapter(schema).validate_json(body)
+            return adapter.validate_json(body)
         except ValidationError as error:
             raise ContractError(
                 f"The server's answer is not what this client expects ({error.errors()[0]['msg']}). "

@@ -4,11 +4,13 @@
     └── ClientError                  has the ids it knows: request_id, job_id
         ├── ServerUnreachable        nothing answers at the server's address, or the connection broke
         ├── EmbeddedServerError      the service that a command starts for itself did not come up, or died
+        ├── BrokenDownload           the bytes that came are not those that the server promised
         ├── ContractError            an answer that this client cannot read: another version, or no Trompe server
         ├── APIError                 the server said no: has status, problem
         │   ├── BadRequest           400, 413, 415, 422: what was sent is wrong
         │   ├── NotFound             404: no such job, object, classifier or file
         │   ├── Conflict             409: not possible in the present state
+    │   ├── TooMany              429: too many requests; has retry_after
         │   └── ServerFault          5xx: the server's own fault
         └── JobError                 has job, as last seen
             ├── JobFailed            the job ended in an error
@@ -24,16 +26,20 @@ from trompe_shared.errors import TrompeError
 __all__ = [
     "APIError",
     "BadRequest",
+    "BrokenDownload",
     "ClientError",
     "Conflict",
     "ContractError",
     "EmbeddedServerError",
+    "Forbidden",
     "JobCancelled",
     "JobError",
     "JobFailed",
     "NotFound",
     "ServerFault",
     "ServerUnreachable",
+    "TooMany",
+    "Unauthorized",
     "WaitTimeout",
 ]
 
@@ -61,6 +67,12 @@ class EmbeddedServerError(ClientError):
     code = "embedded-server"
 
 
+class BrokenDownload(ClientError):  # noqa: N818
+    """The bytes that came are not those that the server promised."""
+
+    code = "broken-download"
+
+
 class ContractError(ClientError):
     """An answer that this client cannot read."""
 
@@ -68,20 +80,43 @@ class ContractError(ClientError):
 
 
 class APIError(ClientError):
-    """The server refused a request. ``problem`` is its answer (RFC 9457), ``status`` the HTTP status."""
+    """The server refused a request. ``problem`` is its answer (RFC 9457), ``status`` the HTTP status.
+
+    ``retry_after`` is how many seconds the server asks to be left in peace, where it says so.
+    """
 
     code = "api"
 
-    def __init__(self, problem: Problem, *, request_id: str | None = None, job_id: str | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        request_id: str | None = None,
+        job_id: str | None = None,
+        retry_after: float | None = None,
+    ) -> None:
         super().__init__(_explain(problem), request_id=request_id or problem.request_id, job_id=job_id)
         self.problem = problem
         self.status = problem.status
+        self.retry_after = retry_after
 
 
 class BadRequest(APIError):  # noqa: N818
     """What was sent is wrong; the message says what."""
 
     code = "bad-request"
+
+
+class Unauthorized(APIError):  # noqa: N818
+    """A token is needed, or this one is unknown or revoked. Give one by ``token=`` or TROMPE_TOKEN."""
+
+    code = "unauthorized"
+
+
+class Forbidden(APIError):  # noqa: N818
+    """The token has not the right to do this."""
+
+    code = "forbidden"
 
 
 class NotFound(APIError):  # noqa: N818
@@ -94,6 +129,12 @@ class Conflict(APIError):  # noqa: N818
     """Not possible in the present state."""
 
     code = "conflict"
+
+
+class TooMany(APIError):  # noqa: N818
+    """Too many requests, and still so after some retries."""
+
+    code = "too-many"
 
 
 class ServerFault(APIError):  # noqa: N818
@@ -131,9 +172,7 @@ class WaitTimeout(JobError):  # noqa: N818
 
 
 def _explain(problem: Problem) -> str:
-    """One paragraph: title, detail, and the fields that are wrong."""
-    parts = [problem.title.rstrip("."), *([problem.detail.rstrip(".")] if problem.detail else [])]
-    for error in problem.errors or []:
-        place = ".".join(str(step) for step in error.get("loc", []) if step != "body")
-        parts.append(f"{place}: {error.get('msg', error)}" if place else str(error.get("msg", error)))
-    return ". ".join(parts) + "."
+    """One paragraph: title and detail, or what is wrong field by field where there is no detail."""
+    fields = [f"{error.get('field')}: {error.get('message')}" for error in problem.errors or []]
+    parts = [problem.title, *([problem.detail] if problem.detail else fields)]
+    return ". ".join(part.rstrip(".") for part in parts) + "."

@@ -1,156 +1,141 @@
-"""A handle on one job: follow it, wait for it, fetch what it made."""
+"""Handles on one job: follow it, wait for it, fetch what it made."""
 
-import os
-import time
-from collections.abc import Callable, Generator, Iterator
-from contextlib import AbstractContextManager, closing, nullcontext, suppress
-from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Final, Self
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
 
 from trompe_client import _core
-from trompe_client._errors import ContractError, JobCancelled, JobFailed, ServerUnreachable, WaitTimeout
-from trompe_shared.api import Event, Job, JobState, Result
+from trompe_client._following import Followed, follow, wait
+from trompe_client._operations import send
+from trompe_client._port import finish, iterate
+from trompe_client._progress import Progress, shown
+from trompe_client._transfer import fetch, fetch_all
+from trompe_shared.api import Event, Job, Result
 
 if TYPE_CHECKING:
+    from trompe_client._async_client import AsyncClient
     from trompe_client._client import Client
 
-__all__ = ["JobHandle"]
-
-PATIENCE: Final = 60.0
-"""How long a server may be gone (restarting) while a job is followed, seconds."""
-SILENCE: Final = 30.0
-"""How long an event stream may say nothing before it is opened anew, seconds."""
-PAUSE: Final = 0.5
-"""Time between two attempts, seconds."""
+__all__ = ["AsyncJobHandle", "JobHandle"]
 
 
-class JobHandle:
+class JobHandle(Followed):
     """A job on a server. ``status`` is the job as last seen; ``refresh`` asks again."""
 
     def __init__(self, client: "Client", status: Job) -> None:
+        super().__init__(status)
         self._client = client
-        self.status = status
-
-    def __repr__(self) -> str:
-        return f"<JobHandle {self.id} {self.state.value}>"
+        self._port = client.port
 
     @property
-    def id(self) -> str:
-        """The job's id; ``client.job(id)`` gives the handle again."""
-        return self.status.id
-
-    @property
-    def state(self) -> JobState:
-        """The job's state as last seen."""
-        return self.status.state
+    def server(self) -> str:
+        """The server's address."""
+        return self._client.server
 
     def refresh(self) -> Job:
         """Ask the server for the job's status."""
-        self.status = self._client.send(_core.job(self.id))
+        self.status = finish(send(self._port, _core.job(self.id)))
         return self.status
 
-    def wait(self, timeout: float | None = None, *, progress: bool = False) -> Self:
+    def wait(self, timeout: float | None = None, *, progress: Progress = False) -> Self:
         """Wait until the job is done and return this handle, so that ``job.wait().result()`` reads well.
 
         Args:
             timeout: seconds; None waits for ever.
-            progress: show a progress bar on standard error.
+            progress: show a bar, on the terminal or in the notebook; or a function of yours, to hand each event to.
 
         Raises ``JobFailed``, ``JobCancelled``, or ``WaitTimeout`` when the time is up (the job goes on); a job that
         ends as n.a. raises nothing. Raises ``ServerUnreachable`` when the server stays away for a minute.
         """
-        if progress:
-            from trompe_client._progress import progress_display  # rich is loaded only for those who look
-
-            display: AbstractContextManager[Callable[[Event], None]] = progress_display()
-        else:
-            display = nullcontext(lambda _event: None)
-        deadline = None if timeout is None else time.monotonic() + timeout
-        with display as show, closing(self._follow(deadline)) as events:
-            for event in events:
-                show(event)
-        while not self._refresh_patiently(deadline).state.final:
-            time.sleep(PAUSE)
-        self._raise_unless_done()
+        with shown(progress) as show:
+            finish(wait(self._port, self, timeout=timeout, show=show))
         return self
 
     def events(self) -> Iterator[Event]:
         """All events of the job from its first to its last, each as it happens; survives dropped connections."""
-        return self._follow(None)
+        return iterate(follow(self._port, self))
 
     def result(self) -> Result:
         """The figures of a finished job. Raises ``APIError`` when there are none (yet)."""
-        return self._client.send(_core.result(self.id))
+        return finish(send(self._port, _core.result(self.id)))
 
     def download(self, folder: str | Path) -> list[Path]:
         """Fetch all artifacts into ``folder``, which is made if need be; gives their paths.
 
-        A file appears under its name when it is whole, and replaces one of that name.
+        A file appears under its name when it is whole and its checksum is right, and replaces one of that name. What an
+        earlier download brought is not fetched again, and one that was cut off goes on where it was.
         """
-        return [self._fetch(name, Path(folder)) for name in self.refresh().artifacts]
+        self.status, paths = finish(fetch_all(self._port, self.id, Path(folder)))
+        return paths
+
+    def archive(self, path: str | Path) -> Path:
+        """Fetch all artifacts as one zip file."""
+        return finish(fetch(self._port, _core.archive(self.id), Path(path)))
 
     def cancel(self) -> Job:
         """Ask the server to stop the job; it does so at the end of the current chunk of work."""
-        self.status = self._client.send(_core.cancel(self.id))
+        self.status = finish(send(self._port, _core.cancel(self.id)))
         return self.status
 
-    def _fetch(self, name: str, folder: Path) -> Path:
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise ContractError(
-                f"The server offers a file named {name!r}, which would lie outside {folder}; not fetched."
-            )
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.part")
-        partial.write_bytes(self._client.send(_core.artifact(self.id, name)))
-        os.replace(partial, path)
-        return path
+    def retry(self) -> "JobHandle":
+        """Submit the same job anew; gives the new one. Raises ``Conflict`` for a job that has not ended."""
+        return JobHandle(self._client, finish(send(self._port, _core.retry(self.id, key=_core.new_key()))))
 
-    def _follow(self, deadline: float | None) -> Generator[Event, None, None]:
-        """Events until the final one, over as many connections as it takes; each resumes after the last event seen."""
-        last: int | None = None
-        over = False
-        while True:
-            with suppress(ServerUnreachable), closing(self._stream(last, deadline)) as events:
-                for event in events:
-                    last = event.id
-                    yield event
-                    if event.state.final:
-                        return
-            if over:
-                return
-            over = self._refresh_patiently(deadline).state.final
-            time.sleep(0 if over else PAUSE)
+    def delete(self) -> None:
+        """Delete the job and its files. Raises ``Conflict`` for a job that has not ended."""
+        finish(send(self._port, _core.delete(self.id)))
 
-    def _stream(self, after: int | None, deadline: float | None) -> Generator[Event, None, None]:
-        """Events of one connection."""
-        silence = SILENCE if deadline is None else min(SILENCE, max(deadline - time.monotonic(), PAUSE))
-        parser = _core.EventParser()
-        with closing(self._client.stream(_core.events(self.id, after=after), timeout=silence)) as lines:
-            for line in lines:
-                self._check_time(deadline)
-                event = parser.feed(line)
-                if event is not None:
-                    yield event
 
-    def _refresh_patiently(self, deadline: float | None) -> Job:
-        """``refresh``, for a server that may be just restarting."""
-        give_up = time.monotonic() + PATIENCE
-        while True:
-            self._check_time(deadline)
-            try:
-                return self.refresh()
-            except ServerUnreachable:
-                if time.monotonic() > give_up:
-                    raise
-            time.sleep(PAUSE)
+class AsyncJobHandle(Followed):
+    """``JobHandle`` for asyncio: the same methods, to be awaited; ``events`` is iterated by ``async for``."""
 
-    def _check_time(self, deadline: float | None) -> None:
-        if deadline is not None and time.monotonic() > deadline:
-            raise WaitTimeout(f"Job {self.id} is still {self.state.value}; it goes on.", job=self.status)
+    def __init__(self, client: "AsyncClient", status: Job) -> None:
+        super().__init__(status)
+        self._client = client
+        self._port = client.port
 
-    def _raise_unless_done(self) -> None:
-        if self.state is JobState.failed:
-            raise JobFailed(f"Job {self.id} failed: {self.status.error or 'no reason given'}", job=self.status)
-        if self.state is JobState.cancelled:
-            raise JobCancelled(f"Job {self.id} was cancelled.", job=self.status)
+    @property
+    def server(self) -> str:
+        """As ``JobHandle.server``."""
+        return self._client.server
+
+    async def refresh(self) -> Job:
+        """As ``JobHandle.refresh``."""
+        self.status = await send(self._port, _core.job(self.id))
+        return self.status
+
+    async def wait(self, timeout: float | None = None, *, progress: Progress = False) -> Self:
+        """As ``JobHandle.wait``."""
+        with shown(progress) as show:
+            await wait(self._port, self, timeout=timeout, show=show)
+        return self
+
+    def events(self) -> AsyncIterator[Event]:
+        """As ``JobHandle.events``."""
+        return follow(self._port, self)
+
+    async def result(self) -> Result:
+        """As ``JobHandle.result``."""
+        return await send(self._port, _core.result(self.id))
+
+    async def download(self, folder: str | Path) -> list[Path]:
+        """As ``JobHandle.download``."""
+        self.status, paths = await fetch_all(self._port, self.id, Path(folder))
+        return paths
+
+    async def archive(self, path: str | Path) -> Path:
+        """As ``JobHandle.archive``."""
+        return await fetch(self._port, _core.archive(self.id), Path(path))
+
+    async def cancel(self) -> Job:
+        """As ``JobHandle.cancel``."""
+        self.status = await send(self._port, _core.cancel(self.id))
+        return self.status
+
+    async def retry(self) -> "AsyncJobHandle":
+        """As ``JobHandle.retry``."""
+        return AsyncJobHandle(self._client, await send(self._port, _core.retry(self.id, key=_core.new_key())))
+
+    async def delete(self) -> None:
+        """As ``JobHandle.delete``."""
+        await send(self._port, _core.delete(self.id))

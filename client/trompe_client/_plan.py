@@ -4,25 +4,28 @@ import io
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, TypedDict, Unpack
 
 from pydantic import ValidationError
 
-from trompe_shared.api import JobSpec, Loss, Optimiser, SurrogateModel, ViewRanges
+from trompe_shared.api import JobRequest, Loss, Needs, Optimiser, Priority, SurrogateModel, ViewRanges
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
 
 __all__ = [
     "AttackOptions",
     "AttackPlan",
+    "JobOptions",
     "Sources",
     "Upload",
     "background_source",
     "background_upload",
     "classifier_source",
     "classifier_upload",
+    "each_source",
     "mask_upload",
+    "named_object_upload",
     "object_source",
     "object_upload",
     "plan_attack",
@@ -46,8 +49,8 @@ class Upload:
     form: Mapping[str, str] = field(default_factory=dict)
 
 
-class AttackOptions(TypedDict, total=False):
-    """Options of an attack; those left out take ``JobSpec``'s defaults, where they are explained."""
+class JobOptions(TypedDict, total=False):
+    """Options of a job; those left out take ``JobRequest``'s defaults, where they are explained."""
 
     epsilon: float
     alpha: float
@@ -71,6 +74,28 @@ class AttackOptions(TypedDict, total=False):
     pool: int
     ranges: ViewRanges | Mapping[str, Any]
     held_out: int
+    priority: Priority
+    labels: Mapping[str, str]
+    needs: Needs
+
+
+class AttackOptions(JobOptions, total=False):
+    """Options of an attack: those of a job, and what may be a file on this side.
+
+    - ``classifier``: path of a .pt2, TorchScript (.pt, .torchscript) or .onnx file; or the name or id of a stored
+      classifier, by default ``tiny``. Class names are read from ``<stem>.classes.json``, ``imagenet_classes.json`` or
+      ``classes.json`` beside the file.
+    - ``ensemble``: classifiers that are attacked together with it, given alike.
+    - ``judges``: classifiers that only judge the result, given alike.
+    - ``background``: "white", "black", "#rrggbb", or the path of a picture; each view draws one of several.
+    - ``masks``: by the file name of a texture, the path of a picture of its size that is white where it may change.
+    """
+
+    classifier: str | Path
+    ensemble: Sources
+    judges: Sources
+    background: Sources
+    masks: Mapping[str, str | Path]
 
 
 @dataclass(frozen=True)
@@ -87,7 +112,7 @@ class AttackPlan:
     judges: tuple[Upload | str, ...]
     backgrounds: tuple[Upload | str, ...]
     masks: Mapping[str, Upload]
-    options: AttackOptions
+    options: JobOptions
 
     def spec(
         self,
@@ -98,12 +123,12 @@ class AttackPlan:
         judges: list[str],
         background: list[str],
         masks: dict[str, str],
-    ) -> JobSpec:
+    ) -> JobRequest:
         """The job, with the ids that the uploads were given. Raises ``SpecError``."""
         attacked = {"object": object, "label": self.label, "classifier": classifier, "ensemble": ensemble}
         others = {"judges": judges, "background": background, "masks": masks}
         try:
-            return JobSpec.model_validate(attacked | others | dict(self.options))
+            return JobRequest.model_validate(attacked | others | dict(self.options))
         except ValidationError as error:
             wrong = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" if e["loc"] else e["msg"] for e in error.errors()]
             raise SpecError("The attack's options are not right. " + "; ".join(wrong) + ".") from error
@@ -113,29 +138,29 @@ def plan_attack(
     object: str | Path,
     *,
     label: str | int,
-    classifier: str | Path,
-    ensemble: Sources,
-    judges: Sources,
-    background: Sources,
-    masks: Mapping[str, str | Path],
-    **options: Unpack[AttackOptions],
+    classifier: str | Path = "tiny",
+    ensemble: Sources = (),
+    judges: Sources = (),
+    background: Sources = "white",
+    masks: Mapping[str, str | Path] | None = None,
+    **options: Unpack[JobOptions],
 ) -> AttackPlan:
     """Read the files and check the options. Raises ``ObjectError``, ``ClassifierError`` or ``SpecError``."""
     plan = AttackPlan(
         object_source(object),
         label,
         classifier_source(classifier),
-        tuple(classifier_source(each) for each in _each(ensemble)),
-        tuple(classifier_source(each) for each in _each(judges)),
-        tuple(background_source(each) for each in _each(background)),
-        {texture: mask_upload(Path(picture)) for texture, picture in masks.items()},
+        tuple(classifier_source(each) for each in each_source(ensemble)),
+        tuple(classifier_source(each) for each in each_source(judges)),
+        tuple(background_source(each) for each in each_source(background)),
+        {texture: mask_upload(Path(picture)) for texture, picture in (masks or {}).items()},
         options,
     )
     plan.spec(object="", classifier="", ensemble=[], judges=[], background=[""] * len(plan.backgrounds), masks={})
     return plan
 
 
-def _each(sources: Sources) -> Sequence[str | Path]:
+def each_source(sources: Sources) -> Sequence[str | Path]:
     """One source is a list of one, never its letters."""
     return [sources] if isinstance(sources, str | Path) else sources
 
@@ -163,6 +188,11 @@ def object_upload(path: Path) -> Upload:
     if not zipfile.is_zipfile(path):
         raise ObjectError(f"{str(path)!r} is not a zip archive. Give a zip, or the folder or .obj file itself.")
     return Upload(path.name, path.read_bytes())
+
+
+def named_object_upload(path: Path, name: str | None) -> Upload:
+    """An object to be stored under a name; None leaves it that of the file."""
+    return replace(object_upload(path), form={"name": name} if name else {})
 
 
 def classifier_source(source: str | Path) -> Upload | str:

@@ -1,15 +1,33 @@
 """A result as a table for people."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from trompe_client._job import JobHandle
-from trompe_shared.api import Accuracy, ClassifierInfo, JobSpec, ObjectInfo, Result
+from trompe_shared.api import (
+    Accuracy,
+    BackgroundInfo,
+    ClassifierInfo,
+    Job,
+    JobSpec,
+    ObjectInfo,
+    RendererInfo,
+    Result,
+    WorkerInfo,
+)
 
-__all__ = ["classifiers_table", "jobs_table", "objects_table", "result_report"]
+__all__ = [
+    "backgrounds_table",
+    "classifiers_table",
+    "job_table",
+    "jobs_table",
+    "objects_table",
+    "renderers_table",
+    "result_report",
+    "workers_table",
+]
 
 
 def result_report(result: Result, *, note: str | None = None) -> RenderableType:
@@ -27,15 +45,67 @@ def result_report(result: Result, *, note: str | None = None) -> RenderableType:
     return Group(Text(_headline(result), style="bold"), table, Text("[..] intervals at 95 %"), facts, *notes, *warnings)
 
 
-def jobs_table(jobs: Sequence[JobHandle]) -> Table:
-    """One line per job."""
-    table = _table("job", "state", "object", "label", "classifier", "epsilon", "done", "created")
+def jobs_table(jobs: Sequence[Job]) -> Table:
+    """One line per job; those with labels say them."""
+    labels = ["labels"] if any(job.labels for job in jobs) else []
+    table = _table("job", "state", "object", "label", "classifier", "epsilon", "done", "created", *labels)
     for job in jobs:
-        spec, progress = job.status.spec, job.status.progress
+        spec = job.spec
         what = [_short(spec.object), str(spec.label), _short(spec.classifier), f"{spec.epsilon:g}"]
-        table.add_row(
-            job.id, job.state.value, *what, f"{progress.fraction:.0%}", f"{job.status.created:%Y-%m-%d %H:%M}"
-        )
+        how = [f"{job.progress.fraction:.0%}", f"{job.created:%Y-%m-%d %H:%M}"]
+        table.add_row(job.id, job.state.value, *what, *how, *([_words(job.labels)] if labels else []))
+    return table
+
+
+def job_table(job: Job) -> Table:
+    """All that is known of one job; of what was asked for, what is not the default."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in _job_facts(job):
+        if value:
+            table.add_row(name, value)
+    return table
+
+
+def _job_facts(job: Job) -> Iterator[tuple[str, str]]:
+    yield "job", job.id
+    yield "state", f"{job.state.value}, {job.progress.phase}, {job.progress.fraction:.0%}"
+    yield "error", job.error or ""
+    yield "note", job.note or ""
+    for name, value in job.spec.model_dump(exclude_defaults=True).items():
+        yield name, str(value)
+    yield "labels", _words(job.labels)
+    yield "priority", f"{job.priority}, needs {job.needs}"
+    yield "attempts", f"{job.attempts}, worker {job.worker or 'none yet'}"
+    for name in ("created", "started", "finished"):
+        time = getattr(job, name)
+        yield name, f"{time:%Y-%m-%d %H:%M:%S %Z}" if time else ""
+    yield "files", ", ".join(job.artifacts)
+
+
+def workers_table(workers: Sequence[WorkerInfo]) -> Table:
+    """One line per attack worker."""
+    table = _table("worker", "host", "device", "alive", "job", "started", "seen")
+    for one in workers:
+        times = [f"{time:%Y-%m-%d %H:%M:%S}" for time in (one.started, one.seen)]
+        table.add_row(one.id, one.host, one.device, _yes(one.alive), one.job or "", *times)
+    return table
+
+
+def renderers_table(renderers: Sequence[RendererInfo]) -> Table:
+    """One line per renderer worker."""
+    table = _table("renderer", "alive")
+    for one in renderers:
+        table.add_row(one.address, _yes(one.alive))
+    return table
+
+
+def backgrounds_table(backgrounds: Sequence[BackgroundInfo]) -> Table:
+    """One line per uploaded picture."""
+    table = _table("name", "id")
+    for one in backgrounds:
+        table.add_row(one.name, one.id)
     return table
 
 
@@ -149,3 +219,11 @@ def _short(reference: str) -> str:
 
 def _origin(shipped: bool) -> str:
     return "shipped" if shipped else "uploaded"
+
+
+def _yes(true: bool) -> str:
+    return "yes" if true else "no"
+
+
+def _words(labels: Mapping[str, str]) -> str:
+    return " ".join(f"{name}={value}" for name, value in labels.items())

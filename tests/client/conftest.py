@@ -1,12 +1,14 @@
 """A Trompe server without the attack: real HTTP on a real socket, jobs that play a script."""
 
+import asyncio
 import hashlib
 import io
 import json
 import re
 import threading
+import time
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
 from email import message_from_bytes
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -16,26 +18,34 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 import pytest
 from pydantic import ValidationError
+from pydantic_core import to_json
 
-from trompe_client import Client, _job
+from trompe_client import Client, _following
+from trompe_client._http import AsyncPort, BlockingPort
 from trompe_shared.api import (
     Accuracy,
+    BackgroundInfo,
     ClassifierInfo,
     Event,
     Job,
     JobList,
+    JobRequest,
     JobSpec,
     JobState,
     Judgement,
     ObjectInfo,
     Progress,
+    RendererInfo,
     Result,
+    WorkerInfo,
 )
 
 NOW = datetime(2025, 1, 2, 3, 4, tzinfo=UTC)
 MUG = ObjectInfo(
     id="m" * 8, name="mug", materials=["m"], textures={"a.png": (4, 8)}, triangles=12, radius=0.1, shipped=True
 )
+WORKER = WorkerInfo(id="w1", host="here", device="cpu", alive=True, started=NOW, seen=NOW, job="job-1")
+RENDERER = RendererInfo(address="127.0.0.1:8085", alive=True)
 TINY = ClassifierInfo(id="t" * 8, name="tiny", white_box=True, image_size=(32, 32), n_classes=10, shipped=True)
 
 
@@ -100,11 +110,27 @@ def adversarial_zip() -> bytes:
 
 
 class FakeServer:
-    """State and script of the fake. ``ending`` is how jobs end; ``drops`` how often an event stream breaks off."""
+    """State and script of the fake.
+
+    ``ending`` is how jobs end; ``drops`` how often an event stream breaks off; ``cut`` after how many bytes the next
+    files break off; ``refusals`` are the answers (status, headers) to the next requests, whatever they ask for;
+    ``lies`` how many files come with wrong bytes; ``token`` is asked for where it is set; ``when_listed`` is called
+    before jobs are listed.
+    """
 
     def __init__(self) -> None:
         self.objects = [MUG]
         self.classifiers = [TINY]
+        self.backgrounds: list[BackgroundInfo] = []
+        self.keys: dict[str, str] = {}
+        self.requests: list[tuple[str, str, dict[str, str]]] = []
+        self.cut: list[int] = []
+        self.refusals: list[tuple[int, dict[str, str]]] = []
+        self.lies = 0
+        self.token: str | None = None
+        self.artifacts = ["adversarial.zip", "report/index.html", "result.json"]
+        self.when_listed: Callable[[], None] = lambda: None
+        self.url = ""
         self.uploads: dict[str, tuple[str, bytes, dict[str, str]]] = {}
         self.jobs: dict[str, Job] = {}
         self.history: dict[str, list[Event]] = {}
@@ -115,8 +141,9 @@ class FakeServer:
         self.page_size = 2
         self.ids = count(1)
 
-    def add_job(self, spec: JobSpec) -> Job:
-        job = Job(id=f"job-{next(self.ids)}", state=JobState.queued, spec=spec, created=NOW)
+    def add_job(self, request: JobRequest) -> Job:
+        more = {"priority": request.priority, "labels": request.labels, "needs": request.needs}
+        job = Job(id=f"job-{next(self.ids)}", state=JobState.queued, spec=request.spec(), created=NOW, **more)
         self.jobs[job.id] = job
         self.history[job.id] = self.script(job)
         return job
@@ -139,12 +166,24 @@ class FakeServer:
         """The job is now where ``event`` says."""
         update: dict[str, object] = {"state": event.state, "progress": event.progress}
         if event.state in {JobState.succeeded, JobState.not_applicable}:
-            update["artifacts"] = ["adversarial.zip", "report/index.html", "result.json"]
+            update["artifacts"] = self.artifacts
         if event.state is JobState.failed:
             update["error"] = "the renderer said no"
         if event.state is JobState.not_applicable:
             update["note"] = "no view was recognised before the attack"
         self.jobs[job_id] = self.jobs[job_id].model_copy(update=update)
+
+    def cancel(self, job_id: str) -> None:
+        """The job's story ends here."""
+        first = self.history[job_id][0]
+        self.history[job_id] = [first, first.model_copy(update={"id": 2, "state": JobState.cancelled})]
+        self.reach(job_id, self.history[job_id][-1])
+
+    def finish_all(self) -> None:
+        """All jobs end."""
+        for job_id, job in self.jobs.items():
+            if not job.state.final:
+                self.reach(job_id, self.history[job_id][-1])
 
     def artifact(self, job_id: str, name: str) -> bytes:
         if name == "adversarial.zip":
@@ -165,65 +204,143 @@ class Handler(BaseHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
         """Say nothing."""
 
-    def reply(self, body: bytes, status: int = 200, kind: str = "application/json") -> None:
+    def reply(self, body: bytes, status: int = 200, kind: str = "application/json", **headers: str) -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("X-Request-ID", "req-7")
-        self.send_header("Content-Length", str(len(body)))
+        given = {name.replace("_", "-"): value for name, value in headers.items()}
+        for name, value in ({"Content-Length": str(len(body))} | given).items():
+            self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body)
 
-    def problem(self, status: int, title: str, **more: object) -> None:
-        self.reply(json.dumps({"title": title, "status": status, **more}).encode(), status, "application/problem+json")
+    def problem(self, status: int, title: str, headers: Mapping[str, str] = {}, **more: object) -> None:
+        body = json.dumps({"title": title, "status": status, **more}).encode()
+        self.reply(body, status, "application/problem+json", **headers)
+
+    def answer(self, value: object, status: int = 200) -> None:
+        self.reply(to_json(value), status)
+
+    def refused(self) -> bool:
+        """Note the request; refuse it if the script says so, or if the token is not right."""
+        self.fake.requests.append((self.command, self.path, dict(self.headers)))
+        if self.fake.refusals:
+            status, headers = self.fake.refusals.pop(0)
+            self.problem(status, "Not now", headers)
+            return True
+        if self.fake.token and self.headers.get("Authorization") != f"Bearer {self.fake.token}":
+            self.problem(401, "Who are you")
+            return True
+        return False
 
     def do_GET(self) -> None:
+        if self.refused():
+            return None
         url = urlsplit(self.path)
-        query = {key: values[0] for key, values in parse_qs(url.query).items()}
-        if url.path in {"/v1/objects", "/v1/classifiers"}:
-            stored = self.fake.objects if url.path.endswith("objects") else self.fake.classifiers
-            return self.reply(json.dumps([one.model_dump(mode="json") for one in stored]).encode())
+        lists = {
+            "/v1/objects": self.fake.objects,
+            "/v1/classifiers": self.fake.classifiers,
+            "/v1/backgrounds": self.fake.backgrounds,
+            "/v1/workers": [WORKER],
+            "/v1/renderers": [RENDERER],
+        }
+        if url.path in lists:
+            return self.answer(lists[url.path])
         if url.path == "/v1/jobs":
-            return self.reply(self.page(query).model_dump_json().encode())
-        match = re.fullmatch(r"/v1/jobs/([^/]+)(?:/(events|result|artifacts)(?:/(.+))?)?", url.path)
+            self.fake.when_listed()
+            return self.answer(self.page(parse_qs(url.query)))
+        match = re.fullmatch(r"/v1/jobs/([^/]+)(?:/(events|result|archive|artifacts)(?:/(.+))?)?", url.path)
         if match is None or match[1] not in self.fake.jobs:
             return self.problem(404, "No such job")
         job_id, what, name = match.groups()
         if what == "events":
             return self.stream(job_id)
         if what == "artifacts":
-            return self.reply(self.fake.artifact(job_id, unquote(name)), kind="application/octet-stream")
+            return self.file(self.fake.artifact(job_id, unquote(name)))
+        if what == "archive":
+            return self.reply(adversarial_zip(), kind="application/zip")
         job = self.fake.jobs[job_id]
         if what == "result" and not job.artifacts:
             return self.problem(409, "No result", detail=f"The job is {job.state.value}")
-        return self.reply((self.fake.result(job_id) if what else job).model_dump_json().encode())
+        return self.answer(self.fake.result(job_id) if what else job)
 
-    def page(self, query: dict[str, str]) -> JobList:
-        wanted = [job for job in reversed(self.fake.jobs.values()) if query.get("state") in {None, job.state.value}]
-        start = int(query.get("cursor", 0))
+    def file(self, data: bytes) -> None:
+        """A file with its checksum, or what is asked for of it; cut off, or wrong, where the script says so."""
+        etag = f'"{hashlib.sha256(data).hexdigest()}"'
+        if self.headers.get("If-None-Match") == etag:
+            return self.reply(b"", 304, ETag=etag)
+        start = 0
+        if self.headers.get("If-Range") == etag:
+            start = int(re.fullmatch(r"bytes=(\d+)-", self.headers["Range"])[1])
+            if start >= len(data):
+                return self.problem(416, "No such range")
+        body = data[start:]
+        if self.fake.lies:
+            self.fake.lies -= 1
+            body = bytes(len(body))
+        sent = body[: self.fake.cut.pop(0)] if self.fake.cut else body
+        self.close_connection = len(sent) < len(body)
+        length, status = str(len(body)), 206 if start else 200
+        return self.reply(sent, status, "application/octet-stream", Content_Length=length, ETag=etag)
+
+    def page(self, query: dict[str, list[str]]) -> JobList:
+        def wanted(job: Job) -> bool:
+            labels = dict(label.split(":", 1) for label in query.get("label", []))
+            known = {"state": job.state.value, "object": job.spec.object, "classifier": job.spec.classifier}
+            return all(query.get(name) in (None, [value]) for name, value in known.items()) and (
+                labels.items() <= job.labels.items()
+            )
+
+        found = [job for job in reversed(self.fake.jobs.values()) if wanted(job)]
+        start = int(query.get("cursor", ["0"])[0])
         stop = start + self.fake.page_size
-        return JobList(jobs=wanted[start:stop], next_cursor=str(stop) if stop < len(wanted) else None)
+        return JobList(jobs=found[start:stop], next_cursor=str(stop) if stop < len(found) else None)
+
+    def do_DELETE(self) -> None:
+        if self.refused():
+            return None
+        job = self.fake.jobs[self.path.rsplit("/", 1)[-1]]
+        if not job.state.final:
+            return self.problem(409, "The job goes on")
+        del self.fake.jobs[job.id]
+        return self.reply(b"", 204)
 
     def do_POST(self) -> None:
         body = self.rfile.read(int(self.headers["Content-Length"]))
+        if self.refused():
+            return None
         if self.path == "/v1/jobs":
             return self.submit(body)
-        if self.path.endswith("/cancel"):
-            job_id = self.path.split("/")[-2]
-            job = self.fake.jobs[job_id]
-            self.fake.jobs[job_id] = job.model_copy(update={"state": JobState.cancelled})
-            return self.reply(self.fake.jobs[job_id].model_dump_json().encode())
-        return self.store(self.path.rsplit("/", 1)[-1], *self.multipart(body))
+        *_, job_id, what = self.path.split("/")
+        if what == "cancel":
+            self.fake.cancel(job_id)
+            return self.answer(self.fake.jobs[job_id])
+        if what == "retry":
+            old = self.fake.jobs[job_id]
+            more = {"priority": old.priority, "labels": old.labels, "needs": old.needs}
+            return self.make(JobRequest(**old.spec.model_dump(), **more))
+        return self.store(what, *self.multipart(body))
 
     def submit(self, body: bytes) -> None:
         try:
-            spec = JobSpec.model_validate_json(body)
+            request = JobRequest.model_validate_json(body)
         except ValidationError as error:
-            return self.problem(
-                422, "Invalid", errors=[{"loc": list(e["loc"]), "msg": e["msg"]} for e in error.errors()]
-            )
-        if spec.object not in {key for one in self.fake.objects for key in (one.id, one.name)}:
-            return self.problem(404, "No such object", detail=f"{spec.object!r} is not stored")
-        return self.reply(self.fake.add_job(spec).model_dump_json().encode(), 201)
+            wrong = [{"field": ".".join(map(str, e["loc"])), "message": e["msg"]} for e in error.errors()]
+            return self.problem(422, "Invalid", errors=wrong)
+        if request.object not in {key for one in self.fake.objects for key in (one.id, one.name)}:
+            return self.problem(404, "No such object", detail=f"{request.object!r} is not stored")
+        return self.make(request)
+
+    def make(self, request: JobRequest) -> None:
+        """A new job, or the one of the same key."""
+        key = self.headers["Idempotency-Key"]
+        new = key not in self.fake.keys
+        if new:
+            self.fake.keys[key] = self.fake.add_job(request).id
+        job = self.fake.jobs[self.fake.keys[key]]
+        if job.spec != request.spec():
+            return self.problem(409, "Another job has this key")
+        return self.answer(job, 201 if new else 200)
 
     def multipart(self, body: bytes) -> tuple[str, bytes, dict[str, str]]:
         head = f"Content-Type: {self.headers['Content-Type']}\r\n\r\n".encode()
@@ -239,12 +356,13 @@ class Handler(BaseHTTPRequestHandler):
         named = {"id": stored_id, "name": form.get("name", Path(filename).stem), "shipped": False}
         if kind == "objects":
             self.fake.objects.append(MUG.model_copy(update=named))
-            return self.reply(self.fake.objects[-1].model_dump_json().encode())
+            return self.answer(self.fake.objects[-1], 201)
         if kind == "classifiers":
             classes = json.loads(form["classes"]) if "classes" in form else None
             self.fake.classifiers.append(TINY.model_copy(update=named | {"classes": classes}))
-            return self.reply(self.fake.classifiers[-1].model_dump_json().encode())
-        return self.reply(json.dumps({"id": stored_id, "name": filename}).encode())
+            return self.answer(self.fake.classifiers[-1], 201)
+        self.fake.backgrounds.append(BackgroundInfo(id=stored_id, name=filename))
+        return self.answer(self.fake.backgrounds[-1], 201)
 
     def stream(self, job_id: str) -> None:
         last = self.headers.get("Last-Event-ID")
@@ -290,12 +408,24 @@ def client(server: FakeServer) -> Iterator[Client]:
 
 
 @pytest.fixture(autouse=True)
-def _hurry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No test waits for politeness; none sees the caller's server."""
-    monkeypatch.setattr(_job, "PAUSE", 0.01)
-    monkeypatch.setattr(_job, "PATIENCE", 0.2)
-    monkeypatch.delenv("TROMPE_SERVER", raising=False)
-    monkeypatch.delenv("TROMPE_DATA", raising=False)
+def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """How long the clients would have slept: no test waits for politeness, and none sees the caller's server."""
+    pauses: list[float] = []
+
+    async def block(_port: BlockingPort, seconds: float) -> None:
+        pauses.append(seconds)
+        time.sleep(min(seconds, 0.01))
+
+    async def suspend(_port: AsyncPort, seconds: float) -> None:
+        pauses.append(seconds)
+        await asyncio.sleep(min(seconds, 0.01))
+
+    monkeypatch.setattr(BlockingPort, "sleep", block)
+    monkeypatch.setattr(AsyncPort, "sleep", suspend)
+    monkeypatch.setattr(_following, "PATIENCE", 2.0)
+    for name in ("TROMPE_SERVER", "TROMPE_TOKEN", "TROMPE_DATA"):
+        monkeypatch.delenv(name, raising=False)
+    return pauses
 
 
 @pytest.fixture

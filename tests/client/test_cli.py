@@ -4,6 +4,10 @@ import hashlib
 import io
 import json
 import re
+import signal
+import subprocess
+import sys
+import time
 from contextlib import contextmanager
 from importlib import metadata
 
@@ -12,10 +16,12 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from trompe_client import JobHandle, cli
+from trompe_client import JobHandle
 from trompe_client._plan import object_source
 from trompe_client._report import result_report
-from trompe_shared.api import JobSpec, JobState, ViewRanges
+from trompe_client.cli import connection, main
+from trompe_client.cli.attack import attack
+from trompe_shared.api import JobRequest, JobSpec, JobState, ViewRanges
 
 SPEC = JobSpec(object="mug", label="mug")
 
@@ -26,7 +32,7 @@ def stored_id(data: bytes) -> str:
 
 
 def trompe(*words: object):
-    return CliRunner().invoke(cli.main, [str(word) for word in words])
+    return CliRunner().invoke(main, [str(word) for word in words])
 
 
 def test_attack_prints_the_table_and_names_the_files_it_wrote(server, tmp_path):
@@ -127,8 +133,8 @@ def test_short_words_for_common_wishes(server, tmp_path, words, wanted):
 
 
 def test_the_command_line_knows_every_option_of_a_job_and_says_its_default():
-    names = {parameter.name for parameter in cli.attack.params}
-    assert names - {"grid", "server", "out"} == JobSpec.model_fields.keys()
+    names = {parameter.name for parameter in attack.params}
+    assert names - {"grid", "server", "token", "key", "detach", "out", "json"} == JobRequest.model_fields.keys()
     text = " ".join(trompe("attack", "--help").stdout.split())
     for option in ("epsilon", "top_k", "loss", "optimiser", "restarts", "surrogate", "steps", "seed", "pool"):
         words = f"--{option.replace('_', '-')} [^-]*Default: {JobSpec.model_fields[option].default}[. ]"
@@ -146,7 +152,7 @@ def test_help_lists_each_option_once_under_a_heading():
         "Server and results:",
     }
     listed = re.findall(r"^  (?:-h, )?(--[a-z-]+)", "\n".join(lines), re.MULTILINE)
-    declared = [parameter.opts[-1] for parameter in cli.attack.params if isinstance(parameter, click.Option)]
+    declared = [parameter.opts[-1] for parameter in attack.params if isinstance(parameter, click.Option)]
     assert listed == [*declared, "--help"]
 
 
@@ -201,10 +207,10 @@ def test_not_applicable_is_reported_with_its_reason_and_is_no_failure(server, tm
     assert re.search(r"target \(own views\).*0\.00 \[0\.00, 0\.06\] │ +n\.a\. │ +n\.a\.", done.stdout)
 
 
-def test_a_failed_job_exits_with_1_and_its_reason(server, tmp_path):
+def test_a_failed_job_exits_with_6_and_its_reason(server, tmp_path):
     server.ending = JobState.failed
     done = trompe("attack", "mug", "--label", 0, "--server", server.url, "--out", tmp_path)
-    assert done.exit_code == 1
+    assert done.exit_code == 6
     assert "trompe: Job job-1 failed: the renderer said no" in done.stderr
     assert "Traceback" not in done.output
 
@@ -233,7 +239,7 @@ def test_wrong_usage_exits_with_2_before_any_server_is_asked(words, tmp_path):
 
 def test_without_a_server_the_remedy_is_named_in_one_paragraph():
     done = trompe("jobs", "--server", "http://127.0.0.1:9")
-    assert done.exit_code == 1
+    assert done.exit_code == 3
     assert done.stderr.count("\n") == 1
     assert "trompe serve" in done.stderr
 
@@ -294,13 +300,28 @@ def test_ctrl_c_leaves_the_job_on_a_server_running_and_says_how_to_come_back(ser
     assert server.jobs["job-1"].state is JobState.queued
 
 
+def test_ctrl_c_in_a_terminal_ends_the_command_and_not_the_job(server, client):
+    server.stalls = True
+    job = client.submit(SPEC)
+    command = [sys.executable, "-m", "trompe_client.cli", "watch", job.id, "--server", server.url]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while not server.resumed_after:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, words = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert f"Job {job.id} goes on. Come back by: trompe watch {job.id} --server {server.url}" in words
+    assert "Traceback" not in words
+    assert client.job(job.id).state is JobState.queued
+
+
 @pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_cancels_the_job_on_a_server_of_our_own(server, tmp_path, monkeypatch):
     @contextmanager
     def embedded():
         yield server.url
 
-    monkeypatch.setattr(cli, "embedded_server", embedded)
+    monkeypatch.setattr(connection, "embedded_server", embedded)
     done = trompe("attack", "mug", "--label", 0, "--out", tmp_path)
     assert done.exit_code == 130
     assert server.jobs["job-1"].state is JobState.cancelled

@@ -3,11 +3,19 @@
 import re
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
-import trompe_client
+import pytest
 
-HEAVY = {"torch", "numpy", "PIL", "trimesh", "fastapi", "dbos", "trompe_server", "trompe_renderer"}
+import trompe_client
+import trompe_renderer
+import trompe_server
+import trompe_shared
+
+HEAVY = {"torch", "numpy", "PIL", "trimesh", "fastapi", "sqlalchemy", "pyrender", "trompe_server", "trompe_renderer"}
+LATER = {"httpx", "rich", "click", "IPython"}
+"""What an import of the SDK leaves for those who need it."""
 
 
 def test_public_names_are_sorted_and_exist():
@@ -15,16 +23,41 @@ def test_public_names_are_sorted_and_exist():
     assert all(hasattr(trompe_client, name) for name in trompe_client.__all__)
 
 
-def test_importing_client_and_command_line_loads_nothing_heavy():
-    code = "import sys, trompe_client, trompe_client.cli as cli; cli.main(['--help'], standalone_mode=False); "
-    code += "print(','.join({m.split('.')[0] for m in sys.modules}), file=sys.stderr)"
+def loaded(code: str) -> set[str]:
+    """Top names of the modules that a fresh Python has loaded after ``code``."""
+    code += "\nimport sys; print(','.join({m.split('.')[0] for m in sys.modules}), file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded = set(done.stderr.strip().split(","))
-    assert "trompe_client" in loaded
-    assert not loaded & HEAVY
+    return set(done.stderr.strip().split(","))
+
+
+def test_importing_the_sdk_loads_little_more_than_pydantic():
+    found = loaded("import trompe_client")
+    assert "trompe_client" in found
+    assert not found & (HEAVY | LATER)
+
+
+@pytest.mark.parametrize("words", [["--help"], ["attack", "--help"], ["jobs", "--help"], ["completion", "bash"]])
+def test_the_command_line_loads_nothing_heavy(words):
+    found = loaded(f"from trompe_client.cli import main; main({words!r}, standalone_mode=False)")
+    assert "trompe_client" in found
+    assert not found & HEAVY
+
+
+def test_completing_a_word_loads_no_command():
+    found = loaded("import trompe_client.cli.group as g; g.main.get_command(None, 'nothing')")
+    assert not found & (HEAVY | {"httpx", "rich"})
 
 
 def test_httpx_is_imported_in_one_module_only():
     folder = Path(trompe_client.__file__).parent
-    users = [file.name for file in folder.glob("*.py") if re.search(r"^\s*(import|from) httpx", file.read_text(), re.M)]
-    assert users == ["_client.py"]
+    files = {file.name: file.read_text() for file in folder.rglob("*.py")}
+    users = [name for name, text in files.items() if re.search(r"^\s*(import|from) httpx", text, re.M)]
+    assert users == ["_http.py"]
+
+
+def test_an_installation_without_extras_brings_four_small_libraries_and_a_few_megabytes_of_ours():
+    needs = [text for text in metadata.requires("trompe") or [] if "extra ==" not in text]
+    assert {re.match(r"[\w-]+", need)[0] for need in needs} == {"click", "httpx", "pydantic", "rich"}
+    roots = [Path(module.__file__).parent for module in (trompe_client, trompe_renderer, trompe_server, trompe_shared)]
+    files = [file for root in roots for file in root.rglob("*") if file.is_file() and file.suffix != ".pyc"]
+    assert sum(file.stat().st_size for file in files) < 8e6

@@ -18,7 +18,7 @@ from trompe_client._plan import (
     object_source,
     plan_attack,
 )
-from trompe_shared.api import JobSpec
+from trompe_shared.api import JobRequest
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
 
 
@@ -114,8 +114,7 @@ def test_a_background_is_a_colour_or_a_picture_file(tmp_path):
 
 
 def test_the_options_are_those_of_a_job():
-    named = {"object", "label", "classifier", "ensemble", "judges", "background", "masks"}
-    assert AttackOptions.__annotations__.keys() == JobSpec.model_fields.keys() - named
+    assert AttackOptions.__annotations__.keys() == JobRequest.model_fields.keys() - {"object", "label"}
 
 
 def plan(**options: Any) -> AttackPlan:

@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from datetime import UTC, datetime
 from pathlib import Path
 
 import httpx
@@ -12,22 +13,29 @@ from trompe_client import (
     Client,
     Conflict,
     ContractError,
+    Forbidden,
     JobCancelled,
     JobFailed,
+    JobHandle,
     NotFound,
+    Retries,
     ServerFault,
     ServerUnreachable,
+    TooMany,
+    Unauthorized,
     WaitTimeout,
 )
-from trompe_shared.api import JobSpec, JobState, ViewRanges
+from trompe_shared.api import Job, JobSpec, JobState, ViewRanges
 from trompe_shared.errors import ObjectError, SpecError
 
+NOW = datetime(2025, 1, 2, tzinfo=UTC)
 SPEC = JobSpec(object="mug", label="mug")
 
 
 def answering(status: int, body: bytes, **headers: str) -> Client:
     """A client whose every request is answered so."""
-    return Client(transport=httpx.MockTransport(lambda _request: httpx.Response(status, content=body, headers=headers)))
+    transport = httpx.MockTransport(lambda _request: httpx.Response(status, content=body, headers=headers))
+    return Client(transport=transport, retries=Retries(limit=0))
 
 
 def test_an_attack_on_a_stored_object_submits_the_spec_and_waits_for_its_result(client, server):
@@ -90,19 +98,12 @@ def test_events_come_once_each_and_in_order_over_a_dropped_connection(client, se
     assert server.resumed_after == [None, "2"]
 
 
-def test_waiting_survives_a_server_that_is_away_for_a_moment(client, server, monkeypatch):
+def test_waiting_survives_a_server_that_is_away_for_a_moment(client, server):
     job = client.submit(SPEC)
-    real_send, refused = client.send, iter([True, True])
-
-    def send(request):
-        if next(refused, False):
-            raise ServerUnreachable("away")
-        return real_send(request)
-
     server.drops = 1
-    monkeypatch.setattr(client, "send", send)
+    server.refusals = [(503, {})] * 3
     assert job.wait(timeout=20).state is JobState.succeeded
-    assert next(refused, None) is None
+    assert not server.refusals
 
 
 def test_a_job_that_was_over_before_it_is_followed_still_tells_its_story(client, server):
@@ -140,12 +141,10 @@ def test_waiting_ends_when_the_time_is_up_and_the_job_goes_on(client, server):
     assert client.job(job.id).state is JobState.queued
 
 
-def test_waiting_gives_up_when_the_server_stays_away(client, server, monkeypatch):
-    job = client.submit(SPEC)
-    with Client("http://127.0.0.1:9") as nobody:
-        monkeypatch.setattr(job, "_client", nobody)
-        with pytest.raises(ServerUnreachable, match="trompe serve"):
-            job.wait()
+def test_waiting_gives_up_when_the_server_stays_away(server):
+    job = Job(id="job-1", state="running", spec=SPEC, created=NOW)
+    with Client("http://127.0.0.1:9") as nobody, pytest.raises(ServerUnreachable, match="trompe serve"):
+        JobHandle(nobody, job).wait()
 
 
 def test_cancel_says_how_the_job_stands(client, server):
@@ -198,17 +197,27 @@ def test_an_unknown_object_is_refused_by_the_server(client):
 @pytest.mark.parametrize(
     ("status", "error"),
     [
+        pytest.param(401, Unauthorized, id="who"),
+        pytest.param(403, Forbidden, id="no right"),
+        pytest.param(429, TooMany, id="too many"),
         pytest.param(422, BadRequest, id="unprocessable"),
         pytest.param(413, BadRequest, id="too-large"),
         pytest.param(503, ServerFault, id="fault"),
     ],
 )
 def test_a_problem_document_becomes_a_typed_error(status, error):
-    errors = [{"loc": ["body", "epsilon"], "msg": "too large"}]
-    body = json.dumps({"title": "Wrong", "status": status, "detail": "Look.", "errors": errors}).encode()
+    body = json.dumps({"title": "Wrong", "status": status, "detail": "Look."}).encode()
     with answering(status, body) as client, pytest.raises(error) as caught:
         client.objects()
-    assert str(caught.value) == "Wrong. Look. epsilon: too large."
+    assert str(caught.value) == "Wrong. Look."
+    assert caught.value.status == status
+    fields = [{"field": "epsilon", "message": "too large"}, {"field": "tau", "message": "too small"}]
+    body = json.dumps({"title": "Wrong", "status": status, "errors": fields}).encode()
+    with (
+        answering(status, body) as client,
+        pytest.raises(error, match=r"Wrong\. epsilon: too large\. tau: too small\."),
+    ):
+        client.objects()
 
 
 def test_an_answer_of_some_other_server_is_quoted():

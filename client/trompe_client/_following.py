@@ -1,0 +1,125 @@
+"""A job from its first event to its last, over as many connections as it takes. Coroutines over a ``Port``."""
+
+import time
+from collections.abc import AsyncGenerator, Callable
+from contextlib import aclosing, suppress
+from typing import Final
+
+from trompe_client import _core
+from trompe_client._errors import JobCancelled, JobFailed, ServerFault, ServerUnreachable, TooMany, WaitTimeout
+from trompe_client._operations import check, send_once
+from trompe_client._port import Port
+from trompe_shared.api import Event, Job, JobState
+
+PATIENCE: Final = 60.0
+"""How long a server may be gone (restarting) while a job is followed, seconds."""
+SILENCE: Final = 30.0
+"""How long an event stream may say nothing before it is opened anew, seconds."""
+PAUSE: Final = 0.5
+"""Time between two connections, seconds."""
+AWAY: Final = (ServerUnreachable, ServerFault, TooMany)
+"""Errors of a server that may be itself again in a moment."""
+
+
+class Followed:
+    """A job as last seen."""
+
+    def __init__(self, status: Job) -> None:
+        self.status = status
+
+    @property
+    def id(self) -> str:
+        """The job's id; ``client.job(id)`` gives the handle again."""
+        return self.status.id
+
+    @property
+    def state(self) -> JobState:
+        """The job's state as last seen."""
+        return self.status.state
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.id} {self.state.value}>"
+
+
+async def wait(port: Port, job: Followed, *, timeout: float | None, show: Callable[[Event], None]) -> None:
+    """Follow a job to its end. Raises ``JobFailed``, ``JobCancelled``, ``WaitTimeout``, ``ServerUnreachable``."""
+    deadline = None if timeout is None else time.monotonic() + timeout
+    async with aclosing(_follow(port, job, deadline)) as events:
+        async for event in events:
+            show(event)
+    while not (await refresh_patiently(port, job, deadline)).state.final:
+        await port.sleep(PAUSE)
+    _raise_unless_done(job)
+
+
+def follow(port: Port, job: Followed) -> AsyncGenerator[Event, None]:
+    """All events of a job, each as it happens."""
+    return _follow(port, job, None)
+
+
+async def _follow(port: Port, job: Followed, deadline: float | None) -> AsyncGenerator[Event, None]:
+    """Events until the final one; each connection resumes after the last event seen."""
+    last: int | None = None
+    over = False
+    while True:
+        with suppress(*AWAY):
+            async with aclosing(_stream(port, job, last, deadline)) as events:
+                async for event in events:
+                    last = event.id
+                    yield event
+                    if event.state.final:
+                        return
+        if over:
+            return
+        over = (await refresh_patiently(port, job, deadline)).state.final
+        await port.sleep(0 if over else PAUSE)
+
+
+async def _stream(port: Port, job: Followed, after: int | None, deadline: float | None) -> AsyncGenerator[Event, None]:
+    """Events of one connection."""
+    silence = SILENCE if deadline is None else min(SILENCE, max(deadline - time.monotonic(), PAUSE))
+    request, parser = _core.events(job.id, after=after), _core.EventParser()
+    async with port.open(request, silence=silence) as answer:
+        await check(answer, request)
+        async with aclosing(answer.lines()) as lines:
+            async for line in lines:
+                _check_time(job, deadline)
+                event = parser.feed(line)
+                if event is not None:
+                    yield event
+
+
+async def refresh_patiently(port: Port, job: Followed, deadline: float | None = None) -> Job:
+    """Ask for the job's status, of a server that may be just restarting."""
+    give_up, attempt = time.monotonic() + PATIENCE, 0
+    while True:
+        _check_time(job, deadline)
+        try:
+            job.status = await send_once(port, _core.job(job.id))
+            return job.status
+        except AWAY as error:
+            now, pause = time.monotonic(), port.retries.delay(error, attempt=attempt)
+            if now + pause > give_up:
+                raise
+        await port.sleep(pause if deadline is None else max(0.0, min(pause, deadline - now)))
+        attempt += 1
+
+
+def _check_time(job: Followed, deadline: float | None) -> None:
+    if deadline is not None and time.monotonic() > deadline:
+        raise WaitTimeout(f"Job {job.id} is still {job.state.value}; it goes on.", job=job.status)
+
+
+def _raise_unless_done(job: Followed) -> None:
+    error = failure(job.status)
+    if error is not None:
+        raise error
+
+
+def failure(job: Job) -> JobFailed | JobCancelled | None:
+    """The error that a job ended in, if it did."""
+    if job.state is JobState.failed:
+        return JobFailed(f"Job {job.id} failed: {job.error or 'no reason given'}", job=job)
+    if job.state is JobState.cancelled:
+        return JobCancelled(f"Job {job.id} was cancelled.", job=job)
+    return None

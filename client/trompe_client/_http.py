@@ -1,0 +1,181 @@
+"""The two ports over httpx, which no other module imports: one blocks, one is asynchronous."""
+
+import asyncio
+import ipaddress
+import time
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any, Final, TypeVar
+
+import httpx
+
+from trompe_client._core import Request
+from trompe_client._errors import ServerUnreachable
+from trompe_client._port import finish
+from trompe_client._retry import Retries
+from trompe_client._settings import Connection
+
+__all__ = ["AsyncPort", "BlockingPort"]
+
+CONNECT_SECONDS: Final = 10.0
+"""Longest time to get through to the server."""
+
+T = TypeVar("T")
+
+
+class BlockingPort:
+    """Does its work on the spot; its coroutines never suspend."""
+
+    def __init__(self, connection: Connection, retries: Retries) -> None:
+        self.retries = retries
+        self._url = connection.url
+        self._http = httpx.Client(**_options(connection))
+
+    @asynccontextmanager
+    async def open(self, request: Request[Any], *, silence: float | None = None) -> AsyncIterator["_Answer"]:
+        with _translated(self._url), self._http.stream(**_arguments(request, silence)) as response:
+            yield _Answer(response)
+
+    async def sleep(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+    async def off(self, work: Callable[[], T]) -> T:
+        return work()
+
+    async def together(self, calls: Sequence[Callable[[], Coroutine[Any, Any, T]]], *, limit: int) -> list[T]:
+        with ThreadPoolExecutor(limit, thread_name_prefix="trompe") as pool:
+            futures = [pool.submit(lambda call=call: finish(call())) for call in calls]  # type: ignore[misc]
+            try:
+                return [future.result() for future in futures]
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+
+class AsyncPort:
+    """Suspends its coroutines while the network is busy; needs asyncio."""
+
+    def __init__(self, connection: Connection, retries: Retries) -> None:
+        self.retries = retries
+        self._url = connection.url
+        self._http = httpx.AsyncClient(**_options(connection))
+
+    @asynccontextmanager
+    async def open(self, request: Request[Any], *, silence: float | None = None) -> AsyncIterator["_AsyncAnswer"]:
+        with _translated(self._url):
+            async with self._http.stream(**_arguments(request, silence)) as response:
+                yield _AsyncAnswer(response)
+
+    async def sleep(self, seconds: float) -> None:
+        await asyncio.sleep(seconds)
+
+    async def off(self, work: Callable[[], T]) -> T:
+        return await asyncio.to_thread(work)
+
+    async def together(self, calls: Sequence[Callable[[], Coroutine[Any, Any, T]]], *, limit: int) -> list[T]:
+        places = asyncio.Semaphore(limit)
+
+        async def in_its_place(call: Callable[[], Coroutine[Any, Any, T]]) -> T:
+            async with places:
+                return await call()
+
+        async with asyncio.TaskGroup() as group:
+            tasks = [group.create_task(in_its_place(call)) for call in calls]
+        return [task.result() for task in tasks]
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+
+@dataclass(frozen=True)
+class _Answer:
+    response: httpx.Response
+
+    @property
+    def status(self) -> int:
+        return self.response.status_code
+
+    @property
+    def headers(self) -> Mapping[str, str]:
+        return self.response.headers
+
+    async def body(self) -> bytes:
+        return self.response.read()
+
+    async def chunks(self) -> AsyncGenerator[bytes, None]:
+        for chunk in self.response.iter_bytes():
+            yield chunk
+
+    async def lines(self) -> AsyncGenerator[str, None]:
+        for line in self.response.iter_lines():
+            yield line
+
+
+class _AsyncAnswer(_Answer):
+    async def body(self) -> bytes:
+        return await self.response.aread()
+
+    async def chunks(self) -> AsyncGenerator[bytes, None]:
+        async for chunk in self.response.aiter_bytes():
+            yield chunk
+
+    async def lines(self) -> AsyncGenerator[str, None]:
+        async for line in self.response.aiter_lines():
+            yield line
+
+
+def _options(connection: Connection) -> dict[str, Any]:
+    token = {"Authorization": f"Bearer {connection.token}"} if connection.token else {}
+    return {
+        "base_url": connection.url,
+        "headers": {"User-Agent": f"trompe/{version('trompe')}", **token},
+        "timeout": httpx.Timeout(connection.timeout, connect=min(CONNECT_SECONDS, connection.timeout)),
+        "transport": connection.transport,
+        # A proxy from the environment cannot reach a server on this very machine.
+        "trust_env": not _is_loopback(httpx.URL(connection.url).host),
+    }
+
+
+def _arguments(request: Request[Any], silence: float | None) -> dict[str, Any]:
+    upload = request.upload
+    arguments = {
+        "method": request.method,
+        "url": request.path,
+        "params": list(request.params),
+        "headers": dict(request.headers) | ({"Content-Type": "application/json"} if request.json else {}),
+        "content": request.json,
+        "data": dict(upload.form) if upload else None,
+        "files": {"file": (upload.filename, upload.data)} if upload else None,
+    }
+    return arguments if silence is None else arguments | {"timeout": httpx.Timeout(silence)}
+
+
+@contextmanager
+def _translated(url: str) -> Iterator[None]:
+    """httpx's errors of the network as our own."""
+    try:
+        yield
+    except (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout) as error:
+        raise ServerUnreachable(
+            f"No Trompe server answers at {url} ({error or type(error).__name__}). "
+            "Start one with `trompe serve`, or give the right address (--server, TROMPE_SERVER, Client(url))."
+        ) from error
+    except (httpx.RequestError, httpx.InvalidURL) as error:
+        raise ServerUnreachable(
+            f"The connection to {url} broke ({type(error).__name__}: {error}). Look at the server's log."
+        ) from error
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,140 @@
+"""Files from the server to the disk: whole or not at all, checked, and taken up where a connection broke.
+
+The bytes go to ``.NAME.SUM.part`` beside the file, SUM being the checksum that the server's ETag promises, so that a
+later run, too, knows what a part is the beginning of. A file appears under its name when its checksum is right.
+"""
+
+import glob
+import hashlib
+import os
+import re
+from collections.abc import Mapping
+from contextlib import aclosing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from trompe_client import _core
+from trompe_client._core import Request
+from trompe_client._errors import BrokenDownload, ClientError, ContractError
+from trompe_client._operations import check, send
+from trompe_client._port import Answer, Port
+from trompe_shared.api import Job
+
+__all__ = ["fetch", "fetch_all"]
+
+ETAG: Final = re.compile(r'(?:W/)?"([0-9a-f]{64})"')
+SUM: Final = re.compile(r"\.([0-9a-f]{64})\.part$")
+PARTIAL, UNCHANGED, UNSATISFIABLE = 206, 304, 416
+
+
+async def fetch_all(port: Port, job_id: str, folder: Path) -> tuple[Job, list[Path]]:
+    """Fetch all artifacts of a job into ``folder``; gives the job and the paths.
+
+    Raises ``ContractError`` for a file that would lie elsewhere, ``BrokenDownload``.
+    """
+    job = await send(port, _core.job(job_id))
+    for name in job.artifacts:
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise ContractError(
+                f"The server offers a file named {name!r}, which would lie outside {folder}; not fetched."
+            )
+    return job, [await fetch(port, _core.artifact(job_id, name), folder / name) for name in job.artifacts]
+
+
+async def fetch(port: Port, request: Request[bytes], path: Path) -> Path:
+    """Fetch one file to ``path``, in place of an older one; the server is not asked for bytes that are there already.
+
+    Raises ``BrokenDownload`` when wrong bytes come again and again.
+    """
+    attempt = 0
+    while True:
+        part = await port.off(partial(_Part.beside, path))
+        try:
+            await _fetch_once(port, request, part)
+            return path
+        except ClientError as error:
+            pause = port.retries.pause(error, attempt=attempt)
+            if pause is None:
+                raise
+        await port.sleep(pause)
+        grown = (await port.off(partial(_Part.beside, path))).size > part.size
+        attempt = 0 if grown else attempt + 1
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The beginning of the file at ``path``: the first ``size`` bytes of what has the checksum ``sum``."""
+
+    path: Path
+    sum: str | None = None
+    size: int = 0
+
+    @classmethod
+    def beside(cls, path: Path) -> "_Part":
+        """The part that an earlier attempt left, or an empty one."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for file in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+            if match := SUM.search(file.name):
+                return cls(path, match[1], file.stat().st_size)
+        return cls(path)
+
+    @property
+    def file(self) -> Path:
+        """Where the part lies."""
+        return self.path.with_name(f".{self.path.name}.{self.sum}.part" if self.sum else f".{self.path.name}.part")
+
+    def conditions(self) -> Mapping[str, str]:
+        """Headers that ask for what is missing alone."""
+        if self.size:
+            return {"Range": f"bytes={self.size}-", "If-Range": f'"{self.sum}"'}
+        return {"If-None-Match": f'"{_checksum(self.path)}"'} if self.path.is_file() else {}
+
+    def discard(self) -> None:
+        """Forget what has come so far."""
+        self.file.unlink(missing_ok=True)
+
+    def complete(self) -> None:
+        """Check the part and give it its name. Raises ``BrokenDownload``."""
+        found = self.sum and _checksum(self.file)
+        if found != self.sum:
+            self.discard()
+            raise BrokenDownload(
+                f"{self.path.name} came with the checksum {found}, where the server promised {self.sum}. Try again; if "
+                "it stays so, something between here and the server changes the bytes."
+            )
+        os.replace(self.file, self.path)
+
+
+async def _fetch_once(port: Port, request: Request[bytes], part: _Part) -> None:
+    conditions = await port.off(part.conditions)
+    async with port.open(replace(request, headers={**request.headers, **conditions})) as answer:
+        if answer.status == UNCHANGED:
+            await port.off(part.discard)
+            return
+        if answer.status == UNSATISFIABLE:  # all of it had come, or more
+            await port.off(part.complete)
+            return
+        await check(answer, request)
+        part = await _append(port, answer, part)
+    await port.off(part.complete)
+
+
+async def _append(port: Port, answer: Answer, part: _Part) -> _Part:
+    """Write the body behind ``part``, or anew where the server does not go on with it."""
+    going_on = answer.status == PARTIAL and part.sum is not None
+    if not going_on:
+        await port.off(part.discard)
+        match = ETAG.fullmatch(answer.headers.get("ETag") or "")
+        part = _Part(part.path, match and match[1])
+    with part.file.open("ab" if going_on else "wb") as file:
+        async with aclosing(answer.chunks()) as chunks:
+            async for chunk in chunks:
+                await port.off(partial(file.write, chunk))
+    return part
+
+
+def _checksum(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,127 @@
+"""The command ``trompe``. Its commands, and those of the other packages, are imported only when they are called."""
+
+from dataclasses import dataclass
+from importlib import import_module, metadata
+from typing import Any, Final
+
+import click
+
+from trompe_client.cli.exits import EXITS, INTERRUPTED, exit_code
+from trompe_client.cli.output import show_error
+from trompe_shared.errors import TrompeError
+
+__all__ = ["main"]
+
+COMMANDS_GROUP: Final = "trompe.commands"
+
+OWN: Final = {
+    "attack": "trompe_client.cli.attack",
+    "backgrounds": "trompe_client.cli.library",
+    "cancel": "trompe_client.cli.jobs",
+    "classifiers": "trompe_client.cli.library",
+    "completion": "trompe_client.cli.completion",
+    "experiment": "trompe_client.experiments.cli",
+    "jobs": "trompe_client.cli.jobs",
+    "objects": "trompe_client.cli.library",
+    "renderers": "trompe_client.cli.fleet",
+    "report": "trompe_client.cli.jobs",
+    "watch": "trompe_client.cli.jobs",
+    "workers": "trompe_client.cli.fleet",
+}
+"""The commands of this package, and the modules that hold them under their names."""
+
+
+@dataclass(frozen=True)
+class _Extension:
+    """A command of another package: the extra that installs what it needs, and its line in ``trompe --help``."""
+
+    extra: str
+    help: str
+
+
+EXTENSIONS: Final = {
+    "serve": _Extension("server", "Run the service: API, attack worker and renderer."),
+    "worker": _Extension("server", "Run one more attack worker."),
+    "demo": _Extension("server", "Attack an object that comes with Trompe, and show the result."),
+    "doctor": _Extension("server", "Check this machine, and say how to mend what is wrong."),
+    "migrate": _Extension("server", "Make the service's database, or bring it up to date."),
+    "render": _Extension("renderer", "Run a renderer worker (SAILenv's protocol)."),
+    "token": _Extension("server", "Make, list and revoke the tokens that a server asks for."),
+}
+
+
+class _Trompe(click.Group):
+    """A group that finds its commands by name or by entry point, and turns errors into words and an exit code."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted({*OWN, *EXTENSIONS, *metadata.entry_points(group=COMMANDS_GROUP).names})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name in OWN:
+            command = getattr(import_module(OWN[cmd_name]), cmd_name)
+            assert isinstance(command, click.Command)
+            return command
+        return _load_extension(cmd_name) if cmd_name in self.list_commands(ctx) else None
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
+        """As click's own, but without importing any command."""
+        from click.shell_completion import CompletionItem
+
+        names = [name for name in self.list_commands(ctx) if name.startswith(incomplete)]
+        return [CompletionItem(name) for name in names] + click.Command.shell_complete(self, ctx, incomplete)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """As click's own, but without importing the commands of other packages."""
+        lines = {name: extension.help for name, extension in EXTENSIONS.items()}
+        for name in OWN:
+            command = self.get_command(ctx, name)
+            lines[name] = command.get_short_help_str(100) if command else ""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, lines.get(name, "")) for name in self.list_commands(ctx)])
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Exit codes"):
+            formatter.write_dl([(str(code), meaning) for code, meaning in EXITS.items()])
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            click.echo("Interrupted.", err=True)
+            ctx.exit(INTERRUPTED)
+        except BrokenPipeError:
+            raise
+        except ModuleNotFoundError as error:  # commands import what they need when they are called
+            if ctx.invoked_subcommand not in EXTENSIONS:
+                raise
+            raise _missing_extra(ctx.invoked_subcommand, error) from error
+        except (TrompeError, OSError) as error:
+            show_error(ctx, error, code=exit_code(error))
+            ctx.exit(exit_code(error))
+
+
+def _load_extension(name: str) -> click.Command:
+    """Import a command of another package. Raises ``ClickException`` when what it needs is not installed."""
+    found = list(metadata.entry_points(group=COMMANDS_GROUP, name=name))
+    try:
+        if not found:
+            raise ModuleNotFoundError(f"no installed package provides the command {name!r}")
+        command = found[0].load()
+    except ModuleNotFoundError as error:
+        raise _missing_extra(name, error) from error
+    assert isinstance(command, click.Command)
+    return command
+
+
+def _missing_extra(name: str, error: ModuleNotFoundError) -> click.ClickException:
+    """The error that names the extra to install."""
+    if name not in EXTENSIONS:
+        return click.ClickException(f"`trompe {name}` cannot be loaded: {error}.")
+    extra = EXTENSIONS[name].extra
+    return click.ClickException(f"`trompe {name}` needs the {extra} extra: pip install 'trompe[{extra}]' ({error})")
+
+
+@click.group(cls=_Trompe, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
+@click.version_option(package_name="trompe")
+def main() -> None:
+    """Craft adversarial 3D objects: repaint a texture so that people see the same object and a classifier does not."""

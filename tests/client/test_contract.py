@@ -1,0 +1,195 @@
+"""What both clients promise, over the fake server of these tests and over a real ``trompe serve``."""
+
+import asyncio
+import inspect
+import json
+import secrets
+import zipfile
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from trompe_client import (
+    AsyncClient,
+    AsyncJobHandle,
+    BadRequest,
+    Client,
+    Conflict,
+    JobCancelled,
+    JobHandle,
+    NotFound,
+    Outcome,
+)
+from trompe_client._embedded import embedded_server
+from trompe_shared.api import JobRequest, JobState
+
+FEW = {"pool": 0, "azimuths": 2, "elevations": 1, "held_out": 1, "steps": 1}
+"""Options of a job of seconds."""
+ENDLESS = FEW | {"steps": 10_000}
+
+
+class Blocking:
+    """An asynchronous client or handle, to be used like the blocking one."""
+
+    def __init__(self, inner: Any, loop: asyncio.AbstractEventLoop) -> None:
+        self.inner, self.loop = inner, loop
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self.inner, name)
+        return (lambda *args, **options: self.settle(found(*args, **options))) if callable(found) else found
+
+    def settle(self, value: Any) -> Any:
+        """What comes of an awaitable, or of an asynchronous iterator, handles wrapped."""
+        if inspect.isawaitable(value):
+            return self.wrap(self.loop.run_until_complete(value))
+        return self.steps(value) if hasattr(value, "__aiter__") else value
+
+    def steps(self, values: Any) -> Iterator[Any]:
+        try:
+            while True:
+                yield self.wrap(self.loop.run_until_complete(anext(values)))
+        except StopAsyncIteration:
+            pass
+        finally:
+            self.loop.run_until_complete(values.aclose())
+
+    def wrap(self, value: Any) -> Any:
+        if isinstance(value, Outcome):
+            return value.of(self.wrap)
+        return Blocking(value, self.loop) if isinstance(value, AsyncJobHandle) else value
+
+
+@pytest.fixture(scope="module")
+def service() -> Iterator[str]:
+    """The address of a real service, as `trompe serve` starts it."""
+    with embedded_server() as url:
+        yield url
+
+
+@pytest.fixture(params=["fake", "real"])
+def address(request: pytest.FixtureRequest) -> str:
+    if request.param == "real":
+        return str(request.getfixturevalue("service"))
+    fake = request.getfixturevalue("server")
+    fake.when_listed = fake.finish_all
+    return str(fake.url)
+
+
+@pytest.fixture(params=[Client, AsyncClient])
+def client(request: pytest.FixtureRequest, address: str) -> Iterator[Any]:
+    if request.param is Client:
+        with Client(address) as connected:
+            yield connected
+        return
+    with asyncio.Runner() as runner:
+        connected = AsyncClient(address)
+        yield Blocking(connected, runner.get_loop())
+        runner.run(connected.close())
+
+
+@pytest.fixture
+def name() -> str:
+    """A name that no other test on the same server has used."""
+    return secrets.token_hex(8)
+
+
+def test_a_job_from_its_submission_to_its_files(client, tmp_path):
+    job = client.attack("mug", label="mug", epsilon=0.1, labels={"who": "me"}, priority="interactive", **FEW)
+    assert job.state in {JobState.queued, JobState.running}
+    job.wait(timeout=120)
+    assert job.state is JobState.succeeded
+    assert (job.status.labels, job.status.priority) == ({"who": "me"}, "interactive")
+    result = job.result()
+    assert (result.epsilon, result.target.views > 0) == (0.1, True)
+    paths = job.download(tmp_path)
+    assert [path.relative_to(tmp_path).as_posix() for path in paths] == job.status.artifacts
+    assert json.loads((tmp_path / "result.json").read_text())["epsilon"] == 0.1
+    with zipfile.ZipFile(job.archive(tmp_path / "all.zip")) as archive:
+        assert archive.testzip() is None
+    states = [event.state for event in job.events()]
+    assert (states[0], states[-1]) == (JobState.queued, JobState.succeeded)
+
+
+def test_a_key_makes_one_job(client, name):
+    first = client.attack("mug", label="mug", key=name, **FEW)
+    assert client.submit(first.status.spec, key=name).id == first.id
+    with pytest.raises(Conflict):
+        client.attack("mug", label="mug", key=name, **FEW | {"seed": 5})
+    first.wait(timeout=120)
+
+
+def test_a_cancelled_job_can_be_submitted_anew_and_deleted(client):
+    job = client.attack("mug", label="mug", labels={"who": "them"}, **ENDLESS)
+    with pytest.raises(Conflict):
+        job.delete()
+    job.cancel()
+    with pytest.raises(JobCancelled) as caught:
+        job.wait(timeout=60)
+    assert caught.value.job_id == job.id
+    anew = job.retry()
+    assert anew.id != job.id
+    assert anew.status.spec == job.status.spec
+    assert anew.status.labels == {"who": "them"}
+    anew.cancel()
+    job.delete()
+    with pytest.raises(NotFound):
+        job.refresh()
+
+
+def test_jobs_are_found_by_state_label_object_and_classifier(client, name):
+    label = {"test": name}
+    jobs = [client.attack("mug", label="mug", labels=label, seed=seed, **FEW) for seed in range(3)]
+    assert [job.id for job in client.jobs(labels=label)] == [job.id for job in reversed(jobs)]
+    assert [job.id for job in client.jobs(labels={"test": f"not {name}"})] == []
+    for job in jobs:
+        job.wait(timeout=120)
+    ended = client.jobs(labels=label, state="succeeded", object="mug", classifier="tiny")
+    assert {job.id for job in ended} == {job.id for job in jobs}
+    assert list(client.jobs(labels=label, state="failed")) == []
+
+
+def test_many_jobs_come_back_with_results_and_errors(client, name):
+    one = {"object": "mug", "label": "mug", **FEW}
+    attacks = [one | {"seed": 1}, one | {"object": "no such"}, JobRequest(**one, labels={"own": "label"})]
+    outcomes = {outcome.index: outcome for outcome in client.map(attacks, batch=name)}
+    assert sorted(outcomes) == [0, 1, 2]
+    assert isinstance(outcomes[1].error, NotFound)
+    assert [outcomes[index].result.seed for index in (0, 2)] == [1, 0]
+    assert outcomes[2].job.status.labels == {"own": "label", "batch": name}
+    again = {outcome.index: outcome for outcome in client.map(attacks, batch=name)}
+    assert [again[index].job.id for index in (0, 2)] == [outcomes[index].job.id for index in (0, 2)]
+
+
+def test_what_is_stored_and_what_does_the_work(client, mug_folder):
+    assert "mug" in {one.name for one in client.objects()}
+    assert "tiny" in {one.name for one in client.classifiers()}
+    assert [worker.alive for worker in client.workers()] == [True]
+    assert [renderer.alive for renderer in client.renderers()] == [True]
+    assert isinstance(client.backgrounds(), list)
+
+
+def test_what_is_wrong_says_so_with_the_ids(client):
+    with pytest.raises(NotFound) as caught:
+        client.job("no-such-job")
+    assert caught.value.job_id == "no-such-job"
+    assert caught.value.request_id
+    with pytest.raises((BadRequest, NotFound)):
+        client.attack("no such object", label=0)
+
+
+PAIRS = [pytest.param(Client, AsyncClient, id="client"), pytest.param(JobHandle, AsyncJobHandle, id="job")]
+
+
+@pytest.mark.parametrize(("blocking", "asynchronous"), PAIRS)
+def test_both_clients_have_the_same_methods_with_the_same_arguments(blocking, asynchronous):
+    def arguments(kind: type) -> dict[str, list[str]]:
+        members = inspect.getmembers(kind, inspect.isfunction)
+        public = {name: member for name, member in members if not name.startswith("_")}
+        return {name: list(map(str, inspect.signature(method).parameters.values())) for name, method in public.items()}
+
+    assert arguments(blocking) == arguments(asynchronous)
+
+
+def test_both_clients_are_made_alike():
+    assert str(inspect.signature(Client)) == str(inspect.signature(AsyncClient))

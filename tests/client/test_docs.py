@@ -1,0 +1,133 @@
+"""The pages about SDK and command line are true: their code runs, their tables are the code's."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import trompe_client
+from trompe_client._embedded import embedded_server
+from trompe_client.cli import main
+from trompe_client.cli.exits import EXITS
+from trompe_client.cli.group import OWN
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def blocks(page: str, language: str) -> list[tuple[str, str]]:
+    """(heading, code) of the blocks of a page that are in ``language``."""
+    heading, found = "", []
+    for match in re.finditer(r"^#+ ([^\n]+)$|^```(\w+)\n(.*?)^```", (DOCS / page).read_text(), re.M | re.S):
+        heading = match[1] or heading
+        if match[2] == language:
+            found.append((heading, match[3]))
+    return found
+
+
+QUICKSTART = {heading: code for language in ("python", "sh") for heading, code in blocks("quickstart.md", language)}
+
+
+@pytest.fixture(scope="module")
+def service() -> Iterator[str]:
+    """The address of a real `trompe serve`."""
+    with embedded_server() as url:
+        yield url
+
+
+def run(command: list[str], folder: Path, server: str) -> str:
+    """What a program prints that is run in ``folder`` as a reader would, with ``server`` in the environment."""
+    scripts = sysconfig.get_path("scripts")
+    environment = os.environ | {"TROMPE_SERVER": server, "PATH": f"{scripts}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=240
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_quickstart_starts_the_service_that_these_tests_start():
+    assert [code for _, code in blocks("quickstart.md", "sh")][:2] == [
+        "pip install 'trompe[server]'\n",
+        "trompe serve\n",
+    ]
+
+
+@pytest.mark.parametrize(("heading", "out"), [("Python", "out-python"), ("Python with asyncio", "out-asyncio")])
+def test_the_quickstart_in_python_runs(service, tmp_path, heading, out):
+    said = run([sys.executable, "-W", "error", "-c", QUICKSTART[heading]], tmp_path, service)
+    assert re.fullmatch(r"recognised in \d+% of the views before, in \d+% after\n", said)
+    assert (tmp_path / out / "adversarial.zip").is_file()
+
+
+def test_the_quickstart_on_the_command_line_runs(service, tmp_path):
+    said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["Command line"]], tmp_path, service)
+    assert "target (own views)" in said
+    assert (tmp_path / "out-cli" / "mug_adversarial.zip").is_file()
+
+
+def test_the_quickstart_with_curl_runs(service, tmp_path):
+    said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["curl"]], tmp_path, service)
+    assert "event: progress" in said
+    assert (tmp_path / "out-curl" / "adversarial.zip").read_bytes()[:2] == b"PK"
+    assert '"texels_altered"' in (tmp_path / "out-curl" / "result.json").read_text()
+
+
+@pytest.fixture
+def readers_folder(server, mug_folder, tmp_path, monkeypatch):
+    """A folder with the files that the pages speak of; the fake server is where commands look for one."""
+    from trompe_client._plan import object_upload
+
+    (tmp_path / "mug.zip").write_bytes(object_upload(mug_folder).data)
+    (tmp_path / "net.pt2").write_bytes(b"network")
+    (tmp_path / "room.png").write_bytes(b"picture")
+    server.when_listed = server.finish_all
+    server.page_size = 500
+    monkeypatch.setenv("TROMPE_SERVER", server.url)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.usefixtures("readers_folder")
+def test_the_page_on_the_sdk_runs_from_its_beginning_to_its_end(server, capsys):
+    names: dict[str, object] = {}
+    for heading, code in blocks("sdk.md", "python"):
+        here = code.replace('"http://127.0.0.1:8000"', repr(server.url))
+        exec(compile(here, f"sdk.md, {heading}", "exec"), names)
+    assert "'no such object' is not stored" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("readers_folder")
+def test_the_page_on_the_command_line_runs_from_its_beginning_to_its_end():
+    lines = [line for _, code in blocks("cli.md", "sh") for line in code.splitlines()]
+    for line in lines:
+        program, *words = shlex.split(line)
+        done = CliRunner().invoke(main, words)
+        assert (program, done.exit_code) == ("trompe", 0), f"{line}\n{done.output}"
+    named = {shlex.split(line)[1] for line in lines}
+    assert named >= OWN.keys() - {"cancel", "experiment"}
+
+
+def test_the_page_lists_the_exit_codes_of_the_code():
+    rows = re.findall(r"^\| (\d+) \| (.+) \|$", (DOCS / "cli.md").read_text(), re.M)
+    assert {int(code): meaning for code, meaning in rows} == EXITS
+
+
+def test_the_page_on_the_sdk_names_every_error():
+    text = (DOCS / "sdk.md").read_text()
+    public = {name: getattr(trompe_client, name) for name in trompe_client.__all__}
+    errors = {name for name, one in public.items() if isinstance(one, type) and issubclass(one, Exception)}
+    bases = {"APIError", "ClientError", "EmbeddedServerError", "JobError"}
+    assert {name for name in errors if f"`{name}`" not in text} <= bases
+
+
+@pytest.mark.parametrize("page", ["quickstart.md", "sdk.md", "cli.md"])
+def test_links_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)#:]+)\)", (DOCS / page).read_text())
+    assert [link for link in links if not (DOCS / link).exists()] == []

@@ -1,0 +1,121 @@
+"""What is sent again, after which pause, and with which key."""
+
+from datetime import UTC, datetime, timedelta
+from email.utils import format_datetime
+
+import httpx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trompe_client import Client, Conflict, Retries, ServerFault, ServerUnreachable, TooMany, Unauthorized
+from trompe_client._core import error_from
+from trompe_shared.api import JobSpec
+
+SPEC = JobSpec(object="mug", label="mug")
+
+
+def refusal(status, **headers):
+    return error_from(status, headers, b"", job_id=None)
+
+
+@given(st.integers(0, 3), st.floats(0, 1), st.sampled_from([429, 502, 503, 504]))
+def test_the_pauses_grow_and_are_never_longer_than_the_longest(attempt, chance, status):
+    retries = Retries(limit=4, base=0.5, longest=3.0, random=lambda: chance)
+    pause = retries.pause(refusal(status), attempt=attempt)
+    assert pause == pytest.approx(chance * min(3.0, 0.5 * 2**attempt))
+
+
+@pytest.mark.parametrize("status", [400, 401, 403, 404, 409, 413, 422, 500])
+def test_what_would_be_refused_again_is_not_sent_again(status):
+    assert Retries().pause(refusal(status), attempt=0) is None
+
+
+def test_after_the_last_attempt_the_error_is_raised(client, server, slept):
+    server.refusals = [(503, {})] * 9
+    with pytest.raises(ServerFault):
+        client.objects()
+    assert len(slept) == Retries().limit
+    assert len(server.requests) == Retries().limit + 1
+
+
+@pytest.mark.parametrize("status", [429, 503])
+def test_a_pause_that_the_server_asks_for_is_kept(client, server, slept, status):
+    server.refusals = [(status, {"Retry-After": "7"})]
+    assert client.objects()
+    assert 7 <= slept[0] < 7.25
+
+
+def test_a_pause_may_be_given_as_a_time_of_day():
+    soon = format_datetime(datetime.now(UTC) + timedelta(seconds=20), usegmt=True)
+    assert 17 < refusal(503, **{"Retry-After": soon}).retry_after <= 20
+    assert refusal(503, **{"Retry-After": "in a while"}).retry_after is None
+
+
+def test_a_server_that_wants_to_be_left_alone_for_an_hour_is_not_waited_for(client, server, slept):
+    server.refusals = [(429, {"Retry-After": "3600"})]
+    with pytest.raises(TooMany) as caught:
+        client.objects()
+    assert caught.value.retry_after == 3600
+    assert slept == []
+
+
+def test_a_submission_whose_answer_is_lost_makes_one_job(server):
+    lost = iter([True, True])
+
+    def carry(request: httpx.Request) -> httpx.Response:
+        response = real.handle_request(request)
+        response.read()
+        if request.method == "POST" and next(lost, False):
+            raise httpx.ReadError("the line is dead", request=request)
+        return response
+
+    with httpx.HTTPTransport() as real, Client(server.url, transport=httpx.MockTransport(carry)) as client:
+        first, second = client.submit(SPEC), client.submit(SPEC)
+    assert next(lost, None) is None
+    assert [first.id, second.id] == list(server.jobs) == ["job-1", "job-2"]
+
+
+def test_the_same_key_gives_the_same_job_and_refuses_another_one(client, server):
+    assert client.submit(SPEC, key="k").id == client.attack("mug", label="mug", key="k").id
+    with pytest.raises(Conflict):
+        client.submit(JobSpec(object="mug", label=7), key="k")
+
+
+def test_a_retry_of_a_job_whose_answer_is_lost_makes_one_job(client, server):
+    job = client.submit(SPEC)
+    server.refusals = [(504, {})]
+    assert job.retry().id == "job-2"
+    keys = {headers["Idempotency-Key"] for _, path, headers in server.requests if path.endswith("/retry")}
+    assert len(keys) == 1
+
+
+def test_nobody_at_the_address_is_tried_some_times_before_it_is_an_error(slept):
+    with Client("http://127.0.0.1:9") as client, pytest.raises(ServerUnreachable):
+        client.objects()
+    assert len(slept) == Retries().limit
+
+
+def test_a_token_is_shown_to_the_server_and_kept_out_of_sight(server, monkeypatch):
+    server.token = "trompe_secret"
+    with Client(server.url) as client, pytest.raises(Unauthorized):
+        client.objects()
+    with Client(server.url, token="trompe_secret") as client:
+        assert client.objects()
+    monkeypatch.setenv("TROMPE_TOKEN", "trompe_secret")
+    monkeypatch.setenv("TROMPE_SERVER", server.url)
+    with Client() as client:
+        assert client.objects()
+        assert "secret" not in repr(vars(client))
+
+
+def test_a_server_that_says_nothing_is_given_up(server):
+    def silence(request: httpx.Request) -> httpx.Response:
+        assert request.extensions["timeout"] == {"connect": 0.5, "read": 0.5, "write": 0.5, "pool": 0.5}
+        raise httpx.ReadTimeout("nothing", request=request)
+
+    with (
+        Client(server.url, timeout=0.5, transport=httpx.MockTransport(silence)) as client,
+        pytest.raises(ServerUnreachable, match="ReadTimeout"),
+    ):
+        client.objects()
