@@ -1,0 +1,98 @@
+"""From surfaces and looks to an object in SAILenv's format: the end of every reader but that of the format itself."""
+
+import json
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trompe_server.formats.pictures import Pixels, encode_srgb, linear_rgb
+from trompe_server.formats.unwrap import BAKED_SIDE, bake, unwrap
+from trompe_shared.errors import ObjectError
+from trompe_shared.object3d import Material, Object3D, object_from_files
+from trompe_shared.wavefront import LARGEST, Part, Surface, obj_text
+
+__all__ = ["DEFAULT_COLOUR", "assemble", "check_numbers", "flat_picture", "free_name", "painted_flat", "safe_name"]
+
+DEFAULT_COLOUR: Final = tuple(linear_rgb(np.full(3, 204, np.uint8)).tolist())
+"""Linear colour of what comes without any: a light grey."""
+
+
+def safe_name(text: str, *, default: str = "object") -> str:
+    """``text`` as a file or material name that no format, file system or shell minds."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).strip("_.-")[:80] or default
+
+
+def free_name(wanted: str, taken: Collection[str]) -> str:
+    """``wanted`` (a file or material name), with a number where it is taken."""
+    stem, dot, ending = wanted.rpartition(".") if "." in wanted else (wanted, "", "")
+    names = (wanted, *(f"{stem}_{k}{dot}{ending}" for k in range(2, len(taken) + 3)))
+    lower = {name.lower() for name in taken}
+    return next(name for name in names if name.lower() not in lower)
+
+
+def flat_picture(colour: Sequence[float], size: tuple[int, int] = (BAKED_SIDE, BAKED_SIDE)) -> Pixels:
+    """A texture (H, W, 3) of one linear colour, with texels enough to be painted on."""
+    return np.broadcast_to(encode_srgb(colour), (*size, 3)).copy()
+
+
+@dataclass(frozen=True)
+class Painted:
+    """Surfaces of one material with the texture made for them."""
+
+    parts: tuple[Part, ...]
+    picture: Pixels
+
+
+def painted_flat(surfaces: Sequence[Surface], colour: Sequence[float]) -> Painted:
+    """Surfaces of one material without texture: unwrapped where one has no UVs, or colours of its vertices.
+
+    ``colour`` (linear) multiplies those of the vertices, which are sRGB-encoded in [0, 1].
+    """
+    coloured = any(surface.colours is not None for surface in surfaces)
+    if not coloured and all(surface.uvs is not None for surface in surfaces):
+        return Painted(tuple(_part(surface) for surface in surfaces), flat_picture(colour))
+    cut, size = unwrap([(surface.vertices, surface.faces) for surface in surfaces])
+    parts = tuple(
+        Part(surface.material, surface.vertices[u.source], surface.normals[u.source], u.uvs, u.faces)
+        for surface, u in zip(surfaces, cut, strict=True)
+    )
+    if not coloured:
+        return Painted(parts, flat_picture(colour, size))
+    shades = [_vertex_colours(surface)[u.source] * np.asarray(colour) for surface, u in zip(surfaces, cut, strict=True)]
+    return Painted(parts, bake(list(zip(cut, shades, strict=True)), size=size))
+
+
+def _vertex_colours(surface: Surface) -> NDArray[np.float64]:
+    if surface.colours is None:
+        return np.ones((len(surface.vertices), 3))
+    return linear_rgb(np.rint(np.clip(surface.colours, 0, 1) * 255).astype(np.uint8))
+
+
+def _part(surface: Surface) -> Part:
+    assert surface.uvs is not None
+    return Part(surface.material, surface.vertices, surface.normals, surface.uvs, surface.faces)
+
+
+def check_numbers(values: NDArray[np.floating], what: str) -> None:
+    """Raises ``ObjectError`` for positions or texture coordinates that are not finite or absurdly large."""
+    if not np.isfinite(values).all() or (values.size and np.abs(values).max() > LARGEST):
+        raise ObjectError(f"{what} has numbers that are not finite or beyond {LARGEST:g}; positions are metres.")
+
+
+def assemble(
+    name: str, parts: Sequence[Part], materials: Mapping[str, Material], files: Mapping[str, bytes]
+) -> Object3D:
+    """The object of these parts; ``files`` are the images that ``materials`` name. Raises ``ObjectError``."""
+    maps = ("albedo", "normal", "metallic")
+    table = {key: {use: getattr(material, use) for use in maps} for key, material in materials.items()}
+    return object_from_files(
+        {
+            f"{name}.obj": obj_text(tuple(parts)).encode(),
+            f"{name}_mat_def.json": json.dumps(table, indent=1).encode(),
+            **files,
+        }
+    )

@@ -1,0 +1,50 @@
+"""Reads or repaints one model file in a process of its own; ``isolated`` starts it.
+
+``convert read FILE NAME MAX_TEXTURE ARCHIVE`` writes the object as SAILenv's zip, ``convert repaint FILE NAME ARCHIVE
+OUT`` a model file with its paint; MAX_TEXTURE may be 0 for none. Both answer with one line of JSON.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from trompe_server.formats.registry import read_object, repaint_file
+from trompe_shared.errors import TrompeError
+from trompe_shared.object3d import load_object
+
+__all__ = ["main"]
+
+
+def _read(file: str, name: str, max_texture: str, archive: str) -> dict[str, object]:
+    imported = read_object(Path(file).read_bytes(), name=name, max_texture=int(max_texture) or None)
+    obj = imported.obj
+    Path(archive).write_bytes(obj.to_zip())
+    return {
+        "format": imported.format,
+        "materials": sorted(obj.materials),
+        "textures": {name: list(image.shape[:2]) for name, image in obj.textures.items()},
+        "triangles": sum(len(part.faces) for part in obj.parts),
+        "radius": obj.radius,
+    }
+
+
+def _repaint(file: str, name: str, archive: str, out: str) -> dict[str, object]:
+    exported = repaint_file(Path(file).read_bytes(), load_object(Path(archive).read_bytes()), name=name)
+    Path(out).write_bytes(exported.data)
+    return {"ending": exported.ending}
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Do what the command line says, and print the answer; the exit code."""
+    what, *rest = arguments
+    try:
+        answer = _read(*rest) if what == "read" else _repaint(*rest)
+    except TrompeError as error:
+        answer = {"error": str(error)}
+    sys.stdout.write(json.dumps(answer) + "\n")
+    return int("error" in answer)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,104 @@
+"""FBX, read by assimp's command line: its mesh and materials as OBJ, in metres.
+
+Only its textures are ever replaced, those that are files beside it as well as those inside a binary FBX.
+"""
+
+import re
+import shutil
+import struct
+import subprocess
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from trompe_server.formats.assembly import assemble, safe_name
+from trompe_server.formats.comparison import repainted
+from trompe_server.formats.fbx_tree import MAGIC, Tree, parse_tree
+from trompe_server.formats.pictures import decode, with_alpha_of
+from trompe_server.formats.upload import Upload, base_name
+from trompe_server.formats.wavefront import complete, shrunk
+from trompe_shared.errors import ObjectError
+from trompe_shared.object3d import Object3D, object_from_files
+
+__all__ = ["read", "repaint", "unit"]
+
+CENTIMETRE: Final = 0.01
+"""Metres of FBX's unit, where a file does not scale it."""
+TIMEOUT: Final = 60.0
+_BINARY: Final = re.compile(rb"S\x0f\0\0\0UnitScaleFactorS\x06\0\0\0doubleS\x06\0\0\0NumberS\0\0\0\0D(.{8})", re.DOTALL)
+_TEXT: Final = re.compile(rb'"UnitScaleFactor"(?:[^\n,]*,){4}\s*([0-9]+(?:\.[0-9]*)?(?:[eE][+-]?[0-9]{1,3})?)')
+
+
+def unit(data: bytes) -> float:
+    """Metres of the file's unit of length. Raises ``ObjectError`` for an absurd one."""
+    found = _BINARY.search(data)
+    text = _TEXT.search(data)
+    factor = struct.unpack("<d", found[1])[0] if found else float(text[1]) if text else 1.0
+    if not 1e-6 <= factor <= 1e6:
+        raise ObjectError(f"The FBX says that its unit is {factor:g} cm; set the unit of length and export it again.")
+    return float(factor) * CENTIMETRE
+
+
+def read(upload: Upload, max_texture: int | None = None) -> Object3D:
+    """The object of an FBX and the textures beside it. Raises ``ObjectError``."""
+    return shrunk(_read(upload), max_texture)
+
+
+def repaint(upload: Upload, painted: Object3D) -> Upload:
+    """``upload`` with the textures of ``painted``. Raises ``ObjectError`` for paint that has no place there."""
+    original, tree = _read(upload), _tree(upload.data)
+    changed = repainted(original, painted)
+    beside, inside = upload.flat(), tree.pictures() if tree is not None else {}
+    homeless = sorted(name for name in changed if name not in beside and name not in inside)
+    if homeless:
+        raise ObjectError(f"{homeless} are not textures of the FBX, which has colours in their place; take the GLB.")
+    pngs = {
+        name: with_alpha_of(rgb, decode(beside.get(name, inside.get(name, b"")), name)[1])
+        for name, rgb in changed.items()
+    }
+    files: dict[str, bytes] = {name: png for name, png in pngs.items() if name in beside}
+    if tree is not None and files.keys() != pngs.keys():
+        files[base_name(upload.main)] = tree.with_pictures({**pngs}).to_bytes()
+    return upload.with_flat(files) if files else upload
+
+
+def _tree(data: bytes) -> Tree | None:
+    return parse_tree(data) if data.startswith(MAGIC) else None
+
+
+def _read(upload: Upload) -> Object3D:
+    scale, tree = unit(upload.data), _tree(upload.data)
+    beside = {name: data for name, data in upload.flat().items() if not name.lower().endswith((".obj", ".mtl"))}
+    inside = tree.pictures() if tree is not None else {}
+    bare = upload.data if tree is None or not inside else tree.with_pictures(dict.fromkeys(inside)).to_bytes()
+    obj = object_from_files(complete({**inside, **beside, **_converted(bare)}))
+    parts = [replace(part, vertices=part.vertices * np.float32(scale)) for part in obj.parts]
+    images = {name: obj.files[name] for m in obj.materials.values() for name in (m.albedo, m.normal) if name}
+    return assemble(safe_name(upload.stem), parts, obj.materials, images)
+
+
+def _converted(data: bytes) -> dict[str, bytes]:
+    """The OBJ and MTL that assimp makes of an FBX."""
+    program = shutil.which("assimp")
+    if program is None:
+        raise ObjectError(
+            "FBX files are read by assimp, which is missing: install the package assimp-utils (Debian, Ubuntu), or "
+            "export the model as glTF."
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        source, made = Path(folder, "in.fbx"), Path(folder, "out.obj")
+        source.write_bytes(data)
+        command = [program, "export", str(source), str(made), "--triangulate"]
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT, check=False
+            )
+        except subprocess.TimeoutExpired as error:
+            raise ObjectError(f"assimp took more than {TIMEOUT:g} s to read the FBX; simplify the model.") from error
+        if not made.exists():
+            reason = next((line for line in reversed(done.stdout.splitlines()) if "ERROR" in line), "no reason given")
+            raise ObjectError(f"assimp cannot read the FBX ({reason.strip()[:200]}). Export the model as glTF.")
+        return {path.name: path.read_bytes() for path in (made, made.with_suffix(".mtl")) if path.exists()}

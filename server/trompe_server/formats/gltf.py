@@ -1,0 +1,274 @@
+"""glTF and GLB: what a scene shows, as an object.
+
+Each distinct (image, colour factor, treatment of alpha) becomes one albedo texture: materials that look alike share
+their texels, an image that is used with two factors becomes two textures, for an attack would paint them differently.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trompe_server.formats.assembly import assemble, flat_picture, free_name, safe_name
+from trompe_server.formats.gltf_container import Container, at, open_container
+from trompe_server.formats.gltf_schema import Document, Material, TextureInfo
+from trompe_server.formats.gltf_shapes import Matrix, Shape, instances, placed, read_shape
+from trompe_server.formats.pictures import (
+    cutout_alpha,
+    decode,
+    metallic_smoothness,
+    scaled_normals,
+    shrink,
+    tinted,
+    with_alpha_of,
+)
+from trompe_server.formats.unwrap import Unwrapped, bake, unwrap
+from trompe_server.formats.upload import Upload, base_name
+from trompe_shared.errors import ObjectError
+from trompe_shared.object3d import Material as Maps
+from trompe_shared.object3d import Object3D, encode_png
+from trompe_shared.wavefront import Part
+
+__all__ = ["Model", "Slot", "load", "read"]
+
+Key = tuple[int, int]
+"""Numbers of a mesh and of one of its primitives."""
+PLAIN: tuple[float, float] = (0.0, 0.9)
+"""Metallic and roughness of a material without a map, in SAILenv's format."""
+
+
+@dataclass(frozen=True)
+class Slot:
+    """An albedo texture: the image it comes from (``None``: a flat colour), and what is done to it.
+
+    ``factor`` is linear. ``alpha`` is (factor, cutoff) where alpha cuts out. ``unwrapped`` names the material whose
+    primitives get their texture coordinates here.
+    """
+
+    image: int | None
+    factor: tuple[float, float, float]
+    alpha: tuple[float, float] | None
+    unwrapped: int | None = None
+
+
+@dataclass
+class Model:
+    """A glTF file as an object, and what of it came from where."""
+
+    container: Container
+    max_texture: int | None
+    files: dict[str, bytes] = field(default_factory=dict)
+    slots: dict[Slot, str] = field(default_factory=dict)
+    """File name of each slot's texture."""
+    users: dict[Slot, set[int | None]] = field(default_factory=dict)
+    """The glTF materials that are painted with it."""
+    shapes: dict[Key, Shape] = field(default_factory=dict)
+    materials: dict[str, Maps] = field(default_factory=dict)
+    parts: list[Part] = field(default_factory=list)
+    _names: dict[tuple[int | None, bool], str] = field(default_factory=dict)
+    _converted: dict[tuple[object, ...], str] = field(default_factory=dict)
+
+    @property
+    def document(self) -> Document:
+        """The file's JSON."""
+        return self.container.document
+
+    def object(self) -> Object3D:
+        """The object. Raises ``ObjectError``."""
+        return assemble(safe_name(self.container.upload.stem), self.parts, self.materials, self.files)
+
+    def add(self) -> None:
+        """Read all that the scene shows."""
+        standing = list(instances(self.document))
+        for mesh in dict.fromkeys(mesh for mesh, _ in standing):
+            self._read_mesh(mesh)
+        self._unwrap()
+        for shape in self.shapes.values():
+            self._paint(shape)
+        for mesh, matrix in standing:
+            self.parts += [
+                part for key, shape in self.shapes.items() if key[0] == mesh for part in self._place(shape, matrix)
+            ]
+
+    def _read_mesh(self, index: int) -> None:
+        mesh = at(self.document.meshes, index, "mesh")
+        if any(mesh.weights):
+            raise ObjectError("The glTF blends morph targets, which are not read; apply them and export it again.")
+        for number, primitive in enumerate(mesh.primitives):
+            if primitive.mode >= 4:
+                self.shapes[index, number] = read_shape(self.container, primitive)
+
+    def _unwrap(self) -> None:
+        """Give texture coordinates to the shapes that need them, those of one material in one texture."""
+        needy: dict[int | None, list[Key]] = {}
+        for key, shape in self.shapes.items():
+            if _needs_unwrapping(shape, self._material(shape.material)):
+                needy.setdefault(shape.material, []).append(key)
+        for index, keys in needy.items():
+            shapes = [self.shapes[key] for key in keys]
+            cuts, size = unwrap([(shape.vertices, shape.faces) for shape in shapes])
+            self.shapes |= {key: replace(s, cut=cut) for key, s, cut in zip(keys, shapes, cuts, strict=True)}
+            self._add_baked(index, list(zip(shapes, cuts, strict=True)), size)
+
+    def _add_baked(self, index: int | None, pieces: list[tuple[Shape, Unwrapped]], size: tuple[int, int]) -> None:
+        material = self._material(index)
+        factor = np.array(material.pbr.base_color_factor[:3])
+        if any(shape.colours is not None for shape, _ in pieces):
+            picture = bake([(cut, (_colours(shape) * factor)[cut.source]) for shape, cut in pieces], size=size)
+        else:
+            picture = flat_picture(factor.tolist(), size)
+        slot = self._slot(index, unwrapped=True)
+        name = self._new_file(f"{self._material_name(index)}_albedo.png", b"")
+        alpha = None if slot.alpha is None else np.full(size, 255, np.uint8)
+        self.files[name] = _albedo_png(shrink(picture, self.max_texture), alpha, slot)
+        self.slots[slot] = name
+
+    def _material(self, index: int | None) -> Material:
+        return Material() if index is None else at(self.document.materials, index, "material")
+
+    def _slot(self, index: int | None, *, unwrapped: bool) -> Slot:
+        material = self._material(index)
+        red, green, blue, opacity = material.pbr.base_color_factor
+        cutoff = material.alpha_cutoff if material.alpha_mode == "MASK" else 0.5
+        alpha = None if material.alpha_mode == "OPAQUE" else (opacity, cutoff)
+        info = material.pbr.base_color_texture
+        image = None if info is None else self._image_of(info)
+        if unwrapped:
+            return Slot(None, (red, green, blue), alpha, -1 if index is None else index)
+        return Slot(image, (red, green, blue), alpha)
+
+    def _image_of(self, info: TextureInfo) -> int:
+        texture = at(self.document.textures, info.index, "texture")
+        if texture.source is None:
+            raise ObjectError(f"Texture {info.index} of the glTF has no image that is read; use PNG or JPEG.")
+        return texture.source
+
+    def _paint(self, shape: Shape) -> None:
+        """Have the material of ``shape``, with its textures."""
+        slot = self._slot(shape.material, unwrapped=shape.cut is not None)
+        self.users.setdefault(slot, set()).add(shape.material)
+        if slot not in self.slots:
+            self.slots[slot] = self._add_albedo(slot, self._material_name(shape.material))
+        key = shape.material, shape.cut is not None
+        if key not in self._names:
+            wanted = self._material_name(shape.material) + ("_unwrapped" if key[1] else "")
+            self._names[key] = free_name(wanted, self._names.values())
+            material = self._material(shape.material)
+            maps = Maps(self._names[key], self.slots[slot], self._normal(material), self._metallic(material))
+            self.materials[self._names[key]] = maps
+
+    def _material_name(self, index: int | None) -> str:
+        default = "default" if index is None else f"material_{index}"
+        return safe_name(self._material(index).name or default, default=default)
+
+    def _add_albedo(self, slot: Slot, material: str) -> str:
+        if slot.image is None:
+            name = self._new_file(f"{material}_albedo.png", b"")
+            rgb, alpha = flat_picture(slot.factor), None
+        else:
+            data = self.container.image_bytes(slot.image)
+            name = self._new_file(f"{self._image_name(slot.image)}.png", data)
+            rgb, alpha = decode(data, name)
+            if _kept_as_is(slot, data, alpha is not None, shrink(rgb, self.max_texture) is rgb):
+                return name
+        if alpha is None and slot.alpha is not None:
+            alpha = np.full(rgb.shape[:2], 255, np.uint8)
+        small = shrink(rgb if slot.image is None else tinted(rgb, slot.factor), self.max_texture)
+        self.files[name] = _albedo_png(small, alpha, slot)
+        return name
+
+    def _new_file(self, wanted: str, data: bytes) -> str:
+        name = free_name(wanted, self.files)
+        self.files[name] = data
+        return name
+
+    def _image_name(self, index: int) -> str:
+        image = at(self.document.images, index, "image")
+        uri = image.uri if image.uri is not None and not image.uri.startswith("data:") else None
+        return safe_name(image.name or base_name(uri or "").rsplit(".", 1)[0], default=f"image_{index}")
+
+    def _normal(self, material: Material) -> str | None:
+        info = material.normal_texture
+        if info is None:
+            return None
+        image = self._image_of(info)
+        key = ("normal", image, info.scale)
+        if key not in self._converted:
+            data = self.container.image_bytes(image)
+            rgb, _ = decode(data, f"{self._image_name(image)} (a normal map)")
+            small = shrink(scaled_normals(rgb, info.scale), self.max_texture)
+            ending = _ending(data) if small is rgb else None
+            name = self._new_file(f"{self._image_name(image)}.{ending or 'png'}", b"")
+            self.files[name] = data if ending is not None else encode_png(small)
+            self._converted[key] = name
+        return self._converted[key]
+
+    def _metallic(self, material: Material) -> str | None:
+        pbr = material.pbr
+        factors = pbr.metallic_factor, pbr.roughness_factor
+        info = pbr.metallic_roughness_texture
+        image = None if info is None else self._image_of(info)
+        if image is None and factors == PLAIN:
+            return None
+        key = ("metallic", image, *factors)
+        if key not in self._converted:
+            pixels = np.full((1, 1, 3), 255, np.uint8)
+            if image is not None:
+                pixels = shrink(decode(self.container.image_bytes(image), "metallic map")[0], self.max_texture)
+            converted = metallic_smoothness(pixels, metallic=factors[0], roughness=factors[1])
+            flat = f"{safe_name(material.name or 'material')}_metallic"
+            stem = flat if image is None else self._image_name(image)
+            self._converted[key] = self._new_file(f"{stem}.png", encode_png(converted))
+        return self._converted[key]
+
+    def _place(self, shape: Shape, matrix: Matrix) -> tuple[Part, ...]:
+        """The shape where an instance stands; both sides of it where both are seen."""
+        part = placed(shape, matrix, self._names[shape.material, shape.cut is not None])
+        if not self._material(shape.material).double_sided:
+            return (part,)
+        return part, replace(part, normals=-part.normals, faces=np.ascontiguousarray(part.faces[:, ::-1]))
+
+
+def read(upload: Upload, max_texture: int | None = None) -> Object3D:
+    """The object that a .gltf or .glb shows. Raises ``ObjectError``."""
+    return load(upload, max_texture).object()
+
+
+def load(upload: Upload, max_texture: int | None = None) -> Model:
+    """As ``read``, with what came from where."""
+    model = Model(open_container(upload), max_texture)
+    model.add()
+    if not model.parts:
+        raise ObjectError("The glTF's scene shows no triangles; export a scene with a mesh in it.")
+    return model
+
+
+def _colours(shape: Shape) -> NDArray[np.float64]:
+    return np.ones((len(shape.vertices), 3)) if shape.colours is None else shape.colours
+
+
+def _needs_unwrapping(shape: Shape, material: Material) -> bool:
+    if shape.colours is not None and material.maps:
+        raise ObjectError(
+            f"Material {material.name!r} has textures that colours of vertices are to multiply; bake these into its "
+            "base colour texture."
+        )
+    return shape.uvs is None or shape.colours is not None
+
+
+def _ending(data: bytes) -> str | None:
+    """How the name of an image file is to end that everyone can read as it is."""
+    return "png" if data[:4] == b"\x89PNG" else "jpg" if data[:3] == b"\xff\xd8\xff" else None
+
+
+def _kept_as_is(slot: Slot, data: bytes, has_alpha: bool, full_size: bool) -> bool:
+    """Whether an image file can serve as it is."""
+    alpha_fits = not has_alpha if slot.alpha is None else slot.alpha == (1.0, 0.5)
+    return _ending(data) == "png" and full_size and slot.factor == (1.0, 1.0, 1.0) and alpha_fits
+
+
+def _albedo_png(rgb: NDArray[np.uint8], alpha: NDArray[np.uint8] | None, slot: Slot) -> bytes:
+    if slot.alpha is None or alpha is None:
+        return encode_png(rgb)
+    factor, cutoff = slot.alpha
+    return with_alpha_of(rgb, cutout_alpha(alpha, factor=factor, cutoff=cutoff))

@@ -1,0 +1,162 @@
+"""A glTF file opened: its JSON checked against the schema, its buffers found, its accessors and images read."""
+
+import base64
+import binascii
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from trompe_server.formats.gltf_schema import READ_EXTENSIONS, Document
+from trompe_server.formats.upload import Upload
+from trompe_shared.errors import ObjectError
+
+__all__ = ["Container", "at", "open_container", "split_glb"]
+
+MAX_JSON: Final = 32 * 2**20
+GLB_MAGIC: Final = b"glTF"
+JSON_CHUNK: Final = 0x4E4F534A
+BIN_CHUNK: Final = 0x004E4942
+COMPONENTS: Final = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+
+T = TypeVar("T")
+
+
+def at(items: Sequence[T], index: int, what: str) -> T:
+    """``items[index]``. Raises ``ObjectError`` where there is none."""
+    if not 0 <= index < len(items):
+        raise ObjectError(f"The glTF names {what} {index}, and has {len(items)}; export it again.")
+    return items[index]
+
+
+@dataclass(frozen=True)
+class Container:
+    """``text`` is the JSON as it is in the file; ``buffers`` are as long as it says at least."""
+
+    upload: Upload
+    text: bytes
+    document: Document
+    buffers: tuple[bytes, ...]
+    binary: bool
+
+    def view(self, index: int) -> bytes:
+        """Bytes of a buffer view."""
+        view = at(self.document.buffer_views, index, "buffer view")
+        data = at(self.buffers, view.buffer, "buffer")
+        if view.byte_offset + view.byte_length > len(data):
+            raise ObjectError(f"Buffer view {index} of the glTF ends beyond its buffer; export it again.")
+        return data[view.byte_offset : view.byte_offset + view.byte_length]
+
+    def raw(self, index: int) -> NDArray[np.generic]:
+        """Numbers of an accessor as they are stored, (count, components)."""
+        accessor = at(self.document.accessors, index, "accessor")
+        if accessor.sparse is not None:
+            raise ObjectError("The glTF has sparse accessors, which are not read; export it without.")
+        kind, width = np.dtype(COMPONENTS[accessor.component_type]), WIDTHS[accessor.type]
+        if accessor.buffer_view is None:
+            return np.zeros((accessor.count, width), kind)
+        data, size = self.view(accessor.buffer_view), kind.itemsize * width
+        stride = self.document.buffer_views[accessor.buffer_view].byte_stride or size
+        if accessor.byte_offset + stride * (accessor.count - 1) + size > len(data) or stride < size:
+            raise ObjectError(f"Accessor {index} of the glTF reads beyond its buffer view; export it again.")
+        strides = (stride, kind.itemsize)
+        return np.ndarray((accessor.count, width), kind, data, accessor.byte_offset, strides).copy()
+
+    def numbers(self, index: int, width: int) -> NDArray[np.float32]:
+        """An accessor of ``width`` components as float32 (count, width), normalised where it says so."""
+        values, accessor = self.raw(index), self.document.accessors[index]
+        if values.shape[1] != width:
+            raise ObjectError(f"Accessor {index} of the glTF has {values.shape[1]} components, expected {width}.")
+        if not accessor.normalized or accessor.component_type == 5126:
+            return values.astype(np.float32)
+        largest = np.iinfo(values.dtype).max  # type: ignore[type-var]
+        return np.maximum(values.astype(np.float32) / largest, -1.0)
+
+    def image_bytes(self, index: int) -> bytes:
+        """The image file of an image."""
+        image = at(self.document.images, index, "image")
+        if image.buffer_view is not None:
+            return self.view(image.buffer_view)
+        if image.uri is None:
+            raise ObjectError(f"Image {index} of the glTF is nowhere: it has neither a buffer view nor a URI.")
+        return resolve(image.uri, self.upload)
+
+
+def resolve(uri: str, upload: Upload) -> bytes:
+    """Bytes behind a URI: its own data, or a file of the upload. Raises ``ObjectError`` for any other."""
+    if not uri.startswith("data:"):
+        return upload.files[upload.beside(uri)]
+    head, _, data = uri.partition(",")
+    if not head.endswith(";base64"):
+        raise ObjectError("The glTF has a data URI that is not base64; export it again.")
+    try:
+        return base64.b64decode(data, validate=True)
+    except binascii.Error as error:
+        raise ObjectError(f"The glTF has a damaged data URI ({error}); export it again.") from error
+
+
+def split_glb(data: bytes) -> list[tuple[int, bytes]]:
+    """Type and bytes of each chunk. Raises ``ObjectError``."""
+    if len(data) < 20:
+        raise ObjectError("The GLB file ends too early; export it again.")
+    version, length = struct.unpack_from("<II", data, 4)
+    if version != 2:
+        raise ObjectError(f"The GLB file has version {version}; only version 2 is read. Export it as glTF 2.0.")
+    chunks, position = [], 12
+    end = min(length, len(data))
+    while position + 8 <= end:
+        size, kind = struct.unpack_from("<II", data, position)
+        if position + 8 + size > end:
+            raise ObjectError("A chunk of the GLB file ends beyond it; export it again.")
+        chunks.append((kind, data[position + 8 : position + 8 + size]))
+        position += 8 + size
+    if not chunks or chunks[0][0] != JSON_CHUNK:
+        raise ObjectError("The GLB file does not begin with its JSON; export it again.")
+    return chunks
+
+
+def open_container(upload: Upload) -> Container:
+    """Open a .gltf or .glb file. Raises ``ObjectError``."""
+    binary = upload.data[:4] == GLB_MAGIC
+    chunks = split_glb(upload.data) if binary else [(JSON_CHUNK, upload.data)]
+    text = chunks[0][1]
+    document = _document(text)
+    own = next((chunk for kind, chunk in chunks[1:2] if kind == BIN_CHUNK), None)
+    return Container(upload, text, document, _buffers(document, upload, own), binary)
+
+
+def _document(text: bytes) -> Document:
+    if len(text) > MAX_JSON:
+        raise ObjectError(
+            f"The glTF's JSON has {len(text)} bytes; at most {MAX_JSON} are read. Put buffers and images beside it, or "
+            "export it as .glb."
+        )
+    try:
+        document = Document.model_validate_json(text.removeprefix(b"\xef\xbb\xbf"))
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        where = ".".join(map(str, first["loc"])) or "the JSON"
+        raise ObjectError(f"The glTF is not valid at {where}: {first['msg']}.") from error
+    if not document.asset.version.startswith("2."):
+        raise ObjectError(f"The glTF has version {document.asset.version[:20]!r}; export it as glTF 2.0.")
+    unread = [name for name in document.extensions_required if not name.startswith(READ_EXTENSIONS)]
+    unread += [name for name in document.extensions_required if name == "KHR_materials_pbrSpecularGlossiness"]
+    if unread:
+        raise ObjectError(f"The glTF requires {', '.join(unread)[:200]}, not read here; export it without compression.")
+    return document
+
+
+def _buffers(document: Document, upload: Upload, own: bytes | None) -> tuple[bytes, ...]:
+    found = []
+    for index, buffer in enumerate(document.buffers):
+        data = own if buffer.uri is None and index == 0 else resolve(buffer.uri or "", upload)
+        if data is None or len(data) < buffer.byte_length:
+            have = 0 if data is None else len(data)
+            raise ObjectError(f"Buffer {index} of the glTF has {have} bytes and should have {buffer.byte_length}.")
+        found.append(data)
+    return tuple(found)

@@ -1,0 +1,321 @@
+"""A glTF file with new base colour textures, and as much of the rest as can stay as it was, byte for byte.
+
+A texture takes the place of the image it came from, where nothing else is drawn with that image; else it becomes an
+image of its own. A colour factor that the texture has taken in becomes 1. A mesh that had no texture coordinates gets
+those that it was painted with: its vertices are split at seams, its triangles stay.
+"""
+
+import base64
+import copy
+import json
+import struct
+from collections.abc import Iterator
+from typing import Any, Final
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trompe_server.formats.assembly import free_name
+from trompe_server.formats.comparison import repainted
+from trompe_server.formats.gltf import Model, Slot, load
+from trompe_server.formats.gltf_container import BIN_CHUNK, GLB_MAGIC, JSON_CHUNK, Container, split_glb
+from trompe_server.formats.gltf_shapes import Shape
+from trompe_server.formats.pictures import Pixels, decode, with_alpha_of
+from trompe_server.formats.unwrap import Unwrapped
+from trompe_server.formats.upload import Upload
+from trompe_shared.object3d import Object3D
+
+__all__ = ["glb", "repaint"]
+
+Json = dict[str, Any]
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+FLOAT, UNSIGNED_INT = 5126, 5125
+
+
+def repaint(upload: Upload, painted: Object3D) -> Upload:
+    """``upload`` with the textures of ``painted``. Raises ``ObjectError``."""
+    model = load(upload)
+    changed = repainted(model.object(), painted)
+    editor = _Editor(model.container)
+    for slot, name in model.slots.items():
+        if name in changed:
+            _Repainting(model, editor, slot).apply(changed[name])
+    return editor.finish()
+
+
+class _Repainting:
+    """One texture on its way into the file."""
+
+    def __init__(self, model: Model, editor: "_Editor", slot: Slot) -> None:
+        self._model, self._editor, self._slot = model, editor, slot
+        self._materials = [index for index in model.users[slot] if index is not None]
+
+    def apply(self, rgb: Pixels) -> None:
+        image, slot = self._slot.image, self._slot
+        if slot.unwrapped is not None:
+            self._wrap(rgb)
+        elif image is None:
+            self._point_to(self._editor.add_texture(with_alpha_of(rgb, None), {}))
+        else:
+            _, alpha = decode(self._model.container.image_bytes(image), "the image")
+            png = with_alpha_of(rgb, alpha)
+            if self._editor.serves_only(image, self._materials) and self._is_first_of(image):
+                self._editor.replace_image(image, png)
+                self._point_to(None)
+            else:
+                self._point_to(self._editor.add_texture(png, self._texture_entry()))
+
+    def _is_first_of(self, image: int) -> bool:
+        """Whether of the slots that come from one image this is the one that may keep its place."""
+        return next(slot for slot in self._model.slots if slot.image == image) == self._slot
+
+    def _texture_entry(self) -> Json:
+        material = self._editor.document["materials"][self._materials[0]]
+        index = material["pbrMetallicRoughness"]["baseColorTexture"]["index"]
+        return dict(self._editor.document["textures"][index])
+
+    def _point_to(self, texture: int | None) -> None:
+        """Have the slot's materials use ``texture`` (``None``: the one they use), with a factor of 1."""
+        for index in self._materials:
+            self._paint(self._editor.document["materials"][index], texture)
+        if None in self._model.users[self._slot] and texture is not None:
+            fresh = self._editor.add("materials", {})
+            self._paint(self._editor.document["materials"][fresh], texture)
+            for (mesh, primitive), shape in self._model.shapes.items():
+                if shape.material is None and shape.cut is None:
+                    self._editor.document["meshes"][mesh]["primitives"][primitive]["material"] = fresh
+
+    def _paint(self, material: Json, texture: int | None) -> None:
+        pbr = material.setdefault("pbrMetallicRoughness", {})
+        if texture is not None:
+            info = pbr.setdefault("baseColorTexture", self._placement(material))
+            info["index"] = texture
+        if self._slot.factor != (1.0, 1.0, 1.0):
+            pbr["baseColorFactor"] = [1.0, 1.0, 1.0, pbr["baseColorFactor"][3]]
+
+    def _placement(self, material: Json) -> Json:
+        """As the material's other maps are placed."""
+        others = (material.get("normalTexture"), material["pbrMetallicRoughness"].get("metallicRoughnessTexture"))
+        info: Json = next((info for info in others if info is not None), {})
+        return copy.deepcopy({key: info[key] for key in ("texCoord", "extensions") if key in info})
+
+    def _wrap(self, rgb: Pixels) -> None:
+        """A copy of the material, with the texture, for the primitives that got their texture coordinates here."""
+        slot, document = self._slot, self._editor.document
+        own = slot.unwrapped is not None and slot.unwrapped >= 0
+        material = copy.deepcopy(document["materials"][slot.unwrapped]) if own else {}
+        texture = self._editor.add_texture(with_alpha_of(rgb, None), {})
+        self._paint(material, texture)
+        index = self._editor.add("materials", material)
+        wanted = slot.unwrapped if own else None
+        for (mesh, number), shape in self._model.shapes.items():
+            if shape.cut is not None and shape.material == wanted:
+                primitive = document["meshes"][mesh]["primitives"][number]
+                self._editor.cut_open(primitive, shape, shape.cut)
+                primitive["material"] = index
+
+
+class _Editor:
+    """The file's JSON and what belongs to it, being changed."""
+
+    def __init__(self, container: Container) -> None:
+        self._container = container
+        self.document: Json = json.loads(container.text.removeprefix(b"\xef\xbb\xbf"))
+        self._before = copy.deepcopy(self.document)
+        self._binary = bytearray(container.buffers[0]) if self._has_own_chunk() else bytearray()
+        self._files = dict(container.upload.files)
+        self._extra = bytearray()
+        self._serving = _users_of_images(self.document)
+
+    def _has_own_chunk(self) -> bool:
+        buffers = self._container.document.buffers
+        return self._container.binary and bool(buffers) and buffers[0].uri is None
+
+    def add(self, kind: str, entry: Json) -> int:
+        """Append to a list of the document; the number of the new entry."""
+        entries = self.document.setdefault(kind, [])
+        entries.append(entry)
+        return len(entries) - 1
+
+    def serves_only(self, image: int, materials: list[int]) -> bool:
+        """Whether an image is drawn as base colour of these materials, and nothing else uses its bytes."""
+        entry = self._before["images"][image]
+        alike = [other for other in self._before["images"] if _source(other) == _source(entry)]
+        accessors = self._before.get("accessors", [])
+        in_use = "bufferView" in entry and any(a.get("bufferView") == entry["bufferView"] for a in accessors)
+        return len(alike) == 1 and not in_use and self._serving.get(image) == set(materials)
+
+    def replace_image(self, index: int, png: bytes) -> None:
+        """Put a PNG in the place of an image."""
+        entry = self.document["images"][index]
+        uri = entry.get("uri")
+        if uri is None:
+            self._replace_view(entry, png)
+        elif uri.startswith("data:"):
+            entry["uri"] = _data_uri(png, "image/png")
+        else:
+            self._replace_file(entry, uri, png)
+        if entry.get("mimeType", "image/png") != "image/png":
+            entry["mimeType"] = "image/png"
+
+    def _replace_file(self, entry: Json, uri: str, png: bytes) -> None:
+        path = self._container.upload.beside(uri)
+        if not path.lower().endswith(".png"):
+            del self._files[path]
+            folder, _, _ = uri.rpartition("/")
+            path = free_name(path.rsplit(".", 1)[0] + ".png", self._files)
+            entry["uri"] = "/".join(part for part in (folder, quote(path.rsplit("/", 1)[-1])) if part)
+        self._files[path] = png
+
+    def _replace_view(self, entry: Json, png: bytes) -> None:
+        """In the GLB's own chunk: cut the old bytes out, and have what lies behind them move up or down."""
+        views = self.document["bufferViews"]
+        view = views[entry["bufferView"]]
+        start = view.get("byteOffset", 0)
+        end = start + view["byteLength"]
+        others = [other for other in views if other is not view and other["buffer"] == view["buffer"]]
+        overlaps = any(
+            o.get("byteOffset", 0) < end and o.get("byteOffset", 0) + o["byteLength"] > start for o in others
+        )
+        if view["buffer"] != 0 or not self._has_own_chunk() or overlaps:
+            entry["bufferView"] = self._add_view(png)
+            return
+        padding = (end - start - len(png)) % 4
+        shift = len(png) + padding - (end - start)
+        self._binary[start:end] = png + bytes(padding)
+        view["byteLength"] = len(png)
+        for other in others:
+            if other.get("byteOffset", 0) >= end:
+                other["byteOffset"] += shift
+
+    def add_texture(self, png: bytes, entry: Json) -> int:
+        """A new texture with a new image; ``entry`` is that of the texture it is sampled like."""
+        image: Json = {"mimeType": "image/png"}
+        if self._container.binary:
+            image["bufferView"] = self._add_view(png)
+        else:
+            image["uri"] = _data_uri(png, "image/png")
+        kept = {key: value for key, value in entry.items() if key == "sampler"}
+        return self.add("textures", kept | {"source": self.add("images", image)})
+
+    def cut_open(self, primitive: Json, shape: Shape, cut: Unwrapped) -> None:
+        """Split a primitive's vertices at the seams, and give it the texture coordinates it was painted with."""
+        attributes = {k: v for k, v in primitive["attributes"].items() if k not in {"TEXCOORD_0", "COLOR_0"}}
+        primitive["attributes"] = {name: self._gather(index, cut.source) for name, index in attributes.items()}
+        if "targets" in primitive:
+            primitive["targets"] = [
+                {name: self._gather(index, cut.source) for name, index in target.items()}
+                for target in primitive["targets"]
+            ]
+        uvs = np.stack([cut.uvs[:, 0], 1 - cut.uvs[:, 1]], axis=1).astype("<f4")
+        primitive["attributes"]["TEXCOORD_0"] = self._add_accessor(uvs, {"componentType": FLOAT, "type": "VEC2"})
+        corners = cut.faces.reshape(-1, 1).astype("<u4")
+        kind = {"componentType": UNSIGNED_INT, "type": "SCALAR"}
+        primitive["indices"] = self._add_accessor(corners, kind, target=ELEMENT_ARRAY_BUFFER)
+        primitive["mode"] = 4
+
+    def _gather(self, index: int, source: NDArray[np.int64]) -> int:
+        accessor = self.document["accessors"][index]
+        values = self._container.raw(index)[source]
+        kept = {k: v for k, v in accessor.items() if k in {"componentType", "type", "normalized", "name"}}
+        if "min" in accessor:
+            kept |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        return self._add_accessor(values, kept)
+
+    def _add_accessor(self, values: NDArray[np.generic], entry: Json, *, target: int = ARRAY_BUFFER) -> int:
+        row = values.dtype.itemsize * values.shape[1]
+        stride = row + -row % 4 if target == ARRAY_BUFFER else row
+        rows = np.zeros((len(values), stride), np.uint8)
+        rows[:, :row] = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), row)
+        view = {"target": target} | ({"byteStride": stride} if stride != row else {})
+        return self.add("accessors", entry | {"bufferView": self._add_view(rows.tobytes(), view), "count": len(values)})
+
+    def _add_view(self, data: bytes, entry: Json | None = None) -> int:
+        """A buffer view of new bytes: in the GLB's own chunk, or in a new buffer."""
+        if self._container.binary and not self.document.get("buffers"):
+            self.document["buffers"] = [{"byteLength": 0}]
+        own = self._container.binary and "uri" not in self.document["buffers"][0]
+        where = self._binary if own else self._extra
+        where += bytes(-len(where) % 4)
+        place = {"buffer": 0 if own else len(self._before.get("buffers", [])), "byteOffset": len(where)}
+        where += data
+        return self.add("bufferViews", place | {"byteLength": len(data)} | (entry or {}))
+
+    def finish(self) -> Upload:
+        """The changed upload; what did not change is what it was."""
+        upload = self._container.upload
+        if self._extra:
+            self.add("buffers", {"byteLength": len(self._extra), "uri": _data_uri(self._extra, _BYTES)})
+        if self._binary:
+            self.document["buffers"][0]["byteLength"] = len(self._binary)
+        if self.document == self._before and self._files == upload.files:
+            return upload
+        text = self._container.text if self.document == self._before else _dumped(self.document, self._container.text)
+        main = self._packed(text) if self._container.binary else text
+        return Upload(upload.main, self._files | {upload.main: main}, upload.packed)
+
+    def _packed(self, text: bytes) -> bytes:
+        kept = split_glb(self._container.upload.data)[1:]
+        if kept and kept[0][0] == BIN_CHUNK:
+            kept = kept[1:]
+        own = [(BIN_CHUNK, bytes(self._binary))] if self._binary else []
+        return glb(text, [*own, *kept])
+
+
+_BYTES: Final = "application/octet-stream"
+
+
+def glb(text: bytes, chunks: list[tuple[int, bytes]]) -> bytes:
+    """A GLB file of its JSON and other chunks."""
+    body = b"".join(_chunk(kind, data) for kind, data in [(JSON_CHUNK, text), *chunks])
+    return GLB_MAGIC + struct.pack("<II", 2, 12 + len(body)) + body
+
+
+def _chunk(kind: int, data: bytes) -> bytes:
+    padded = data + (b" " if kind == JSON_CHUNK else b"\0") * (-len(data) % 4)
+    return struct.pack("<II", len(padded), kind) + padded
+
+
+def _dumped(document: Json, before: bytes) -> bytes:
+    """JSON, on lines where it was on lines before."""
+    if b"\n" in before.strip():
+        return json.dumps(document, indent=2, ensure_ascii=False).encode()
+    return json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode()
+
+
+def _data_uri(data: bytes | bytearray, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def _source(image: Json) -> tuple[object, object]:
+    return image.get("uri"), image.get("bufferView")
+
+
+def _users_of_images(document: Json) -> dict[int, set[int | str]]:
+    """Which materials are drawn with an image as base colour; other uses are named, so that no set of numbers fits."""
+    users: dict[int, set[int | str]] = {}
+    for number, material in enumerate(document.get("materials", [])):
+        for path, index in _texture_uses(material, ""):
+            user = number if path == ".pbrMetallicRoughness.baseColorTexture" else path
+            texture = document["textures"][index] if 0 <= index < len(document.get("textures", [])) else {}
+            for source in _sources(texture):
+                users.setdefault(source, set()).add(user)
+    return users
+
+
+def _texture_uses(entry: object, path: str) -> Iterator[tuple[str, int]]:
+    """Where in a material a texture is used, and which."""
+    if not isinstance(entry, dict):
+        return
+    for key, value in entry.items():
+        if key.endswith("Texture") and isinstance(value, dict) and isinstance(value.get("index"), int):
+            yield f"{path}.{key}", value["index"]
+        yield from _texture_uses(value, f"{path}.{key}")
+
+
+def _sources(texture: Json) -> Iterator[int]:
+    """The images of a texture, those in other encodings among them."""
+    for entry in (texture, *texture.get("extensions", {}).values()):
+        if isinstance(entry, dict) and isinstance(entry.get("source"), int):
+            yield entry["source"]

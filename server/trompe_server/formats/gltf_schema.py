@@ -1,0 +1,194 @@
+"""As much of glTF 2.0's schema as is read: every number in range, every index a non-negative whole number."""
+
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+from pydantic.alias_generators import to_camel
+
+from trompe_shared.wavefront import MAX_FACES
+
+__all__ = ["READ_EXTENSIONS", "Accessor", "Document", "Image", "Material", "Node", "Primitive", "TextureInfo"]
+
+READ_EXTENSIONS: Final = ("KHR_texture_transform", "KHR_mesh_quantization", "KHR_materials_", "KHR_lights_punctual")
+"""Beginnings of the names of extensions that a file may require: read, or about light and finish that is not drawn."""
+
+MAX_NODES: Final = 100_000
+
+Index = Annotated[int, Field(ge=0, lt=2**31)]
+Size = Annotated[int, Field(ge=0, lt=2**40)]
+Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+Pair = tuple[Number, Number]
+Triple = tuple[Number, Number, Number]
+Quadruple = tuple[Number, Number, Number, Number]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(strict=True, frozen=True, alias_generator=to_camel)
+
+
+class Asset(_Part):
+    """What the file says of itself."""
+
+    version: str
+
+
+class Buffer(_Part):
+    """Bytes in the GLB's own chunk, in a data URI or in a file."""
+
+    byte_length: Size
+    uri: str | None = None
+
+
+class BufferView(_Part):
+    """A range of a buffer."""
+
+    buffer: Index
+    byte_offset: Size = 0
+    byte_length: Size
+    byte_stride: Annotated[int, Field(ge=1, le=1024)] | None = None
+
+
+class Accessor(_Part):
+    """Numbers in a buffer view."""
+
+    buffer_view: Index | None = None
+    byte_offset: Size = 0
+    component_type: Literal[5120, 5121, 5122, 5123, 5125, 5126]
+    normalized: bool = False
+    count: Annotated[int, Field(ge=1, le=3 * MAX_FACES)]
+    type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
+    sparse: Any = None
+
+
+class Primitive(_Part):
+    """Triangles of one material."""
+
+    attributes: dict[str, Index]
+    indices: Index | None = None
+    material: Index | None = None
+    mode: Annotated[int, Field(ge=0, le=6)] = 4
+
+
+class Mesh(_Part):
+    """Primitives that go together; ``weights`` blend their morph targets."""
+
+    primitives: Annotated[tuple[Primitive, ...], Field(min_length=1)]
+    weights: tuple[Number, ...] = ()
+
+
+class Node(_Part):
+    """A place: a matrix in column order, or translation, rotation (quaternion x, y, z, w) and scale."""
+
+    mesh: Index | None = None
+    skin: Index | None = None
+    children: tuple[Index, ...] = ()
+    matrix: Annotated[tuple[Number, ...], Field(min_length=16, max_length=16)] | None = None
+    translation: Triple = (0.0, 0.0, 0.0)
+    rotation: Quadruple = (0.0, 0.0, 0.0, 1.0)
+    scale: Triple = (1.0, 1.0, 1.0)
+    weights: tuple[Number, ...] = ()
+
+
+class Scene(_Part):
+    """Roots of a tree of nodes."""
+
+    nodes: tuple[Index, ...] = ()
+
+
+class Image(_Part):
+    """An image file in a buffer view, a data URI or a file."""
+
+    uri: str | None = None
+    buffer_view: Index | None = None
+    mime_type: str | None = None
+    name: str | None = None
+
+
+class Texture(_Part):
+    """An image with the way it is sampled."""
+
+    source: Index | None = None
+    sampler: Index | None = None
+
+
+class Sampler(_Part):
+    """How a texture goes on beyond its edges: 10497 repeated, 33071 clamped, 33648 mirrored."""
+
+    wrap_s: Literal[10497, 33071, 33648] = 10497
+    wrap_t: Literal[10497, 33071, 33648] = 10497
+
+
+class UvTransform(_Part):
+    """KHR_texture_transform. ``rotation`` in radians."""
+
+    offset: Pair = (0.0, 0.0)
+    rotation: Number = 0.0
+    scale: Pair = (1.0, 1.0)
+    tex_coord: Index | None = None
+
+
+class TextureExtensions(_Part):
+    """Extensions of a texture's use."""
+
+    transform: UvTransform | None = Field(default=None, alias="KHR_texture_transform")
+
+
+class TextureInfo(_Part):
+    """The use of a texture; ``scale`` is that of a normal map."""
+
+    index: Index
+    tex_coord: Index = 0
+    scale: Number = 1.0
+    extensions: TextureExtensions = TextureExtensions()
+
+    @property
+    def placement(self) -> tuple[int, UvTransform]:
+        """The set of texture coordinates, and what is done to them."""
+        transform = self.extensions.transform or UvTransform()
+        return (self.tex_coord if transform.tex_coord is None else transform.tex_coord), transform
+
+
+class Pbr(_Part):
+    """Metallic-roughness. ``base_color_factor`` is linear."""
+
+    base_color_factor: tuple[Unit, Unit, Unit, Unit] = (1.0, 1.0, 1.0, 1.0)
+    base_color_texture: TextureInfo | None = None
+    metallic_factor: Unit = 1.0
+    roughness_factor: Unit = 1.0
+    metallic_roughness_texture: TextureInfo | None = None
+
+
+class Material(_Part):
+    """What of a material is drawn."""
+
+    name: str | None = None
+    pbr: Pbr = Field(default=Pbr(), alias="pbrMetallicRoughness")
+    normal_texture: TextureInfo | None = None
+    alpha_mode: Literal["OPAQUE", "MASK", "BLEND"] = "OPAQUE"
+    alpha_cutoff: Annotated[float, Field(ge=0.0, le=1e3)] = 0.5
+    double_sided: bool = False
+
+    @property
+    def maps(self) -> tuple[TextureInfo, ...]:
+        """The textures that are drawn."""
+        all_maps = (self.pbr.base_color_texture, self.normal_texture, self.pbr.metallic_roughness_texture)
+        return tuple(info for info in all_maps if info is not None)
+
+
+class Document(_Part):
+    """A glTF file."""
+
+    asset: Asset
+    extensions_required: tuple[str, ...] = ()
+    scene: Index | None = None
+    scenes: tuple[Scene, ...] = ()
+    nodes: Annotated[tuple[Node, ...], Field(max_length=MAX_NODES)] = ()
+    meshes: tuple[Mesh, ...] = ()
+    accessors: tuple[Accessor, ...] = ()
+    buffer_views: tuple[BufferView, ...] = ()
+    buffers: tuple[Buffer, ...] = ()
+    materials: tuple[Material, ...] = ()
+    textures: tuple[Texture, ...] = ()
+    images: tuple[Image, ...] = ()
+    samplers: tuple[Sampler, ...] = ()

@@ -1,0 +1,233 @@
+"""The meshes of a glTF scene: where their instances stand, and what their primitives consist of."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trompe_server.formats.assembly import check_numbers
+from trompe_server.formats.gltf_container import Container, at
+from trompe_server.formats.gltf_schema import Document, Material, Node, Primitive, UvTransform
+from trompe_server.formats.unwrap import Unwrapped
+from trompe_shared.errors import ObjectError
+from trompe_shared.wavefront import MAX_FACES, Part
+
+__all__ = ["Matrix", "Shape", "instances", "placed", "read_shape"]
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One primitive, as the file has it. ``cut`` is how it was unwrapped.
+
+    uvs: (V, 2), v upwards. colours: (V, 3), linear.
+    """
+
+    material: int | None
+    vertices: NDArray[np.float32]
+    normals: NDArray[np.float32] | None
+    uvs: NDArray[np.float32] | None
+    colours: NDArray[np.float64] | None
+    faces: NDArray[np.int32]
+    cut: Unwrapped | None = None
+
+
+def instances(document: Document) -> Iterator[tuple[int, Matrix]]:
+    """Each mesh of the scene with its place in the world. Raises ``ObjectError`` for what is no tree of nodes."""
+    waiting = [(index, np.eye(4)) for index in reversed(_roots(document))]
+    seen: set[int] = set()
+    triangles, count_of = 0, cache(partial(_triangles, document))
+    while waiting:
+        index, above = waiting.pop()
+        if index in seen:
+            raise ObjectError(f"Node {index} of the glTF hangs on itself or on two others; nodes must form a tree.")
+        seen.add(index)
+        node = at(document.nodes, index, "node")
+        matrix = above @ _local(node)
+        if node.mesh is not None:
+            if node.skin is not None or any(node.weights):
+                raise ObjectError("The glTF bends its meshes by skins or morph targets; apply them, export it again.")
+            triangles += count_of(node.mesh)
+            if triangles > MAX_FACES:
+                raise ObjectError(f"The glTF shows more than {MAX_FACES} triangles; simplify it.")
+            yield node.mesh, matrix
+        waiting += [(child, matrix) for child in reversed(node.children)]
+
+
+def _roots(document: Document) -> Sequence[int]:
+    if document.scenes:
+        return at(document.scenes, document.scene or 0, "scene").nodes
+    children = {child for node in document.nodes for child in node.children}
+    return [index for index in range(len(document.nodes)) if index not in children]
+
+
+def _triangles(document: Document, mesh: int) -> int:
+    """About how many triangles a mesh has, both sides counted where both are seen."""
+    count = 0
+    for primitive in at(document.meshes, mesh, "mesh").primitives:
+        source = primitive.attributes.get("POSITION", 0) if primitive.indices is None else primitive.indices
+        corners = at(document.accessors, source, "accessor").count
+        material = None if primitive.material is None else at(document.materials, primitive.material, "material")
+        sides = 2 if material is not None and material.double_sided else 1
+        count += sides * (corners // 3 if primitive.mode == 4 else corners)
+    return count
+
+
+def _local(node: Node) -> Matrix:
+    """Transform (4, 4) of a node."""
+    if node.matrix is not None:
+        return np.array(node.matrix).reshape(4, 4).T
+    x, y, z, w = np.array(node.rotation) / max(np.linalg.norm(node.rotation), 1e-12)
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * np.array(node.scale)
+    matrix[:3, 3] = node.translation
+    return matrix
+
+
+def read_shape(container: Container, primitive: Primitive) -> Shape:
+    if "POSITION" not in primitive.attributes:
+        raise ObjectError("A mesh of the glTF has no positions; export it again.")
+    vertices = container.numbers(primitive.attributes["POSITION"], 3)
+    check_numbers(vertices, "The glTF")
+    normals = container.numbers(primitive.attributes["NORMAL"], 3) if "NORMAL" in primitive.attributes else None
+    faces = _faces(container, primitive, len(vertices))
+    uvs = _uvs(container, primitive)
+    colours = _vertex_colours(container, primitive)
+    for values, what in ((normals, "normals"), (uvs, "texture coordinates"), (colours, "colours")):
+        if values is not None and len(values) != len(vertices):
+            raise ObjectError(f"A mesh of the glTF has {len(vertices)} positions and {len(values)} {what}.")
+        if values is not None:
+            check_numbers(values, "The glTF")
+    return Shape(primitive.material, vertices, normals, uvs, colours, faces)
+
+
+def _faces(container: Container, primitive: Primitive, count: int) -> NDArray[np.int32]:
+    """Triangles (F, 3) of a list, strip or fan. Raises ``ObjectError`` for indices out of range."""
+    corners: NDArray[np.int64] = np.arange(count)
+    if primitive.indices is not None:
+        raw = container.raw(primitive.indices)
+        if raw.dtype.kind != "u" or raw.shape[1] != 1:
+            raise ObjectError("A mesh of the glTF has indices that are no whole numbers; export it again.")
+        corners = raw[:, 0].astype(np.int64)
+    if corners.max(initial=0) >= count:
+        raise ObjectError(f"A mesh of the glTF names vertex {corners.max()} and has {count}; export it again.")
+    if primitive.mode == 4:
+        faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
+    elif primitive.mode == 5:
+        faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+        faces[1::2] = faces[1::2, [1, 0, 2]]
+    else:
+        faces = np.stack([np.full(max(len(corners) - 2, 0), corners[0]), corners[1:-1], corners[2:]], axis=1)
+    if not len(faces):
+        raise ObjectError("A mesh of the glTF has fewer than three corners; export it again.")
+    return faces.astype(np.int32)
+
+
+def _uvs(container: Container, primitive: Primitive) -> NDArray[np.float32] | None:
+    """Texture coordinates (V, 2), v upwards, that the material's maps are drawn with; ``None`` where there are none."""
+    document = container.document
+    material = Material() if primitive.material is None else at(document.materials, primitive.material, "material")
+    if not material.maps:
+        which, transform = 0, UvTransform()
+    else:
+        which, transform = material.maps[0].placement
+        if any(info.placement != material.maps[0].placement for info in material.maps):
+            raise ObjectError(
+                f"Material {material.name or primitive.material!r} places its maps differently (texCoord or "
+                "KHR_texture_transform); bake them to one set of texture coordinates."
+            )
+    if f"TEXCOORD_{which}" not in primitive.attributes:
+        if material.maps:
+            raise ObjectError(
+                f"Material {material.name or primitive.material!r} has textures, and a mesh with it has no "
+                f"TEXCOORD_{which}; unwrap it in a modelling program."
+            )
+        return None
+    uvs = _moved(container.numbers(primitive.attributes[f"TEXCOORD_{which}"], 2), transform)
+    _check_wrapping(document, material, uvs)
+    return np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1)
+
+
+def _moved(uvs: NDArray[np.float32], transform: UvTransform) -> NDArray[np.float32]:
+    if (transform.offset, transform.rotation, transform.scale) == ((0.0, 0.0), 0.0, (1.0, 1.0)):
+        return uvs
+    cosine, sine = np.cos(transform.rotation), np.sin(transform.rotation)
+    turn = np.array([[cosine, sine], [-sine, cosine]]) * np.array(transform.scale)
+    return np.asarray(uvs @ turn.T + transform.offset, np.float32)
+
+
+def _check_wrapping(document: Document, material: Material, uvs: NDArray[np.float32]) -> None:
+    """Objects' textures repeat; where all texture coordinates are on the texture, any wrapping looks the same."""
+    if uvs.min() >= -1e-3 and uvs.max() <= 1 + 1e-3:
+        return
+    for info in material.maps:
+        texture = at(document.textures, info.index, "texture")
+        if texture.sampler is None:
+            continue
+        sampler = at(document.samplers, texture.sampler, "sampler")
+        if (sampler.wrap_s, sampler.wrap_t) != (10497, 10497):
+            raise ObjectError(
+                f"Material {material.name!r} clamps or mirrors a texture beyond its edges, which is not drawn here; "
+                "use repetition, or texture coordinates within [0, 1]."
+            )
+
+
+def _vertex_colours(container: Container, primitive: Primitive) -> NDArray[np.float64] | None:
+    """Linear colours (V, 3) of vertices; ``None`` where there are none, or all are white."""
+    if "COLOR_0" not in primitive.attributes:
+        return None
+    index = primitive.attributes["COLOR_0"]
+    width = 4 if at(container.document.accessors, index, "accessor").type == "VEC4" else 3
+    colours = container.numbers(index, width)[:, :3].astype(np.float64)
+    return None if (colours > 0.999).all() else np.clip(colours, 0.0, 1.0)
+
+
+def placed(shape: Shape, matrix: Matrix, material: str) -> Part:
+    """A shape that has texture coordinates, its own or its cut's, where an instance of it stands."""
+    shape = _with_uvs(shape)
+    assert shape.uvs is not None
+    moved = shape.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    check_numbers(moved, "The glTF")
+    vertices = moved.astype(np.float32)
+    faces = shape.faces if np.linalg.det(matrix[:3, :3]) >= 0 else np.ascontiguousarray(shape.faces[:, ::-1])
+    if shape.normals is None:
+        return _faceted(material, vertices[faces], shape.uvs[faces])
+    return Part(material, vertices, _transformed(shape.normals, matrix), shape.uvs, faces)
+
+
+def _with_uvs(shape: Shape) -> Shape:
+    """A shape that is unwrapped, cut open."""
+    cut = shape.cut
+    if cut is None:
+        return shape
+    normals = None if shape.normals is None else shape.normals[cut.source]
+    return replace(shape, vertices=shape.vertices[cut.source], normals=normals, uvs=cut.uvs, faces=cut.faces)
+
+
+def _transformed(normals: NDArray[np.float32], matrix: Matrix) -> NDArray[np.float32]:
+    """Unit normals after ``matrix``; cofactors instead of the inverse, for it may be flat."""
+    a, b, c = matrix[:3, :3].T
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    sign = -1.0 if np.linalg.det(matrix[:3, :3]) < 0 else 1.0
+    turned = normals.astype(np.float64) @ (sign * cofactors).T
+    lengths = np.linalg.norm(turned, axis=1, keepdims=True)
+    return np.asarray(turned / np.maximum(lengths, 1e-30), np.float32)
+
+
+def _faceted(material: str, corners: NDArray[np.float32], uvs: NDArray[np.float32]) -> Part:
+    """Triangles (F, 3, 3) with a normal for each face, as glTF wants it where a file gives none."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).astype(np.float64)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    faces = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
+    flat = np.repeat(normals, 3, axis=0).astype(np.float32)
+    return Part(material, corners.reshape(-1, 3), flat, uvs.reshape(-1, 2), faces)

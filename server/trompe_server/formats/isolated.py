@@ -1,0 +1,70 @@
+"""Uploads, read in a process that may fail: out of memory, out of time, or brought down by what it reads."""
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from trompe_server.formats.registry import Exported
+from trompe_server.sandbox import run_limited
+from trompe_shared.errors import ObjectError
+from trompe_shared.object3d import Object3D
+
+__all__ = ["MEMORY", "SECONDS", "Converted", "import_file", "repaint_limited"]
+
+MEMORY: Final = 4 * 2**30
+"""Bytes of address space; 8192 x 8192 texels take 1.3 GiB."""
+SECONDS: Final = 180.0
+"""A million triangles take 20 s of computing, and 2.7 GiB."""
+_MODULE: Final = "trompe_server.formats.convert"
+
+
+@dataclass(frozen=True)
+class Converted:
+    """What came of an upload: SAILenv's zip, which Trompe wrote itself, and what is in it.
+
+    ``format`` names the one it came in. ``textures``: (height, width) by name; ``radius`` in metres.
+    """
+
+    archive: bytes
+    format: str
+    materials: list[str]
+    textures: Mapping[str, tuple[int, int]]
+    triangles: int
+    radius: float
+
+
+def import_file(
+    data: bytes | Path, *, name: str, max_texture: int | None = None, memory: int = MEMORY, seconds: float = SECONDS
+) -> Converted:
+    """As ``read_object`` of bytes or of a file, in a process of its own.
+
+    Raises ``ObjectError``, for one that takes too much as well.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        source, archive = Path(folder, "upload"), Path(folder, "archive.zip")
+        if isinstance(data, Path):
+            source = data
+        else:
+            source.write_bytes(data)
+        arguments = ["read", str(source), name, str(max_texture or 0), str(archive)]
+        answer = _run(arguments, memory=memory, seconds=seconds)
+        textures = {name: (int(size[0]), int(size[1])) for name, size in answer["textures"].items()}
+        return Converted(archive.read_bytes(), **{**answer, "textures": textures})
+
+
+def repaint_limited(
+    data: bytes, painted: Object3D, *, name: str, memory: int = MEMORY, seconds: float = SECONDS
+) -> Exported:
+    """As ``repaint_file``, in a process of its own. Raises ``ObjectError``."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, archive, out = Path(folder, "upload"), Path(folder, "archive.zip"), Path(folder, "out")
+        source.write_bytes(data)
+        archive.write_bytes(painted.to_zip())
+        answer = _run(["repaint", str(source), name, str(archive), str(out)], memory=memory, seconds=seconds)
+        return Exported(out.read_bytes(), str(answer["ending"]))
+
+
+def _run(arguments: list[str], *, memory: int, seconds: float) -> Mapping[str, Any]:
+    return run_limited(_MODULE, arguments, memory=memory, seconds=seconds, failure=ObjectError)

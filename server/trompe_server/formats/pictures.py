@@ -1,0 +1,114 @@
+"""Texture images on their way in: decoded within limits, made smaller, multiplied by a colour, turned into other maps.
+
+Colours are sRGB-encoded uint8 in images and linear in [0, 1] as factors.
+"""
+
+import io
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+from trompe_shared.object3d import IMAGE_FORMATS, decode_rgb, encode_png
+
+__all__ = [
+    "Pixels",
+    "cutout_alpha",
+    "decode",
+    "encode_srgb",
+    "linear_rgb",
+    "metallic_smoothness",
+    "scaled_normals",
+    "shrink",
+    "tinted",
+    "with_alpha_of",
+]
+
+Pixels = NDArray[np.uint8]
+
+_LEVELS: Final = np.arange(256) / 255
+_LINEAR: Final = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4)
+
+
+def linear_rgb(encoded: Pixels) -> NDArray[np.float64]:
+    """Linear values in [0, 1] of sRGB-encoded ones."""
+    return _LINEAR[encoded]
+
+
+def encode_srgb(linear: ArrayLike) -> Pixels:
+    """sRGB-encoded values of linear ones, clipped to [0, 1]; any shape."""
+    values = np.clip(np.asarray(linear, np.float64), 0.0, 1.0)
+    encoded = np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(255 * encoded), np.uint8)
+
+
+def decode(data: bytes, name: str) -> tuple[Pixels, Pixels | None]:
+    """Colours (H, W, 3) and, where the image has one, alpha (H, W). Raises ``ObjectError``."""
+    rgb = decode_rgb(data, name)
+    with Image.open(io.BytesIO(data), formats=IMAGE_FORMATS) as image:
+        if not image.has_transparency_data:
+            return rgb, None
+        return rgb, np.array(image.convert("RGBA").getchannel("A"))
+
+
+def shrink(pixels: Pixels, side: int | None) -> Pixels:
+    """The image with its longer side at most ``side``; channels are filtered one by one, for they may be no colours."""
+    height, width = pixels.shape[:2]
+    if side is None or max(height, width) <= side:
+        return pixels
+    size = max(1, round(width * side / max(height, width))), max(1, round(height * side / max(height, width)))
+    return _resized(pixels, size)
+
+
+def _resized(pixels: Pixels, size: tuple[int, int]) -> Pixels:
+    channels = pixels[..., None] if pixels.ndim == 2 else pixels
+    filtered = [
+        np.array(Image.fromarray(np.ascontiguousarray(channels[..., k])).resize(size, Image.Resampling.LANCZOS))
+        for k in range(channels.shape[2])
+    ]
+    return filtered[0] if pixels.ndim == 2 else np.stack(filtered, axis=-1)
+
+
+def tinted(rgb: Pixels, factor: Sequence[float]) -> Pixels:
+    """``rgb`` multiplied by a linear ``factor``."""
+    if all(value == 1.0 for value in factor):
+        return rgb
+    return np.stack([encode_srgb(_LINEAR * factor[k])[rgb[..., k]] for k in range(3)], axis=-1)
+
+
+def cutout_alpha(alpha: Pixels, *, factor: float, cutoff: float) -> Pixels:
+    """Alpha that is one half where ``alpha * factor`` is ``cutoff``, which is where SAILenv's renderers cut.
+
+    Values in between are scaled, not thresholded, so that the edge is filtered as it was.
+    """
+    scale = factor * 0.5 / max(cutoff, 1e-3)
+    table = np.asarray(np.rint(np.minimum(np.arange(256) * scale, 255)), np.uint8)
+    return table[alpha]
+
+
+def metallic_smoothness(pixels: Pixels, *, metallic: float, roughness: float) -> Pixels:
+    """Unity's map (H, W, 4), red metallic and alpha smoothness, from glTF's: green roughness, blue metallic."""
+    metal = np.rint(pixels[..., 2] * metallic).astype(np.uint8)
+    smooth = 255 - np.rint(pixels[..., 1] * roughness).astype(np.uint8)
+    return np.stack([metal, metal, metal, smooth], axis=-1)
+
+
+def scaled_normals(pixels: Pixels, scale: float) -> Pixels:
+    """A normal map whose slopes are ``scale`` times those of ``pixels``."""
+    if scale == 1.0:
+        return pixels
+    vectors = pixels.astype(np.float32) / 127.5 - 1
+    vectors[..., :2] *= scale
+    lengths = np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-6)
+    return np.asarray(np.rint((vectors / lengths + 1) * 127.5), np.uint8)
+
+
+def with_alpha_of(rgb: Pixels, alpha: Pixels | None) -> bytes:
+    """PNG bytes of ``rgb`` with ``alpha`` (H, W), brought to its size where it is another."""
+    if alpha is None:
+        return encode_png(np.ascontiguousarray(rgb))
+    size = (rgb.shape[1], rgb.shape[0])
+    fitted = alpha if alpha.shape == rgb.shape[:2] else _resized(alpha, size)
+    return encode_png(np.dstack([rgb, fitted]))

@@ -1,0 +1,114 @@
+"""The formats, how a file's is recognised, and the two things that can be done with any: read it, and repaint it."""
+
+import posixpath
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from trompe_server.formats import fbx, gltf, gltf_repaint, ply, stl, wavefront
+from trompe_server.formats.upload import Upload
+from trompe_shared.errors import ObjectError
+from trompe_shared.object3d import MAX_ARCHIVE_BYTES, Object3D, unpack
+
+__all__ = ["FORMATS", "Exported", "Format", "Imported", "read_object", "repaint_file"]
+
+
+@dataclass(frozen=True)
+class Format:
+    """``endings`` of the mesh file. ``read`` takes the longest side of a texture, too; both raise ``ObjectError``."""
+
+    name: str
+    endings: tuple[str, ...]
+    read: Callable[[Upload, int | None], Object3D]
+    repaint: Callable[[Upload, Object3D], Upload]
+
+
+FORMATS: Final = (
+    Format("obj", (".obj",), wavefront.read, wavefront.repaint),
+    Format("gltf", (".gltf", ".glb"), gltf.read, gltf_repaint.repaint),
+    Format("fbx", (".fbx",), fbx.read, fbx.repaint),
+    Format("ply", (".ply",), ply.read, ply.repaint),
+    Format("stl", (".stl",), stl.read, stl.repaint),
+)
+"""Where an archive holds meshes of several formats, the first of these is meant; others are beside it."""
+
+_BEGINNINGS: Final = (
+    (b"glTF", "gltf"),
+    (b"{", "gltf"),
+    (b"Kaydara FBX Binary", "fbx"),
+    (b"; FBX", "fbx"),
+    (b"ply\n", "ply"),
+    (b"ply\r", "ply"),
+)
+_ENDING: Final = {"gltf": ".glb", "fbx": ".fbx", "ply": ".ply", "stl": ".stl", "obj": ".obj"}
+
+
+@dataclass(frozen=True)
+class Imported:
+    """An object, and the name of the format that it came in (``sailenv``: an OBJ with a mat_def)."""
+
+    obj: Object3D
+    format: str
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Bytes of a file, and the ending of its name."""
+
+    data: bytes
+    ending: str
+
+
+def read_object(data: bytes, *, name: str, max_texture: int | None = None) -> Imported:
+    """The object in the bytes of a model file or of a zip; ``name`` is the file's name.
+
+    ``max_texture`` is the longest side of a texture; larger ones are made smaller. Raises ``ObjectError``.
+    """
+    upload, found = _opened(data, name)
+    sailenv = found.name == "obj" and any(path.endswith("_mat_def.json") for path in upload.files)
+    return Imported(found.read(upload, max_texture), "sailenv" if sailenv else found.name)
+
+
+def repaint_file(data: bytes, painted: Object3D, *, name: str) -> Exported:
+    """The same model file, or zip, with the textures of ``painted``, which came of it. Raises ``ObjectError``."""
+    upload, found = _opened(data, name)
+    changed = found.repaint(upload, painted)
+    out = data if changed == upload else changed.to_bytes()
+    return Exported(out, ".zip" if out[:2] == b"PK" else posixpath.splitext(changed.main)[1].lower())
+
+
+def _opened(data: bytes, name: str) -> tuple[Upload, Format]:
+    if len(data) > MAX_ARCHIVE_BYTES:
+        raise ObjectError(f"The file has more than {MAX_ARCHIVE_BYTES >> 20} MiB.")
+    if data[:2] == b"PK":
+        return _in_archive(unpack(data))
+    found = _recognised(data, name)
+    main = name if name.lower().endswith(found.endings) else f"{name or 'object'}{_ENDING[found.name]}"
+    main = main.replace("\\", "/").rsplit("/", 1)[-1]
+    return Upload(main, {main: data}, packed=False), found
+
+
+def _recognised(data: bytes, name: str) -> Format:
+    by_name = {format.name: format for format in FORMATS}
+    head = data[:64].removeprefix(b"\xef\xbb\xbf").lstrip() if data[:4] != b"ply\n" else data
+    for beginning, format in _BEGINNINGS:
+        if head.startswith(beginning):
+            return by_name[format]
+    if stl.looks_binary(data) or head.startswith(b"solid"):
+        return by_name["stl"]
+    if name.lower().endswith(".obj"):
+        return by_name["obj"]
+    raise ObjectError(
+        f"{name!r} is no model that is read here. Send a zip of an OBJ with its materials and textures, glTF or "
+        "GLB, FBX, PLY or STL."
+    )
+
+
+def _in_archive(files: Mapping[str, bytes]) -> tuple[Upload, Format]:
+    for format in FORMATS:
+        meshes = sorted(path for path in files if path.lower().endswith(format.endings))
+        if len(meshes) > 1:
+            raise ObjectError(f"The archive holds several models, {meshes[:8]}; send them one by one.")
+        if meshes:
+            return Upload(meshes[0], files, packed=True), format
+    raise ObjectError(f"The archive holds no model, only {sorted(files)[:8]}; zip an .obj, .gltf, .glb, .fbx or .ply.")

@@ -1,0 +1,64 @@
+"""An uploaded model: the files it consists of, and the one among them that holds the mesh."""
+
+import posixpath
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from urllib.parse import unquote
+
+from trompe_shared.errors import ObjectError
+from trompe_shared.object3d import pack_zip
+
+__all__ = ["Upload", "base_name"]
+
+
+@dataclass(frozen=True)
+class Upload:
+    """``files`` by path; ``main`` is the path of the mesh. ``packed``: they came, and are to go, as a zip."""
+
+    main: str
+    files: Mapping[str, bytes]
+    packed: bool
+
+    @property
+    def data(self) -> bytes:
+        """The bytes of the mesh file."""
+        return self.files[self.main]
+
+    @property
+    def stem(self) -> str:
+        """The mesh file's name without folder and ending."""
+        return base_name(self.main).rsplit(".", 1)[0] or "object"
+
+    def beside(self, uri: str) -> str:
+        """The path of a file that the mesh file names by a relative URI. Raises ``ObjectError`` where it leads away."""
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(self.main), unquote(uri).replace("\\", "/")))
+        if ":" in uri or path.startswith(("/", "..")):
+            raise ObjectError(
+                f"{self.main!r} names {uri[:80]!r}; only files below its own folder are read. Put the file there."
+            )
+        if path not in self.files:
+            raise ObjectError(f"{self.main!r} names {uri[:80]!r}, which is not there; zip it together with its files.")
+        return path
+
+    def flat(self) -> dict[str, bytes]:
+        """The files by name without folders. Raises ``ObjectError`` where two have the same."""
+        names = {base_name(path): data for path, data in self.files.items()}
+        if len(names) < len(self.files):
+            raise ObjectError("Two files in different folders have the same name; rename one of them.")
+        return names
+
+    def with_flat(self, files: Mapping[str, bytes]) -> "Upload":
+        """The same upload with files replaced, by name without folders; new ones go where the mesh is."""
+        places = {base_name(path): path for path in self.files}
+        folder = posixpath.dirname(self.main)
+        new = {places.get(name, posixpath.join(folder, name)): data for name, data in files.items()}
+        return replace(self, files={**self.files, **new})
+
+    def to_bytes(self) -> bytes:
+        """What to send back: the mesh file where it came alone and needs no other, else a zip."""
+        return self.data if not self.packed and len(self.files) == 1 else pack_zip(self.files)
+
+
+def base_name(path: str) -> str:
+    """The file name at the end of a path, whichever way its slashes lean."""
+    return path.replace("\\", "/").rsplit("/", 1)[-1]
