@@ -1,0 +1,222 @@
+"""Running an experiment: submit what is missing, follow it, keep what comes out.
+
+In the folder of an experiment, ``jobs/KEY/`` holds what came of one job (``job.json``, ``result.json``, artifacts);
+``results.csv`` and ``predictions.csv`` are made from all of them, anew with every job that ends.
+"""
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Protocol
+
+from pydantic import BaseModel
+
+from trompe_client._errors import APIError
+from trompe_client.experiments.plan import Plan, Row
+from trompe_client.experiments.service import Service
+from trompe_shared.api import Job, JobState, Result
+from trompe_shared.experiment_table import (
+    PREDICTIONS,
+    RESULTS,
+    PredictionRow,
+    ResultRow,
+    prediction_rows,
+    write_table,
+)
+
+__all__ = ["Finished", "Outcome", "Show", "run_experiment"]
+
+PAUSE: Final = 1.0
+"""Seconds between two looks at the jobs."""
+LOOK_AT: Final = 12
+"""Jobs that are looked at each time: the first of those that wait, since workers take them in this order."""
+REFUSED: Final = "refused"
+"""State of a row that the server did not take."""
+TO_RETRY: Final = {JobState.failed.value, JobState.cancelled.value, REFUSED}
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What came of one job. ``result`` is ``None`` where it came to none; ``error`` says why."""
+
+    state: str
+    job: str
+    error: str = ""
+    result: Result | None = None
+    predictions: tuple[PredictionRow, ...] = ()
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no result though there should be."""
+        return self.state in TO_RETRY
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of an experiment: all its rows, and those among them that failed."""
+
+    rows: tuple[ResultRow, ...]
+
+    @property
+    def failed(self) -> tuple[ResultRow, ...]:
+        """Rows without a result though they should have one; n.a. is a result."""
+        return tuple(row for row in self.rows if row.state in TO_RETRY)
+
+
+class Show(Protocol):
+    """Where progress is shown."""
+
+    def begin(self, *, total: int, done: int) -> None:
+        """``total`` jobs in all, ``done`` of them before this run."""
+        ...
+
+    def look(self, row: Row, job: Job) -> None:
+        """A job, as it stands."""
+        ...
+
+    def end(self, row: Row, finished: Finished) -> None:
+        """A job is done."""
+        ...
+
+
+def run_experiment(plan: Plan, service: Service, folder: Path, *, show: Show, retry_failed: bool = False) -> Outcome:
+    """Run all jobs of ``plan`` that ``folder`` has no result of yet, and write the tables.
+
+    A job that failed before is left so, or submitted anew with ``retry_failed``. May be stopped at any time and called
+    again. Raises ``ServerUnreachable`` when the server goes away.
+    """
+    jobs, collected = plan.jobs(), _Collected(folder)
+    known = {key: found for key in jobs if (found := collected.load(key)) is not None}
+    missing = [row for key, row in jobs.items() if key not in known or (retry_failed and known[key].failed)]
+    show.begin(total=len(jobs), done=len(jobs) - len(missing))
+    rows = write_tables(plan, known, folder)
+    for row, finished in _follow(missing, known, service, plan, show):
+        known[row.key] = collected.save(row.key, finished)
+        rows = write_tables(plan, known, folder)
+        show.end(row, finished.outcome)
+    return Outcome(rows)
+
+
+@dataclass(frozen=True)
+class _Fetched:
+    """A finished job with the files that are to be kept, by name."""
+
+    outcome: Finished
+    job: Job | None
+    files: Mapping[str, bytes]
+
+
+def _follow(
+    missing: list[Row], known: Mapping[str, Finished], service: Service, plan: Plan, show: Show
+) -> Iterator[tuple[Row, _Fetched]]:
+    """Submit and watch; each row as it is done."""
+    ids: dict[str, str] = {}
+    waiting: dict[str, tuple[Row, Job]] = {}
+    for row in missing:
+        try:
+            for name, file in row.uploads.items():
+                if name not in ids:
+                    ids[name] = service.store(file)
+            waiting[row.key] = row, service.submit(row.stored(ids), _submission_key(row, known.get(row.key)))
+        except APIError as error:
+            yield row, _Fetched(Finished(REFUSED, "", str(error)), None, {})
+    while waiting:
+        for key in list(waiting)[:LOOK_AT]:
+            row, before = waiting[key]
+            job = service.job(before.id)
+            show.look(row, job)
+            if job.state.final:
+                del waiting[key]
+                yield row, _fetch(row, job, service, plan.experiment.artifacts)
+        if waiting:
+            time.sleep(PAUSE)
+
+
+def _submission_key(row: Row, before: Finished | None) -> str:
+    """The idempotency key: another one after each job that failed."""
+    return row.key if before is None or not before.job else f"{row.key}-after-{before.job[:16]}"
+
+
+def _fetch(row: Row, job: Job, service: Service, artifacts: list[str]) -> _Fetched:
+    """The result and the files of a job that is done."""
+    if job.state not in {JobState.succeeded, JobState.not_applicable}:
+        said = job.error or f"the job was {job.state.value}"
+        return _Fetched(Finished(job.state.value, job.id, said), job, {})
+    result = service.result(job.id)
+    files = {name: data for name in artifacts if (data := service.artifact(job.id, name)) is not None}
+    predictions = prediction_rows(row.key, result, service.classes(result.spec.classifier))
+    return _Fetched(Finished(job.state.value, job.id, job.note or "", result, tuple(predictions)), job, files)
+
+
+class _Collected:
+    """The folder ``jobs``."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / "jobs"
+
+    def load(self, key: str) -> Finished | None:
+        """What came of a job, if it is there."""
+        folder = self._folder / key
+        try:
+            kept = _Kept.model_validate_json((folder / "job.json").read_bytes())
+            result = Result.model_validate_json((folder / "result.json").read_bytes()) if kept.has_result else None
+        except (FileNotFoundError, ValueError):  # not there, or of another version: the job is asked for again
+            return None
+        return Finished(kept.state, kept.job, kept.error, result, tuple(kept.predictions))
+
+    def save(self, key: str, fetched: _Fetched) -> Finished:
+        """Keep what came of a job; ``job.json`` is last, so that the folder counts when all of it is there."""
+        folder, outcome = self._folder / key, fetched.outcome
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in fetched.files.items():
+            path = folder / Path(name).name
+            path.write_bytes(data)
+        if outcome.result is not None:
+            (folder / "result.json").write_text(outcome.result.model_dump_json(), "utf-8")
+        kept = _Kept(
+            state=outcome.state,
+            job=outcome.job,
+            error=outcome.error,
+            has_result=outcome.result is not None,
+            predictions=list(outcome.predictions),
+        )
+        partial = folder / ".job.json.part"
+        partial.write_text(kept.model_dump_json(), "utf-8")
+        partial.replace(folder / "job.json")
+        return outcome
+
+
+class _Kept(BaseModel):
+    """``job.json``."""
+
+    state: str
+    job: str
+    error: str
+    has_result: bool
+    predictions: list[PredictionRow]
+
+
+def write_tables(plan: Plan, known: Mapping[str, Finished], folder: Path) -> tuple[ResultRow, ...]:
+    """Write both tables; gives the rows of the results."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = tuple(_result_row(row, known[row.key]) for row in plan.rows if row.key in known)
+    write_table(folder / RESULTS, rows)
+    predictions = [each for key in plan.jobs() if key in known for each in known[key].predictions]
+    write_table(folder / PREDICTIONS, predictions, PredictionRow)
+    return rows
+
+
+def _result_row(row: Row, finished: Finished) -> ResultRow:
+    if finished.result is not None:
+        return ResultRow.of_result(row.place, finished.result, state=finished.state, job=finished.job)
+    names = {"object": row.object, "classifier": _classifier_name(row)}
+    return ResultRow.of_spec(
+        row.place, row.request.spec(), state=finished.state, job=finished.job, error=finished.error, **names
+    )
+
+
+def _classifier_name(row: Row) -> str:
+    """What people call the classifier: the stem of its file, or its name."""
+    file = row.uploads.get(row.request.classifier)
+    return Path(file.upload.filename).stem if file is not None else row.request.classifier

@@ -1,0 +1,76 @@
+"""How the figures look: colours that the colour-blind can tell apart (Okabe and Ito), SVG and PNG, the same bytes from
+the same data."""
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from pydantic import BaseModel
+
+__all__ = ["BLUE", "GREEN", "GREY", "INK", "MARKERS", "ORANGE", "PALETTE", "RED", "Drawing", "drawing", "stamp_of"]
+
+INK: Final = "#262626"
+GREY: Final = "#999999"
+BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
+PALETTE: Final = (BLUE, ORANGE, GREEN, RED, "#CC79A7", "#56B4E9", "#F0E442", INK)
+MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
+RC: Final[Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": GREY,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E5E5E5",
+    "axes.axisbelow": True,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+    "svg.hashsalt": "trompe",
+    "svg.fonttype": "path",
+}
+
+
+class Drawing:
+    """A figure with its panels, ``axes`` (rows, columns)."""
+
+    def __init__(self, figure: Figure, axes: Any) -> None:
+        self.figure, self.axes = figure, axes
+
+    @property
+    def panels(self) -> list[Axes]:
+        """All panels, row by row."""
+        return list(self.axes.flat)
+
+    def save(self, folder: Path, name: str, *, stamp: str) -> list[Path]:
+        """Write ``name``.svg and ``name``.png; ``stamp``, in their metadata, names the data. Gives their paths."""
+        folder.mkdir(parents=True, exist_ok=True)
+        svg, png = folder / f"{name}.svg", folder / f"{name}.png"
+        with matplotlib.rc_context(RC):
+            self.figure.savefig(svg, metadata={"Date": None, "Creator": "trompe", "Description": stamp})
+            self.figure.savefig(png, dpi=160, metadata={"Software": "trompe", "Description": stamp})
+        return [svg, png]
+
+
+@contextmanager
+def drawing(*, size: tuple[float, float], panels: tuple[int, int] = (1, 1), **options: Any) -> Iterator[Drawing]:
+    """A figure of ``size`` (width, height in inches) with ``panels`` (rows, columns), to be drawn on in the block."""
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots(*panels, squeeze=False, **options)
+        yield Drawing(figure, axes)
+
+
+def stamp_of(rows: Sequence[BaseModel]) -> str:
+    """What names the data of a figure: a hash of its rows, job ids aside."""
+    digest = hashlib.sha256()
+    for row in rows:
+        digest.update(row.model_dump_json(exclude={"job"}).encode())
+    return f"data {digest.hexdigest()[:16]}"
