@@ -1,0 +1,64 @@
+"""Take the pictures of the pages that the documentation shows, of a server that has some finished jobs.
+
+    python scripts/screenshots.py --server http://127.0.0.1:8000 [--out docs/images/pages]
+
+Needs Chromium. The result that is shown is that of the latest job that has succeeded.
+"""
+
+import argparse
+import shutil
+import sys
+from collections.abc import Mapping
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+from playwright.sync_api import Page, sync_playwright
+
+from trompe_client import Client
+
+OUT: Final = Path(__file__).parents[1] / "docs" / "images" / "pages"
+FLAGS: Final = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
+WIDTH, HEIGHT = 1100, 800
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--server", default="http://127.0.0.1:8000")
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args()
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        sys.exit("There is no Chromium here; on Debian: apt-get install chromium")
+    options.out.mkdir(parents=True, exist_ok=True)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        for scheme in ("light", "dark"):
+            page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme=scheme)
+            for name, path in pages(options.server).items():
+                if scheme == "light" or name == "result":
+                    shoot(page, options.server + path, options.out / f"{name}{'-dark' if scheme == 'dark' else ''}.png")
+        browser.close()
+
+
+def pages(server: str) -> Mapping[str, str]:
+    """What is shown, by name."""
+    with Client(server) as client:
+        done = list(islice(client.jobs(state="succeeded"), 2))
+    if len(done) < 2:
+        sys.exit("Two jobs must have succeeded on the server, to show them.")
+    compared = f"/jobs/compare?a={done[0].id}&b={done[1].id}"
+    return {"start": "/", "new": "/jobs/new", "jobs": "/jobs", "result": f"/jobs/{done[0].id}", "compare": compared}
+
+
+def shoot(page: Page, address: str, file: Path) -> None:
+    """One picture, once what it shows has come."""
+    page.goto(address)
+    page.wait_for_timeout(2000)
+    page.screenshot(path=file)
+    print(file)
+
+
+if __name__ == "__main__":
+    main()

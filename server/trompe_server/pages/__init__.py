@@ -1,0 +1,19 @@
+"""The pages: what people see who open the server's address. They only show; whatever people do goes through the API."""
+
+from fastapi import FastAPI
+from starlette.staticfiles import StaticFiles
+
+from trompe_server.pages.errors import HtmlProblems
+from trompe_server.pages.pictures import Pictures
+from trompe_server.pages.routes import router
+from trompe_server.pages.serving import STATIC
+
+__all__ = ["add_pages"]
+
+
+def add_pages(app: FastAPI) -> None:
+    """Serve the pages from ``app``, which serves the API. Problems that a browser meets become pages, too."""
+    app.state.pictures = Pictures()
+    app.include_router(router)
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    app.add_middleware(HtmlProblems)

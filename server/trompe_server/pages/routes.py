@@ -1,0 +1,309 @@
+"""Addresses of the pages."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Form, Query, Request
+from fastapi import Path as PathParam
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from sse_starlette import EventSourceResponse, ServerSentEvent
+
+from trompe_server.access import hash_secret
+from trompe_server.api.jobs import Cursor
+from trompe_server.api.jobs import _labels as filters_of
+from trompe_server.api.services import Services, ServicesDep
+from trompe_server.database import DatabaseDownError
+from trompe_server.errors import NotFoundError
+from trompe_server.pages.chart import Point, chart
+from trompe_server.pages.naming import Names
+from trompe_server.pages.pictures import Kind, ViewSet
+from trompe_server.pages.present import TERMS, JobRow, Shown, differences, present
+from trompe_server.pages.serving import COOKIE, page, render
+from trompe_server.pages.turntable import TURNS, turntable
+from trompe_shared.api import Job, JobState, Result
+from trompe_shared.presets import PRESETS
+from trompe_shared.shipped import shipped_objects
+
+__all__ = ["router"]
+
+router = APIRouter(include_in_schema=False)
+
+GALLERY: Final[Mapping[str, Any]] = json.loads((Path(__file__).parent / "gallery.json").read_bytes())
+"""The shipped demo's result; ``scripts/make_gallery.py`` writes it."""
+
+LATEST: Final = 8
+PAGE: Final = 50
+STREAM_INTERVAL: Final = 1.0
+LASTING: Final = {"Cache-Control": "private, max-age=31536000, immutable"}
+EXPERIMENT: Final = "experiment"
+
+State = Annotated[str, Query(pattern=f"^({'|'.join(JobState)})?$")]
+Label = Annotated[str, Query(max_length=264)]
+
+
+@router.get("/")
+def home(request: Request, services: ServicesDep) -> HTMLResponse:
+    """What Trompe does, and the latest jobs."""
+    return page(request, "home.html", gallery=GALLERY, rows=_rows(services, limit=LATEST)[0])
+
+
+@router.get("/jobs")
+def jobs(
+    request: Request, services: ServicesDep, state: State = "", label: Label = "", cursor: Cursor = None
+) -> HTMLResponse:
+    """The list of jobs."""
+    rows, older = _rows(services, state=state, label=label, cursor=cursor)
+    filters = {"state": state, "label": label}
+    given = {name: value for name, value in filters.items() if value}
+    # Older pages stand still, but for the jobs on them.
+    stream = "/jobs/stream?" + urlencode(given if cursor is None else {"ids": ",".join(row.id for row in rows)})
+    return page(
+        request,
+        "jobs.html",
+        rows=rows,
+        filters=filters,
+        states=[each.value for each in JobState],
+        counts={state.value: n for state, n in services.store.counts().items()},
+        stream=stream,
+        first=cursor is None,
+        newest=f"/jobs?{urlencode(given)}",
+        older=older and f"/jobs?{urlencode({**given, 'cursor': older})}",
+    )
+
+
+@router.get("/jobs/stream")
+def follow_list(
+    services: ServicesDep, state: State = "", label: Label = "", ids: str = "", limit: int = PAGE
+) -> EventSourceResponse:
+    """Rows of the list as they change, newest first, as HTML."""
+
+    def look() -> list[JobRow]:
+        if ids:
+            return [_row(services, job) for each in ids.split(",")[:PAGE] if (job := _found(services, each))]
+        return _rows(services, state=state, label=label, limit=min(max(limit, 1), PAGE))[0]
+
+    return EventSourceResponse(_changes(look), ping=15)
+
+
+@router.get("/jobs/new")
+def new_job(request: Request, services: ServicesDep) -> HTMLResponse:
+    """The form of a new job."""
+    labels = {name: shipped.label for name, shipped in shipped_objects().items()}
+    objects = [
+        {"reference": info.name if info.shipped else info.id, "name": info.name, "label": labels.get(info.name, "")}
+        for info in services.library.objects()
+    ]
+    classifiers = [
+        {"reference": info.name if info.shipped else info.id, "name": info.name, "white_box": info.white_box}
+        for info in services.library.classifiers()
+    ]
+    return page(
+        request,
+        "new.html",
+        objects=objects,
+        classifiers=classifiers,
+        presets={name: {"help": preset.help, "options": dict(preset.options)} for name, preset in PRESETS.items()},
+        turns=TURNS,
+        endings=".zip",
+        formats="A flat zip of an .obj, its .mtl and its textures.",
+    )
+
+
+@router.get("/jobs/turntable/{reference}.png")
+def show_turntable(
+    services: ServicesDep, reference: str, background: str = "white", distance: float | None = None
+) -> Response:
+    """The object from all around in the target renderer: pictures side by side."""
+    return Response(turntable(services, reference, background=background, distance=distance), media_type="image/png")
+
+
+@router.get("/jobs/compare")
+def compare(request: Request, services: ServicesDep, a: str, b: str) -> HTMLResponse:
+    """Two results side by side."""
+    sides, results = [], []
+    for each in (a, b):
+        job = services.store.get(each)
+        result = _result(services, job)
+        if result is None:
+            raise NotFoundError(f"Job {each} is {job.state} and has no result to compare.")
+        row = _row(services, job)
+        results.append(result)
+        sides.append({"job": row, "shown": _shown(services, row, result)})
+    return page(request, "compare.html", sides=sides, lines=differences(*results))
+
+
+@router.get("/jobs/{job}")
+def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
+    """One job: its progress, or its result."""
+    found = services.store.get(job)
+    row, result = _row(services, found), _result(services, found)
+    shown = _shown(services, row, result) if result else None
+    return page(request, "job.html", job=row, shown=shown, terms=TERMS)
+
+
+@router.get("/jobs/{job}/preview.png")
+def preview(services: ServicesDep, job: str) -> Response:
+    """The object as the attack has it now, in surrogate and target; 204 where it has not come so far."""
+    services.store.get(job)
+    try:
+        return Response(services.artifacts(job).read("preview.png"), media_type="image/png")
+    except FileNotFoundError:
+        return Response(status_code=204)
+
+
+@router.get("/jobs/{job}/pictures/{view_set}/{index}/{kind}.png")
+def picture(
+    request: Request,
+    services: ServicesDep,
+    job: str,
+    view_set: ViewSet,
+    index: Annotated[int, PathParam(ge=0)],
+    kind: Kind,
+) -> Response:
+    """One target image of a job that has ended."""
+    services.store.get(job)
+    try:
+        data = request.app.state.pictures.one(services.artifacts(job), view_set, index, kind)
+    except (FileNotFoundError, IndexError, KeyError) as error:
+        raise NotFoundError(f"Job {job} has no picture {view_set} {index} {kind}.") from error
+    return Response(data, media_type="image/png", headers=LASTING)
+
+
+@router.get("/experiments")
+def experiments(request: Request, services: ServicesDep) -> HTMLResponse:
+    """All experiments."""
+    found = [
+        {"name": group.value, "jobs": {state.value: n for state, n in group.counts.items()}, "created": group.created}
+        for group in services.store.groups(EXPERIMENT)
+    ]
+    return page(request, "experiments.html", experiments=found)
+
+
+@router.get("/experiments/{name:path}")
+def show_experiment(request: Request, services: ServicesDep, name: str, cursor: Cursor = None) -> HTMLResponse:
+    """The jobs of an experiment, and their speed against their accuracy."""
+    found = services.store.page(labels={EXPERIMENT: name}, limit=500, cursor=cursor)
+    if not found.jobs:
+        raise NotFoundError(f"There is no experiment {name!r}.")
+    pairs = [(_row(services, job), _result(services, job)) for job in found.jobs]
+    states = [row.state for row, _ in pairs]
+    return page(
+        request,
+        "experiment.html",
+        name=name,
+        counts={state: states.count(state) for state in dict.fromkeys(states)},
+        chart=chart(
+            [point for row, result in pairs if (point := _point(row, result))],
+            measure="A_drop in the target, held-out views",
+        ),
+        columns=["epsilon", "tau", "seed", "steps", "views", "A_drop", "held-out A_drop", "seconds"],
+        lines=[_line(row, result) for row, result in pairs],
+        older=found.next_cursor and f"?{urlencode({'cursor': found.next_cursor})}",
+    )
+
+
+@router.get("/login")
+def login(request: Request, next: str = "/") -> HTMLResponse:
+    """Where a token is asked for."""
+    return page(request, "login.html", next=next, wrong=None)
+
+
+@router.post("/login")
+def sign_in(
+    request: Request,
+    services: ServicesDep,
+    token: Annotated[str, Form(max_length=200)],
+    next: Annotated[str, Form(max_length=2000)] = "/",
+) -> Response:
+    """Keep the token in a cookie that scripts cannot read and other sites cannot use."""
+    known = services.tokens.by_hash().get(hash_secret(token.strip()))
+    if known is None or known.revoked is not None:
+        wrong = "That is no valid token; it begins with trompe_ and was shown once, when it was made."
+        return page(request, "login.html", status=401, next=next, wrong=wrong)
+    own = next.startswith("/") and not next.startswith(("//", "/\\"))
+    answer = RedirectResponse(next if own else "/", status_code=303)
+    secure = request.url.scheme == "https"
+    answer.set_cookie(COOKIE, token.strip(), httponly=True, samesite="strict", secure=secure, max_age=30 * 86400)
+    return answer
+
+
+@router.post("/logout")
+def sign_out() -> Response:
+    """Forget the token."""
+    answer = RedirectResponse("/", status_code=303)
+    answer.delete_cookie(COOKIE, httponly=True, samesite="strict")
+    return answer
+
+
+def _rows(
+    services: Services, *, state: str = "", label: str = "", limit: int = PAGE, cursor: str | None = None
+) -> tuple[list[JobRow], str | None]:
+    found = services.store.page(
+        state=JobState(state) if state else None,
+        labels=filters_of([label]) if label else {},
+        limit=limit,
+        cursor=cursor,
+    )
+    names = Names(services.library)
+    return [names.row(job) for job in found.jobs], found.next_cursor
+
+
+def _row(services: Services, job: Job) -> JobRow:
+    return Names(services.library).row(job)
+
+
+def _found(services: Services, job: str) -> Job | None:
+    try:
+        return services.store.get(job)
+    except NotFoundError:
+        return None
+
+
+async def _changes(look: Any) -> AsyncIterator[ServerSentEvent]:
+    """Rows that are new or changed since the look before, rendered as the page renders them."""
+    known: dict[str, str] = {}
+    while True:
+        try:
+            rows: list[JobRow] = await asyncio.to_thread(look)
+        except DatabaseDownError:
+            rows = []
+        changed = [row for row in rows if known.get(row.id) != row.version]
+        known = known | {row.id: row.version for row in rows}
+        if changed:
+            html = await asyncio.to_thread(render, "_rows.html", rows=changed)
+            yield ServerSentEvent(data=html, event="rows")
+        await asyncio.sleep(STREAM_INTERVAL)
+
+
+def _result(services: Services, job: Job) -> Result | None:
+    if "result.json" not in job.artifacts:
+        return None
+    try:
+        return Result.model_validate_json(services.artifacts(job.id).read("result.json"))
+    except FileNotFoundError:
+        return None
+
+
+def _shown(services: Services, row: JobRow, result: Result) -> Shown:
+    return present(result, row, names=Names(services.library).classes(result.spec.classifier))
+
+
+def _point(row: JobRow, result: Result | None) -> Point | None:
+    judged = result and (result.held_out or result.target)
+    if not result or not judged or judged.a_drop is None:
+        return None
+    return Point(row.id, row.object, max(sum(result.seconds.values()), 0.1), judged.a_drop)
+
+
+def _line(row: JobRow, result: Result | None) -> dict[str, Any]:
+    cells: list[str] = ["–"] * 8
+    if result is not None:
+        drops = [accuracy.a_drop if accuracy else None for accuracy in (result.target, result.held_out)]
+        values = [result.epsilon, result.tau, result.seed, result.steps, result.target.views, *drops]
+        cells = ["–" if value is None else f"{value:.3g}" for value in values]
+        cells.append(f"{sum(result.seconds.values()):.0f}")
+    return {"job": row.id, "object": row.object, "state": row.state, "cells": cells}

@@ -1,0 +1,48 @@
+// A job that runs: its progress as it comes, and its result once it is there.
+import { ask, follow } from "./common.js";
+
+const live = document.getElementById("live");
+
+function show(progress) {
+  const put = (name, text) => { live.querySelector(`[data-field=${name}]`).textContent = text ?? "–"; };
+  live.querySelector("progress").value = progress.fraction;
+  put("phase", progress.phase);
+  put("step", progress.step == null ? null : `${progress.step} of ${progress.steps}`);
+  put("loss", progress.loss?.toFixed(3));
+  put("fooled", progress.fooled == null ? null : `${Math.round(100 * progress.fooled)} %`);
+  put("eta", progress.eta_seconds == null ? null : span(progress.eta_seconds));
+}
+
+const span = (seconds) => (seconds < 90 ? `${Math.round(seconds)} s` : `${Math.round(seconds / 60)} min`);
+
+let shown = null;
+function preview(progress) {
+  const figure = document.getElementById("preview");
+  const chunk = Math.floor((progress.step ?? 0) / 5);
+  if (!chunk || chunk === shown) return;
+  const picture = new Image(448, 224);
+  picture.alt = "The object as it is now, in the surrogate and in the target renderer";
+  picture.onload = () => {
+    figure.querySelector("img").replaceWith(picture);
+    figure.hidden = false;
+  };
+  picture.src = `/jobs/${live.dataset.job}/preview.png?chunk=${chunk}`;
+  shown = chunk;
+}
+
+if (live) {
+  const stop = follow(`/v1/jobs/${live.dataset.job}/events`, "progress", (data) => {
+    const event = JSON.parse(data);
+    show(event.progress);
+    preview(event.progress);
+    if (!["queued", "running"].includes(event.state)) {
+      stop();
+      location.reload();
+    }
+  });
+  // After the server was away a stream can end without its last event: ask now and then.
+  setInterval(async () => {
+    const job = await ask(`/v1/jobs/${live.dataset.job}`).catch(() => null);
+    if (job && !["queued", "running"].includes(job.state)) location.reload();
+  }, 10000);
+}
