@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from trompe_server.access import Right, Token, Tokens
-from trompe_server.commands import _data, _database, _for_people, _settings
+from trompe_server.commands import data_option, database_option, for_people, settings_of
 from trompe_server.settings import Settings
 
 __all__ = ["token"]
@@ -20,7 +20,7 @@ _json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 def _where(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options that say which database is meant."""
-    return _data(_database(command))
+    return data_option(database_option(command))
 
 
 @click.group()
@@ -39,10 +39,10 @@ def token() -> None:
 )
 @_json
 @_where
-@_for_people
+@for_people
 def create(name: str, right: str, as_json: bool, data: Path | None, database: str | None) -> None:
     """Make a token called NAME. Its secret is shown this once and kept nowhere."""
-    with _tokens(_settings(data, database=database)) as tokens:
+    with _tokens(settings_of(data, database=database)) as tokens:
         secret = tokens.create(name, Right(right))
     if as_json:
         click.echo(json.dumps({"name": name, "right": right, "secret": secret}))
@@ -54,10 +54,10 @@ def create(name: str, right: str, as_json: bool, data: Path | None, database: st
 @token.command("list")
 @_json
 @_where
-@_for_people
+@for_people
 def show(as_json: bool, data: Path | None, database: str | None) -> None:
     """List all tokens, also those that were revoked."""
-    with _tokens(_settings(data, database=database)) as tokens:
+    with _tokens(settings_of(data, database=database)) as tokens:
         rows = [_row(each) for each in tokens.all()]
     if as_json:
         click.echo(json.dumps(rows))
@@ -72,10 +72,10 @@ def show(as_json: bool, data: Path | None, database: str | None) -> None:
 @token.command()
 @click.argument("name")
 @_where
-@_for_people
+@for_people
 def revoke(name: str, data: Path | None, database: str | None) -> None:
     """Make the token NAME worthless; servers that run know it a second later."""
-    with _tokens(_settings(data, database=database)) as tokens:
+    with _tokens(settings_of(data, database=database)) as tokens:
         tokens.revoke(name)
     click.echo(f"revoked {name}", err=True)
 

@@ -14,15 +14,25 @@ from trompe_server.log import log_to_stderr
 from trompe_server.settings import Settings
 from trompe_shared.errors import TrompeError
 
-__all__ = ["demo", "doctor", "migrate", "serve", "worker"]
+__all__ = [
+    "data_option",
+    "database_option",
+    "demo",
+    "doctor",
+    "for_people",
+    "migrate",
+    "serve",
+    "settings_of",
+    "worker",
+]
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_data = click.option(
+data_option = click.option(
     "--data", type=click.Path(path_type=Path, file_okay=False), help="Folder of data (or TROMPE_DATA)."
 )
-_database = click.option(
+database_option = click.option(
     "--database",
     metavar="URL",
     help="sqlite:///FILE or postgresql://... (or TROMPE_DATABASE). Default: in the data folder.",
@@ -35,7 +45,7 @@ _store = click.option(
 _device = click.option("--device", metavar="DEVICE", help="cpu, cuda or cuda:1 (or TROMPE_DEVICE). Default: cpu.")
 
 
-def _for_people(command: Callable[P, R]) -> Callable[P, R]:
+def for_people(command: Callable[P, R]) -> Callable[P, R]:
     """Show errors as one sentence instead of a traceback."""
 
     @functools.wraps(command)
@@ -48,7 +58,7 @@ def _for_people(command: Callable[P, R]) -> Callable[P, R]:
     return run
 
 
-def _settings(data: Path | None, **others: object) -> Settings:
+def settings_of(data: Path | None, **others: object) -> Settings:
     """The settings of the environment, and those that were given as options."""
     given = {"data": data and data.absolute(), **others}
     return Settings.model_validate(
@@ -77,21 +87,21 @@ def _announce(line: str) -> None:
     help="Renderer workers, which share each job's images (or TROMPE_RENDERERS). Default: 1.",
 )
 @_device
-@_data
-@_database
+@data_option
+@database_option
 @_store
-@_for_people
+@for_people
 def serve(host: str, port: int, data: Path | None, **options: str | int | None) -> None:
     """Run the service: REST API, its attack workers and renderer workers, one folder of data."""
     from trompe_server.serving import run_service
 
     log_to_stderr()
-    run_service(_settings(data, **options), host=host, port=port, announce=_announce)
+    run_service(settings_of(data, **options), host=host, port=port, announce=_announce)
 
 
 @click.command()
-@_data
-@_database
+@data_option
+@database_option
 @_store
 @click.option(
     "--renderer",
@@ -108,7 +118,7 @@ def serve(host: str, port: int, data: Path | None, **options: str | int | None) 
     help="A name that the DNS resolves to the addresses of all renderer workers, looked up again and again.",
 )
 @_device
-@_for_people
+@for_people
 def worker(data: Path | None, renderers: tuple[str, ...], names: tuple[str, ...], **options: str | None) -> None:
     """Run an attack worker, which takes one job after the other, of any machine that shares database and store."""
     from trompe_server.jobs.renderers import Renderers
@@ -118,19 +128,19 @@ def worker(data: Path | None, renderers: tuple[str, ...], names: tuple[str, ...]
         raise click.UsageError("Say where the renderer workers are: --renderer HOST:PORT or --renderers-dns NAME:PORT.")
     found = Renderers(tuple(_address(each) for each in renderers), tuple(_address(each) for each in names))
     log_to_stderr()
-    run_worker(_settings(data, **options), found, announce=_announce)
+    run_worker(settings_of(data, **options), found, announce=_announce)
 
 
 @click.command()
-@_data
-@_database
-@_for_people
+@data_option
+@database_option
+@for_people
 def migrate(data: Path | None, database: str | None) -> None:
     """Make the database, or bring it up to date: once, before anything works with it."""
     from trompe_server.jobs.worker import prepare_data
 
     log_to_stderr()
-    prepare_data(_settings(data, database=database))
+    prepare_data(settings_of(data, database=database))
     _announce("the database is up to date")
 
 
@@ -152,15 +162,15 @@ def demo(out: Path) -> None:
 
 
 @click.command()
-@_data
-@_database
+@data_option
+@database_option
 @_store
 @_device
 @click.option("--json", "as_json", is_flag=True, help="Answer in JSON.")
 def doctor(data: Path | None, as_json: bool, **options: str | None) -> None:
     """Check that this machine can do the work, and say how to mend what it cannot."""
     findings = []
-    for finding in check_all(_settings(data, **options)):
+    for finding in check_all(settings_of(data, **options)):
         findings.append(finding)
         if not as_json:
             _announce(in_words(finding))
