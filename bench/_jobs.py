@@ -1,5 +1,6 @@
 """Whole jobs on the paper's objects, in this process: what the benches of attacks share."""
 
+import io
 import json
 import os
 import shutil
@@ -40,7 +41,7 @@ class Paper:
         """The paper's protocol for an object: its distance, elevations and background; with ``mixed`` black, white and
         the photographs."""
         row = self.objects[name]
-        stored = self.library.add_object(load_object(self.assets / "objects" / name).to_zip(), name)
+        stored = self.library.add_object(io.BytesIO(load_object(self.assets / "objects" / name).to_zip()), name)
         protocol = {
             "object": stored.id,
             "label": row["imagenet_class"],
@@ -52,7 +53,7 @@ class Paper:
 
     def run(self, spec: JobSpec, target: SailenvTarget) -> Result:
         """One job from beginning to end. It pays for its probes, whatever was found out before."""
-        shutil.rmtree(self.library.calibrations.folder, ignore_errors=True)
+        self.library.calibrations.delete_all()
         shutil.rmtree(self.folder / "job", ignore_errors=True)
         artifacts = LocalArtifacts(self.folder / "job")
         job = open_pipeline(spec, library=self.library, artifacts=artifacts, target=target)

@@ -2,7 +2,7 @@
 
 TROMPE_ASSETS=... python -m bench.attacks --csv docs/bench/attacks.csv
                   python -m bench.attacks --plain --objects all --epsilon 0.05 0.02 --csv docs/bench/attacks_grid.csv
-                  python -m bench.attacks --plain --objects all --pool 240 --steps 30 --held-out 200 --mixed
+                  python -m bench.attacks --plain --objects all --pool 480 --held-out 200 --mixed
 """
 
 import argparse
@@ -70,7 +70,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--plain", action="store_true", help="only the automatic surrogate without saliency")
     parser.add_argument("--classifier", default="mobilenet_v2")
     parser.add_argument("--epsilon", type=float, nargs="+", default=[0.05])
-    parser.add_argument("--steps", type=int, default=20)
+    parser.add_argument("--steps", type=int, default=90)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--pool", type=int, default=0, help="attack so many random views, not the paper's grid")
     parser.add_argument("--held-out", type=int, default=60)

@@ -1,10 +1,11 @@
 """What tests of several packages share: a real renderer worker, and objects made from a few numbers."""
 
 import json
+import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 import numpy as np
@@ -17,6 +18,21 @@ from trompe_shared.shipped import shipped_objects
 
 Surface = tuple[ArrayLike, ArrayLike, NDArray[np.uint8]]
 """Corners (F, 3, 3) in metres, their texture coordinates (F, 3, 2), and the texture (H, W, 3) they are painted with."""
+
+INSTALLABLE = re.compile("install|NOT TESTED")
+"""What the reason says of a test that is skipped for want of something that could be installed."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """With TROMPE_REQUIRE_ALL nothing is skipped that could be run here: it fails, saying what to install."""
+    report = yield
+    if report.skipped and "TROMPE_REQUIRE_ALL" in os.environ and INSTALLABLE.search(str(report.longrepr)):
+        report.outcome = "failed"
+        report.longrepr = f"{report.longrepr} (TROMPE_REQUIRE_ALL is set)"
+    return report
 
 
 def start_worker(*options: str) -> tuple[subprocess.Popen[str], str]:

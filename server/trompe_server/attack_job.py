@@ -18,8 +18,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from trompe_server.artifacts import Folder
 from trompe_server.attack import (
     AttackState,
+    Backgrounds,
     Budget,
     Step,
     TexelMasks,
@@ -34,9 +36,12 @@ from trompe_server.attack import (
 )
 from trompe_server.attack_report import Evidence, public_files, saliency_views
 from trompe_server.calibration_files import calibration_key, pack_calibration, unpack_calibration
+from trompe_server.classifiers.metered import meter_network
+from trompe_server.classifiers.network import NetworkClassifier
 from trompe_server.job_files import JobFiles
 from trompe_server.library import Library
-from trompe_server.pipeline import Artifacts, OnProgress, PhaseReport
+from trompe_server.meter import Meter
+from trompe_server.pipeline import VIEWS_AFTER, VIEWS_BEFORE, Artifacts, OnProgress, PhaseReport
 from trompe_server.reports import heat_textures
 from trompe_server.scene import Scene, open_scene
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of
@@ -44,7 +49,7 @@ from trompe_server.surrogate.calibration import Calibration, build_surrogate, ca
 from trompe_server.target import TargetRenderer
 from trompe_shared.api import JobSpec, JobState, Progress
 from trompe_shared.geometry import View
-from trompe_shared.object3d import Object3D
+from trompe_shared.object3d import Object3D, encode_png
 
 __all__ = ["AttackJob", "open_pipeline"]
 
@@ -66,10 +71,23 @@ Image8 = NDArray[np.uint8]
 
 
 def open_pipeline(
-    spec: JobSpec, *, library: Library, artifacts: Artifacts, target: TargetRenderer, device: str = "cpu"
+    spec: JobSpec,
+    *,
+    library: Library,
+    artifacts: Artifacts,
+    target: TargetRenderer,
+    device: str = "cpu",
+    meter: Meter | None = None,
 ) -> "AttackJob":
-    """The phases of the job that ``spec`` describes. Raises ``TrompeError`` for what the user can mend."""
+    """The phases of the job that ``spec`` describes; ``meter`` counts what its networks are shown.
+
+    Raises ``TrompeError`` for what the user can mend.
+    """
     scene = open_scene(spec, library=library, target=target, device=device)
+    if meter is not None:
+        for each in {id(each): each for each in (*scene.members, scene.classifier, *scene.judges)}.values():
+            if isinstance(each, NetworkClassifier):
+                meter_network(each.network, meter)
     return AttackJob(spec, scene, artifacts, library.calibrations)
 
 
@@ -79,7 +97,7 @@ class AttackJob:
     ``calibrations`` are kept for other jobs: one that would ask the target the same questions asks none.
     """
 
-    def __init__(self, spec: JobSpec, scene: Scene, artifacts: Artifacts, calibrations: Artifacts) -> None:
+    def __init__(self, spec: JobSpec, scene: Scene, artifacts: Artifacts, calibrations: Folder) -> None:
         self.spec, self.scene, self.artifacts, self.calibrations = spec, scene, artifacts, calibrations
         self.files = JobFiles(artifacts, chunks=-(-spec.steps // CHUNK))
         self._geometry: Future[Geometry] | None = None
@@ -106,7 +124,7 @@ class AttackJob:
         total = len(scene.views) + len(scene.held_out)
         ask = self._asker("prepare", total, on_progress)
         own = ask(scene.obj, scene.views)
-        self.files.save("clean", own=own, held_out=ask(scene.obj, scene.held_out))
+        self.files.save(VIEWS_BEFORE, own=own, held_out=ask(scene.obj, scene.held_out))
         if scene.white_box:
             self.files.save("saliency", maps=saliency(own, scene.members, goal=scene.goal).numpy().astype(np.float16))
             _ = self._masks  # a tau that leaves nothing is told before more is asked
@@ -125,14 +143,14 @@ class AttackJob:
         return PhaseReport(_progress("judge", 1.0), JobState.not_applicable, note, public)
 
     def _calibrate(self, on_progress: OnProgress) -> PhaseReport:
-        if not self.files.has("calibration"):
-            clean = self.files.load("clean")["own"]
+        if not self.files.has_calibration():
+            clean = self.files.load(VIEWS_BEFORE)["own"]
             name = f"{self._calibration_key(clean)}.npz"
             found = self._known_calibration(name)
             if found is None:
                 found = self._ask_the_target(clean, on_progress)
             packed = pack_calibration(found)
-            self.artifacts.write("calibration.npz", packed)
+            self.files.save_calibration(packed)
             if found.renders:
                 self.calibrations.write(name, packed)
         return PhaseReport(_progress("calibrate", 1.0))
@@ -150,6 +168,7 @@ class AttackJob:
         except (ValueError, OSError):
             logger.warning("the stored calibration %s is damaged; the target is asked again", name)
             return None
+        self.calibrations.touch(name)
         return replace(known, renders=0, reason=f"{known.reason} (known from an earlier job)")
 
     def _ask_the_target(self, clean: Image8, on_progress: OnProgress) -> Calibration:
@@ -178,22 +197,37 @@ class AttackJob:
         executor.shutdown(wait=False)
 
     def _attack(self, chunk: int, on_progress: OnProgress) -> PhaseReport:
-        before = self.files.load_state(chunk) if chunk else start(self._textures)
-        last, evaluations, asked = Progress(), 0, self.scene.queries or 0
+        before = self.files.load_state(chunk, step=chunk * CHUNK) if chunk else start(self._textures)
+        steps = min(CHUNK, self.spec.steps - before.step)
+        last, taken, asked = _progress("attack", (before.step + steps) / self.spec.steps), [], self.scene.queries or 0
 
         def on_step(step: Step) -> None:
-            nonlocal last, evaluations
-            evaluations = step.evaluations
+            nonlocal last
+            taken.append(step)
             share = (step.step + 1) / self.spec.steps
             last = _progress("attack", share).model_copy(
                 update={"step": step.step + 1, "steps": self.spec.steps, "loss": step.loss, "fooled": step.fooled}
             )
             on_progress(last)
 
-        steps = min(CHUNK, self.spec.steps - before.step)
-        self.files.save_state(chunk + 1, self._ascend(before, steps, on_step))
-        self.files.note_spent(chunk, evaluations=evaluations, queries=(self.scene.queries or 0) - asked)
+        after = self._ascend(before, steps, on_step)
+        self.files.save_state(chunk + 1, after)
+        self._show(after)
+        if taken:
+            queries = (self.scene.queries or 0) - asked
+            self.files.note_spent(chunk, steps=len(taken), evaluations=taken[-1].evaluations, queries=queries)
         return PhaseReport(last)
+
+    def _show(self, state: AttackState) -> None:
+        """Keep a picture for those who watch: the first view as it is now, in the surrogate and in the target."""
+        scene, painted = self.scene, self.budget.repaint(self.scene.obj, state.deltas)
+        texels = self._surrogate.texels(textures_of(painted, device=scene.device))
+        with torch.no_grad():
+            expected = self._surrogate.render(texels, 0)[0].permute(1, 2, 0).cpu().numpy()
+        shown = scene.target.render(painted, scene.views[:1], size=scene.size)[0]
+        self.artifacts.write(
+            "preview.png", encode_png(np.concatenate([(255 * expected).round().astype(np.uint8), shown], 1))
+        )
 
     def _ascend(self, state: AttackState, steps: int, on_step: Callable[[Step], None]) -> AttackState:
         scene, masks = self.scene, self._masks
@@ -211,16 +245,17 @@ class AttackJob:
             masks=masks,
             texels=self._movable,
             views_per_step=VIEWS_PER_STEP if self.spec.pool else None,
+            backgrounds=self._backgrounds,
             seed=self.spec.seed,
             on_step=on_step,
         )
 
     def _judge(self, on_progress: OnProgress) -> PhaseReport:
         scene = self.scene
-        deltas = self.files.load_state(self.files.chunks).deltas
+        deltas = self.files.load_state(self.files.chunks, step=self.spec.steps).deltas
         painted = self.budget.repaint(scene.obj, deltas)
         ask = self._asker("judge", len(scene.views) + len(scene.held_out), on_progress)
-        self.files.save("after", own=ask(painted, scene.views), held_out=ask(painted, scene.held_out))
+        self.files.save(VIEWS_AFTER, own=ask(painted, scene.views), held_out=ask(painted, scene.held_out))
         if self._scores is not None:
             hot = scene.obj.with_textures(heat_textures(scene.obj.textures, _numpy(self._scores)))
             self.files.save("hot", images=ask(hot, [scene.views[index] for index in saliency_views(scene)]))
@@ -233,15 +268,15 @@ class AttackJob:
         return Evidence(
             spec=self.spec,
             scene=self.scene,
-            before=self.files.load("clean"),
-            after=self.files.load("after") if painted is not None else None,
+            before=self.files.load(VIEWS_BEFORE),
+            after=self.files.load(VIEWS_AFTER) if painted is not None else None,
             painted=painted,
             maps=None if self._maps is None else self._maps.numpy(),
             scores=None if painted is None or self._scores is None else _numpy(self._scores),
             hot=self.files.load("hot")["images"] if self.files.has("hot") else None,
             surrogate=self._surrogate if painted is not None else None,
             calibration=self._calibration if painted is not None else None,
-            **self.files.spent(),
+            spent=self.files.spent(),
             seconds=self.files.seconds() | {kind: time.perf_counter() - started},
         )
 
@@ -251,11 +286,11 @@ class AttackJob:
 
     @cached_property
     def _calibration(self) -> Calibration:
-        return unpack_calibration(self.artifacts.read("calibration.npz"))
+        return self.files.load_calibration()
 
     @cached_property
     def _surrogate(self) -> Surrogate:
-        scene, clean = self.scene, self.files.load("clean")["own"]
+        scene, clean = self.scene, self.files.load(VIEWS_BEFORE)["own"]
         geometry = self._geometry.result() if self._geometry is not None else None
         return build_surrogate(
             self._calibration,
@@ -286,10 +321,19 @@ class AttackJob:
         return None if self._maps is None else rank_texels(self._surrogate, self._textures, self._maps)
 
     @cached_property
+    def _backgrounds(self) -> Backgrounds | None:
+        """What a pool's views are set in front of, the more often the better the object is recognised there."""
+        backgrounds = self.scene.backgrounds if self.spec.pool else None
+        if backgrounds is None:
+            return None
+        said = self.scene.classifier.predict(self.files.load(VIEWS_BEFORE)["own"]).argmax(axis=1)
+        return backgrounds.by_need((said == self.scene.label).tolist())
+
+    @cached_property
     def _movable(self) -> TexelMasks:
         within = list(self.scene.within)
         if self.spec.keep is not None:
-            gradients = image_gradients(self.files.load("clean")["own"], self.scene.members, goal=self.scene.goal)
+            gradients = image_gradients(self.files.load(VIEWS_BEFORE)["own"], self.scene.members, goal=self.scene.goal)
             within.append(best_texels(rank_texels(self._surrogate, self._textures, gradients), self.spec.keep))
         return movable(self._surrogate, self.budget, self._masks, within=within)
 

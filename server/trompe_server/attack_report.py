@@ -1,10 +1,12 @@
 """The report of a job: ``result.json``, the pictures, and the repainted object."""
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -26,7 +28,9 @@ from trompe_server.attack.metrics import (
 )
 from trompe_server.attack.perceptual import object_pixels, perceived_change, total_variation
 from trompe_server.classifiers import Classifier
-from trompe_server.pipeline import Artifacts
+from trompe_server.formats import repaint_limited, write_glb
+from trompe_server.job_files import Spent
+from trompe_server.pipeline import VIEWS_AFTER, VIEWS_BEFORE, Artifacts
 from trompe_server.reports import (
     Verdict,
     contact_sheet,
@@ -42,6 +46,7 @@ from trompe_server.scene import Scene
 from trompe_server.surrogate import Surrogate, behind, textures_of
 from trompe_server.surrogate.calibration import MAX_ERROR, MIN_EXPLAINED, Calibration
 from trompe_shared.api import Accuracy, JobSpec, Judgement, Result
+from trompe_shared.errors import ObjectError
 from trompe_shared.geometry import Camera
 from trompe_shared.object3d import Object3D, encode_png
 
@@ -55,6 +60,8 @@ SALIENCY_VIEWS: Final = 6
 DIFFERENCE_VIEWS: Final = 4
 POOR_VIEW: Final = 3.0 / 255
 NAMED_VIEWS: Final = 5
+LARGE_GAP: Final = 0.1
+"""A transfer gap that is told."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +81,7 @@ class Evidence:
     """The target's images, of ``saliency_views``, of the object painted with ``scores`` as heat."""
     surrogate: Surrogate | None
     calibration: Calibration | None
-    evaluations: int | None
-    queries: int | None
+    spent: Spent
     seconds: Mapping[str, float]
 
     @cached_property
@@ -92,14 +98,34 @@ class Evidence:
 
 
 def public_files(evidence: Evidence, artifacts: Artifacts, *, warnings: Sequence[str]) -> tuple[str, ...]:
-    """Write everything that is for the user; returns the names of the files."""
+    """Write everything that is for the user; returns the names of the files, with those of the target's images."""
     files = _pictures(evidence)
     if evidence.painted is not None:
-        files["adversarial.zip"] = evidence.painted.to_zip()
+        made, refused = _models(evidence.painted, evidence.scene.original)
+        files, warnings = files | made, (*warnings, *refused)
     files["result.json"] = _result(evidence, warnings).model_dump_json(indent=1).encode()
     for name, data in files.items():
         artifacts.write(name, data)
-    return tuple(sorted(files))
+    images = [VIEWS_BEFORE, VIEWS_AFTER] if evidence.after is not None else [VIEWS_BEFORE]
+    return tuple(sorted([*files, *(f"{name}.npz" for name in images)]))
+
+
+def _models(painted: Object3D, original: tuple[bytes, str] | None) -> tuple[dict[str, bytes], tuple[str, ...]]:
+    """The painted object as SAILenv's zip, as GLB and in the form that it came in; and why that could not be made."""
+    files = {"adversarial.zip": painted.to_zip(), "adversarial.glb": write_glb(painted)}
+    if original is None:
+        return files, ()
+    data, name = original
+    try:
+        same = repaint_limited(data, painted, name=name)
+    except ObjectError as error:
+        return files, (f"The object could not be written in the form that it came in ({name}): {error}",)
+    return files | {f"adversarial_{_plain(Path(name).stem)}{same.ending}": same.data}, ()
+
+
+def _plain(name: str) -> str:
+    """A name that an artifact can have."""
+    return re.sub(r"[^A-Za-z0-9_.\-]", "_", name)[:100]
 
 
 def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
@@ -114,7 +140,8 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
         label_name=scene.class_name(scene.label) if scene.classifier.classes else None,
         classifier=scene.classifier.name,
         ensemble=[member.name for member in scene.members[1:]],
-        **spec.model_dump(include={"epsilon", "alpha", "tau", "seed", "steps"}),
+        **spec.model_dump(include={"epsilon", "alpha", "tau", "seed"}),
+        steps=evidence.spent.steps,
         image_size=scene.size,
         surrogate=surrogate,
         target=target,
@@ -126,9 +153,9 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
         mean_texel_change=mean_texel_change(scene.obj.textures, painted.textures) if painted else None,
         **_view_changes(evidence),
         goal_reached=_goal_reached(evidence),
-        evaluations=evidence.evaluations,
-        queries=evidence.queries,
-        warnings=[*warnings, *_warnings(evidence, target)],
+        evaluations=evidence.spent.evaluations,
+        queries=evidence.spent.queries,
+        warnings=[*warnings, *_warnings(evidence, target, surrogate)],
         seconds={name: round(seconds, 3) for name, seconds in evidence.seconds.items()},
         versions={name: version(name) for name in ("trompe", "torch", "numpy", "pyrender", "onnxruntime")},
         views=view_predictions(scene.views, evidence.logits_before["own"], after.get("own"), scene.label),
@@ -210,7 +237,7 @@ def _view_changes(evidence: Evidence) -> dict[str, Any]:
     }
 
 
-def _warnings(evidence: Evidence, target: Accuracy) -> list[str]:
+def _warnings(evidence: Evidence, target: Accuracy, surrogate: Accuracy | None) -> list[str]:
     found = [warning] if target.a_before > 0 and (warning := drop_warning(target)) else []
     calibration = evidence.calibration
     if calibration is not None and calibration.model != "diffuse" and not calibration.fidelity.good_enough:
@@ -220,7 +247,25 @@ def _warnings(evidence: Evidence, target: Accuracy) -> list[str]:
             f"(at most {MAX_ERROR * 255:.1f}), "
             f"{mean['explained']:.0%} of a random repaint's effect explained (at least {MIN_EXPLAINED:.0%})."
         )
-    return found + _poor_views(evidence)
+    return found + _promises(evidence, target, surrogate) + _poor_views(evidence)
+
+
+def _promises(evidence: Evidence, target: Accuracy, surrogate: Accuracy | None) -> list[str]:
+    """What to know of an attack that came to nothing, or to less than the surrogate promised."""
+    found = []
+    painted = evidence.painted
+    if painted is not None and texels_altered(evidence.scene.obj.textures, painted.textures) == 0:
+        found.append(
+            "No texel was altered: the classifier's gradient is zero on every view (a saturated softmax, or a step "
+            "that hides gradients). Try --loss margin, or attack it by its scores (--queries)."
+        )
+    gap = transfer_gap(surrogate, target)
+    if gap is not None and gap > LARGE_GAP:
+        found.append(
+            f"The surrogate promised more than the target kept: its A_drop is larger by {gap:.2f}. "
+            "Try --surrogate auto, or look at the fidelity."
+        )
+    return found
 
 
 def _poor_views(evidence: Evidence) -> list[str]:

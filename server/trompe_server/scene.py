@@ -1,6 +1,5 @@
 """From a job's options to what it works on: the object, the networks, the views and the renderer."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,14 +10,15 @@ import torch
 from numpy.typing import NDArray
 
 from trompe_server.attack import (
+    Backgrounds,
     Goal,
     TexelMasks,
     ViewDistribution,
-    framing_distance,
     grid_views,
     material_texels,
     painted_texels,
 )
+from trompe_server.checks import check_saliency
 from trompe_server.classifiers import (
     Classifier,
     ScoreBasedClassifier,
@@ -31,17 +31,16 @@ from trompe_server.labels import resolve_label
 from trompe_server.library import Library
 from trompe_server.target import BackdropTarget, TargetRenderer, fitted
 from trompe_shared.api import JobSpec
-from trompe_shared.errors import ClassifierError, SpecError
-from trompe_shared.geometry import View
+from trompe_shared.errors import ClassifierError
+from trompe_shared.geometry import View, colour_of, framing_distance
 from trompe_shared.object3d import Object3D, decode_rgb, load_object
 from trompe_shared.shipped import shipped_objects
 
 __all__ = ["Scene", "open_scene"]
 
+SAILENV: Final = "sailenv"
 DEFAULT_ELEVATION: Final = (0.0, 50.0)
 Image8 = NDArray[np.uint8]
-
-COLOURS: Final = {"white": (255, 255, 255), "black": (0, 0, 0)}
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,8 @@ class Scene:
 
     classifier: the first of those that are attacked, by which the result is judged. members: all of them, as the attack
     needs them. goal: what they should say. within: masks of the texels that may change. views: what is attacked;
-    ``held_out`` ones are only judged. backdrops: the pictures that views name, (H, W, 3). device: where torch computes.
+    ``held_out`` ones are only judged. backdrops: the pictures that views name, (H, W, 3). original: the file that the
+    object came as, and its name; ``None`` where that is ``obj``. device: where torch computes.
     """
 
     obj: Object3D
@@ -64,6 +64,7 @@ class Scene:
     held_out: tuple[View, ...]
     target: TargetRenderer
     backdrops: Mapping[str, Image8]
+    original: tuple[bytes, str] | None = None
     device: str = "cpu"
 
     @property
@@ -75,6 +76,18 @@ class Scene:
     def size(self) -> tuple[int, int]:
         """(H, W) of every image: what the attacked classifier takes."""
         return self.classifier.image_size
+
+    @property
+    def backgrounds(self) -> Backgrounds | None:
+        """What the attacked views stand in front of; ``None`` where that is the same for all."""
+        names: dict[str | tuple[int, int, int], int] = {}
+        own = [names.setdefault(view.backdrop or view.background, len(names)) for view in self.views]
+        if len(names) == 1:
+            return None
+        pictures = np.empty((len(names), *self.size, 3), np.uint8)
+        for name, number in names.items():
+            pictures[number] = self.backdrops[name] if isinstance(name, str) else name
+        return Backgrounds(torch.from_numpy(pictures), own)
 
     @property
     def white_box(self) -> bool:
@@ -102,7 +115,7 @@ def open_scene(spec: JobSpec, *, library: Library, target: TargetRenderer, devic
     stored = partial(_stored_classifier, library=library, device=device)
     classifier = stored(spec.classifier)
     distance, elevation = _framing(spec, obj, info.name if info.shipped else None)
-    pictures = {name: _picture(name, library) for name in spec.background if _colour(name) is None}
+    pictures = {name: _picture(name, library) for name in spec.background if colour_of(name) is None}
     return Scene(
         obj,
         info.name,
@@ -114,6 +127,7 @@ def open_scene(spec: JobSpec, *, library: Library, target: TargetRenderer, devic
         *_views(spec, distance, elevation),
         BackdropTarget(target, pictures) if pictures else target,
         {name: fitted(picture, classifier.image_size) for name, picture in pictures.items()},
+        None if info.format == SAILENV else library.original(spec.object),
         device,
     )
 
@@ -143,9 +157,8 @@ def _by_scores(spec: JobSpec, classifier: Classifier) -> WhiteBoxClassifier:
             f"{classifier.name!r} gives scores but no gradients (.onnx). Attack a .pt2 file and name this one as a "
             "judge (--judge), or let gradients be estimated from scores (--queries 10)."
         )
-    if spec.tau is not None or spec.keep is not None:
-        raise SpecError(f"tau and keep need saliency, and {classifier.name!r} gives no gradients: leave them out.")
-    behind = _colour(spec.background[0]) if len(spec.background) == 1 else None
+    check_saliency(spec, classifier.name)
+    behind = colour_of(spec.background[0]) if len(spec.background) == 1 else None
     background = None if behind is None else torch.tensor(behind)[:, None, None] / 255
     return score_based(classifier, seed=spec.seed, queries=spec.queries, sigma=spec.epsilon, background=background)
 
@@ -172,19 +185,9 @@ def _stored_classifier(reference: str, *, library: Library, device: str) -> Clas
 def _framing(spec: JobSpec, obj: Object3D, shipped: str | None) -> tuple[float, tuple[float, float]]:
     """(distance, elevation range): the job's, else a shipped object's own, else what shows the object well."""
     own = shipped_objects()[shipped] if shipped is not None else None
-    distance = spec.distance or (own.distance if own is not None else framing_distance(obj))
+    distance = spec.distance or (own.distance if own is not None else framing_distance(obj.radius))
     elevation = spec.elevation or (own.elevation if own is not None else DEFAULT_ELEVATION)
     return distance, elevation
-
-
-def _colour(text: str) -> tuple[int, int, int] | None:
-    """The colour that a background names; ``None`` for a picture."""
-    if text in COLOURS:
-        return COLOURS[text]
-    if not re.fullmatch("#[0-9a-fA-F]{6}", text):
-        return None
-    red, green, blue = bytes.fromhex(text[1:])
-    return red, green, blue
 
 
 def _views(spec: JobSpec, distance: float, elevation: tuple[float, float]) -> tuple[tuple[View, ...], tuple[View, ...]]:
@@ -204,7 +207,7 @@ def _views(spec: JobSpec, distance: float, elevation: tuple[float, float]) -> tu
         elevation=elevation,
         azimuths=spec.azimuths,
         elevations=spec.elevations,
-        background=COLOURS["white"],
+        background=(255, 255, 255),
     )
     return _before(spec.background, grid, np.random.default_rng([spec.seed, GRID_STREAM])), held_out
 
@@ -220,5 +223,5 @@ def _before(backgrounds: Sequence[str], views: Sequence[View], generator: np.ran
 
 
 def _in_front_of(background: str, view: View) -> View:
-    colour = _colour(background)
+    colour = colour_of(background)
     return replace(view, backdrop=background) if colour is None else replace(view, background=colour)

@@ -14,7 +14,6 @@ from trompe_server.attack import (
     Budget,
     Goal,
     ViewDistribution,
-    framing_distance,
     grid_views,
     image_gradients,
     saliency,
@@ -22,7 +21,7 @@ from trompe_server.attack import (
 )
 from trompe_server.classifiers import NetworkClassifier, fake_classifier
 from trompe_shared.errors import SpecError
-from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View
+from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View, framing_distance
 from trompe_shared.object3d import Object3D
 
 Make = Callable[..., Any]
@@ -204,7 +203,7 @@ def test_the_seed_determines_the_held_out_views() -> None:
 @given(st.floats(0, 360), st.floats(-90, 90))
 @settings(max_examples=30, deadline=None)
 def test_from_the_framing_distance_all_of_the_object_is_seen(mug: Object3D, azimuth: float, elevation: float) -> None:
-    matrix = Camera(framing_distance(mug), azimuth, elevation).world_to_camera()
+    matrix = Camera(framing_distance(mug.radius), azimuth, elevation).world_to_camera()
     points = np.concatenate([part.vertices for part in mug.parts]) @ matrix[:3, :3].T + matrix[:3, 3]
     reach = np.abs(points[:, :2] / -points[:, 2:]) / np.tan(np.radians(FIELD_OF_VIEW / 2))
     assert (points[:, 2] < 0).all()

@@ -54,6 +54,8 @@ PICTURES = {
     "saliency.png",
     "textures.png",
 }
+MODELS = {"adversarial.zip", "adversarial.glb"}
+IMAGES = {"views_before.npz", "views_after.npz"}
 Image8 = NDArray[np.uint8]
 
 
@@ -154,7 +156,7 @@ def test_a_job_goes_through_its_phases_and_succeeds(finished: Run) -> None:
     assert list(finished.reports) == ["prepare", "calibrate", "attack-000", "attack-001", "judge"]
     states = [report.state for report in finished.reports.values()]
     assert states == [None, None, None, None, JobState.succeeded]
-    assert set(finished.reports["judge"].public) == PICTURES | {"adversarial.zip", "result.json"}
+    assert set(finished.reports["judge"].public) == PICTURES | MODELS | {"result.json", *IMAGES}
     assert set(finished.reports["judge"].public) <= set(finished.artifacts.files)
 
 
@@ -199,7 +201,7 @@ def test_the_figures_of_the_change_are_those_of_the_files(finished: Run) -> None
     assert change.max() == 25  # floor(0.1 * 255)
     assert result.texels_altered == pytest.approx(altered.mean())
     assert result.mean_texel_change == pytest.approx(change[altered].mean() / 255)
-    clean, painted = (unpack_arrays(finished.artifacts.read(f"{name}.npz")) for name in ("clean", "after"))
+    clean, painted = (unpack_arrays(finished.artifacts.read(f"{name}.npz")) for name in ("views_before", "views_after"))
     seen = max(np.abs(clean[k].astype(int) - painted[k]).max() for k in ("own", "held_out"))
     assert result.max_view_change == pytest.approx(seen / 255)
 
@@ -214,7 +216,7 @@ def test_what_is_judged_is_the_texture_that_is_saved(finished: Run, library: Lib
     scene = open_scene(SPEC, library=library, target=FakeTarget())
     saved = load_object(finished.artifacts.read("adversarial.zip"))
     images = FakeTarget().render(saved, scene.views, size=scene.size)
-    assert (unpack_arrays(finished.artifacts.read("after.npz"))["own"] == images).all()
+    assert (unpack_arrays(finished.artifacts.read("views_after.npz"))["own"] == images).all()
     verdicts = scene.classifier.predict(images).argmax(axis=1)
     assert [view.after for view in finished.artifacts.result().views] == verdicts.tolist()
     assert finished.artifacts.result().target.a_after == (verdicts == scene.label).mean()
@@ -230,6 +232,21 @@ def test_the_pictures_can_be_seen(finished: Run) -> None:
 def test_each_phase_may_run_in_another_process_and_twice(finished: Run, library: Library) -> None:
     again = run(SPEC, library, new=True, times=2)
     assert again.artifacts.lasting() == finished.artifacts.lasting()
+
+
+def test_an_attack_that_has_won_all_views_safely_takes_no_further_steps(
+    library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trompe_server.attack.search.SAFE_ENOUGH", 1.1)
+    easy = QUICK.model_copy(update={"epsilon": 0.5, "alpha": 0.1, "steps": 30})
+    once, anew = run(easy, library), run(easy, library, new=True)
+    result = once.artifacts.result()
+    assert result.spec.steps == 30
+    assert 2 < result.steps < 30
+    assert result.target.a_after == 0
+    taken = [progress.step for progress in once.progress if progress.step is not None]
+    assert taken == list(range(1, result.steps + 1))
+    assert anew.artifacts.lasting() == once.artifacts.lasting()
 
 
 class Counting(FakeTarget):
@@ -287,7 +304,7 @@ def test_the_seed_changes_the_held_out_views_and_only_them_of_the_images(finishe
         SPEC.model_copy(update={"seed": 1}), library=library, artifacts=MemoryArtifacts(), target=FakeTarget()
     )
     job.run("prepare", lambda _: None)
-    clean, other = (unpack_arrays(files.read("clean.npz")) for files in (finished.artifacts, job.artifacts))
+    clean, other = (unpack_arrays(files.read("views_before.npz")) for files in (finished.artifacts, job.artifacts))
     assert (clean["own"] == other["own"]).all()
     assert (clean["held_out"] != other["held_out"]).any()
 
@@ -299,7 +316,7 @@ def test_an_object_that_is_never_recognised_is_not_applicable(library: Library) 
     assert report.note is not None
     for word in ("n.a.", "'ball'", "none of the 4", "--label", "--background"):
         assert word in report.note
-    assert set(report.public) == {"result.json", "saliency.png"}
+    assert set(report.public) == {"result.json", "saliency.png", "views_before.npz"}
     result = ended.artifacts.result()
     assert (result.target.a_before, result.target.a_after, result.target.a_drop) == (0, None, None)
     assert (result.surrogate, result.texels_altered, result.transfer_gap) == (None, None, None)
@@ -389,7 +406,7 @@ def test_distance_and_elevation_can_be_asked_for(library: Library) -> None:
 
 def test_an_uploaded_object_is_framed_by_its_size(tmp_path: Path, mug: Object3D) -> None:
     library = Library(tmp_path)
-    library.add_object(mug.to_zip(), "cup.zip")
+    library.add_object(io.BytesIO(mug.to_zip()), "cup.zip")
     scene = scene_of(library, object="cup", label="mug")
     assert {round(view.camera.distance / mug.radius, 3) for view in scene.views} == {2.1}
     assert {view.camera.elevation for view in scene.views} == {0, 50}
@@ -502,7 +519,8 @@ class PatchyTarget(FakeTarget):
 
     def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
         images = super().render(obj, views, **options)
-        images[1] = images[1] // 2 if obj.textures[next(iter(obj.textures))].shape == (4, 4, 3) else images[1]
+        if obj.textures[next(iter(obj.textures))].shape == (4, 4, 3):
+            images[1:2] //= 2
         return images
 
 
@@ -524,6 +542,17 @@ def test_views_draw_their_backgrounds_from_several(tmp_path: Path, photo: Image8
     assert scene.backdrops[picture].shape == (*scene.size, 3)
     again = scene_of(library, background=["black", "#ff0000", picture], held_out=30)
     assert again.views == scene.views
+
+
+def test_the_attack_knows_what_its_views_stand_in_front_of(tmp_path: Path, photo: Image8) -> None:
+    library = Library(tmp_path)
+    picture = library.add_background(encode_png(photo), "wall.png").id
+    scene = scene_of(library, background=["black", "#ff0000", picture], pool=30)
+    assert scene.backgrounds is not None
+    for view, number in zip(scene.views, scene.backgrounds.own, strict=True):
+        expected = scene.backdrops[picture] if view.backdrop else np.array(view.background, np.uint8)
+        assert (scene.backgrounds.pictures[number].numpy() == expected).all()
+    assert scene_of(library, background=["black"], pool=30).backgrounds is None
 
 
 class Liar(FakeTarget):

@@ -1,6 +1,7 @@
 """The loop as a whole on a small scene: it climbs within its budget, can be cut anywhere, and survives what is odd."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
 
@@ -27,7 +28,8 @@ from trompe_server.attack import (
 )
 from trompe_server.attack.goal import SAFE_MARGIN
 from trompe_server.attack.objective import Objective
-from trompe_server.attack.optimiser import OptimiserName
+from trompe_server.attack.optimiser import ROUND, OptimiserName, Pace
+from trompe_server.attack.search import RISE, SAFE_ENOUGH
 from trompe_server.classifiers import NetworkClassifier, fake_classifier, load_classifier
 from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_shared.errors import SpecError
@@ -380,7 +382,7 @@ def test_a_classifier_that_is_fooled_everywhere_leaves_the_object_alone(
 ) -> None:
     seen: list[Step] = []
     textures = textures_of(square)
-    options: Any = lengths(optimiser, 1 if optimiser == "fgsm" else 4) | {"budget": Budget(0.1, 0.1)}
+    options: Any = lengths(optimiser, 1 if optimiser == "fgsm" else 3) | {"budget": Budget(0.1, 0.1)}
     state = attack(
         start(textures), textures, surrogate, won_classifier(), goal=Goal(LABEL), on_step=seen.append, **options
     )
@@ -579,6 +581,73 @@ def test_views_that_are_safely_won_rest_and_are_looked_at_again(square: Object3D
     )
     assert [step.evaluations for step in seen] == [12, 12, 12, 24, 24]
     assert [step.fooled for step in seen] == [1.0] * 5
+
+
+# The safe margin, and the end of a search
+
+
+def won_run(obj: Object3D, surrogate: Surrogate, *, state: AttackState | None = None, **options: Any) -> AttackState:
+    """A search on a classifier that is fooled from the beginning."""
+    textures = textures_of(obj)
+    options = {"goal": Goal(LABEL), "budget": Budget(0.1, 0.1)} | options
+    return attack(state or start(textures), textures, surrogate, won_classifier(), **options)
+
+
+def test_a_search_that_has_won_everything_safely_takes_no_further_steps(square: Object3D, surrogate: Surrogate) -> None:
+    seen: list[Step] = []
+    state = won_run(square, surrogate, steps=40, on_step=seen.append)
+    rises = int(np.log(SAFE_ENOUGH / SAFE_MARGIN) / np.log(RISE)) + 1
+    assert len(seen) == rises
+    assert state.step == 40
+    assert all((delta == 0).all() for delta in state.deltas.values())
+
+
+@given(cut=st.integers(1, 39))
+@SMALL
+def test_a_search_that_ends_early_can_be_cut_anywhere(square: Object3D, surrogate: Surrogate, cut: int) -> None:
+    seen: list[Step] = []
+    whole = won_run(square, surrogate, steps=40)
+    part = load_state(save_state(won_run(square, surrogate, steps=cut, total_steps=40, on_step=seen.append)))
+    ended = won_run(square, surrogate, steps=40 - cut, state=part, on_step=seen.append)
+    assert same(ended, whole)
+    assert [step.step for step in seen] == list(range(len(seen)))
+
+
+def test_a_method_that_compares_losses_keeps_to_one_margin(square: Object3D, surrogate: Surrogate) -> None:
+    seen: list[Step] = []
+    won_run(square, surrogate, steps=30, optimiser="auto", on_step=seen.append)
+    assert [step.loss for step in seen] == [SAFE_MARGIN] * 30
+
+
+def test_the_margin_stays_low_while_views_are_to_be_won(square: Object3D, surrogate: Surrogate) -> None:
+    state = run(square, surrogate, steps=4, budget=Budget(0.001, 0.001))
+    assert float(state.memory["search.safe"]) == SAFE_MARGIN
+
+
+def test_the_margin_falls_where_views_are_lost_again(square: Object3D, surrogate: Surrogate) -> None:
+    known = AttackState(0, start(textures_of(square)).deltas, {"search.safe": torch.tensor(3.0)})
+    state = run(square, surrogate, steps=1, state=known, budget=Budget(0.001, 0.001))
+    assert float(state.memory["search.safe"]) == pytest.approx(3 / RISE)
+
+
+def test_every_run_begins_with_the_low_margin(square: Object3D, surrogate: Surrogate) -> None:
+    before = won_run(square, surrogate, steps=10, total_steps=20, restarts=1)
+    after = won_run(square, surrogate, steps=1, total_steps=20, restarts=1, state=before)
+    assert float(before.memory["search.safe"]) > 3
+    assert float(after.memory["search.safe"]) == pytest.approx(SAFE_MARGIN * RISE)
+
+
+@given(length=st.integers(1, 2000))
+@settings(max_examples=40, deadline=None)
+def test_the_step_falls_to_nothing_in_every_round_and_rounds_grow(length: int) -> None:
+    falling = [Pace(done, length).falling for done in range(length)]
+    starts = [0, *(done for done in range(1, length) if falling[done] > falling[done - 1])]
+    rounds = np.diff([*starts, length])
+    assert np.mean(falling) == pytest.approx(1)
+    assert all(later >= 2 * sooner for sooner, later in pairwise(rounds))
+    assert len(rounds) == 1 or rounds[0] == ROUND
+    for begin, size in zip(starts, rounds, strict=True):
+        np.testing.assert_allclose(falling[begin : begin + size], np.arange(2 * size - 1, 0, -2) / size)
 
 
 # Without any server

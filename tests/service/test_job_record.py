@@ -234,6 +234,17 @@ def test_a_job_that_three_workers_died_of_is_failed_with_the_reason(store: JobSt
     assert found.finished is not None
 
 
+def test_a_job_that_gets_on_outlives_any_number_of_workers(store: JobStore) -> None:
+    job = create(store)
+    for done in range(1, 6):
+        for _ in range(2):
+            roll(store, "w").arrive()
+            taken = claim(store)
+        desk(store, "w").advance(taken, Progress(phase="attack", fraction=0.1), done=done)
+    desk(store, "w").finish(taken, DONE)
+    assert (store.get(job).state, store.get(job).attempts) == (JobState.succeeded, 10)
+
+
 def test_a_job_given_back_does_not_count_as_lost(store: JobStore) -> None:
     job = create(store)
     for _ in range(5):

@@ -92,7 +92,12 @@ GRID: Final = ("azimuths", "elevations")
 )
 @_goal("--loss", type=click.Choice(get_args(Loss)), help=f"Default: {_default('loss')}.")
 @_search("--alpha", type=float, metavar="A", help="Mean step, 0..1. Default: 0.01, or epsilon / 5 if less.")
-@_search("--steps", type=int, metavar="N", help=f"Steps of the attack. Default: {_default('steps')}.")
+@_search(
+    "--steps",
+    type=int,
+    metavar="N",
+    help=f"At most so many steps; it ends where all views are safely won. Default: {_default('steps')}.",
+)
 @_search("--optimiser", type=click.Choice(get_args(Optimiser)), help=f"Default: {_default('optimiser')}.")
 @_search(
     "--restarts",

@@ -13,13 +13,15 @@ It needs no server. With an object, views of it and a classifier that gives grad
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from trompe_server.attack.backgrounds import Backgrounds
 from trompe_server.attack.budget import Budget
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Objective, Textures, members_of
-from trompe_server.attack.optimiser import Box, OptimiserName, Point
+from trompe_server.attack.optimiser import Box, Memory, OptimiserName, Point
 from trompe_server.attack.search import Schedule, Search
 from trompe_server.attack.state import AttackState
 from trompe_server.attack.texels import TexelMasks, movable
@@ -61,6 +63,7 @@ def attack(
     masks: Bool[Tensor, "views H W"] | None = None,
     texels: TexelMasks | None = None,
     views_per_step: int | None = None,
+    backgrounds: Backgrounds | None = None,
     seed: int = 0,
     on_step: Callable[[Step], None] = lambda _: None,
 ) -> AttackState:
@@ -69,26 +72,59 @@ def attack(
 
     ``textures`` are sRGB in [0, 1]. Of several classifiers the mean loss counts, and a view is fooled when all of them
     are. ``restarts`` further runs from random points share the steps; ``random_start`` begins the first one so too.
+    What is left of the steps is left out once all views are won so safely that more would change nothing.
     ``masks`` (saliency) let only those pixels' gradients through, and only ``texels`` (by default those ``movable``)
-    move. Each step looks at all views, or at ``views_per_step`` drawn by ``seed`` and its number. Deterministic, in one
-    go or in several. Raises ``SpecError`` for options that contradict each other, before any work.
+    move. Each step looks at all views, or at ``views_per_step`` drawn by ``seed`` and its number, in front of some of
+    ``backgrounds`` drawn likewise (by default their own). Deterministic, in one go or in several. Raises ``SpecError``
+    for options that contradict each other, before any work.
     """
     total = state.step + steps if total_steps is None else total_steps
     schedule = Schedule(total, restarts, random_start, seed)
     schedule.check(optimiser, last=state.step + steps)
-    objective = Objective(textures, surrogate, members_of(classifier, goal), goal, masks)
+    members = members_of(classifier, goal)
+    moving = movable(surrogate, budget, masks) if texels is None else texels
+    touched = {name: mask | state.deltas[name].any(2) for name, mask in moving.items()}
+    objective = Objective(textures, surrogate, members, goal, masks, surrogate.canvas(textures, touched))
     search = Search(
         objective,
         schedule,
         optimiser,
         box=Box(budget, objective.source),
-        movable=objective.join(movable(surrogate, budget, masks) if texels is None else texels)[:, None],
+        movable=objective.join(moving)[:, None].float().expand(-1, 3).contiguous(),  # booleans take seven times as long
         within=ViewBudget.of(objective, budget.epsilon_view) if budget.epsilon_view is not None else None,
         views_per_step=views_per_step,
+        backgrounds=backgrounds,
     )
-    point = Point(objective.join(state.deltas), state.memory).to(objective.source.device)
+    point = Point(objective.join(state.deltas), _joined(objective, state.memory)).to(objective.source.device)
     for step in range(state.step, state.step + steps):
+        if search.over(point):
+            break
         look, point = search.look(search.begin(point, step), step)
         on_step(Step(step, look.loss, look.fooled, search.shown(point)))
         point = search.move(point, look, step)
-    return AttackState(state.step + steps, objective.split(point.delta), point.memory)
+    return AttackState(state.step + steps, objective.split(point.delta), _split(objective, point.memory))
+
+
+def _joined(objective: Objective, memory: Memory) -> Memory:
+    """What is remembered of each texel, of those alone that may move."""
+    sizes = [texture.shape[:2] for texture in objective.textures.values()]
+
+    def joined(value: Tensor) -> Tensor:
+        if value.ndim != 2:
+            return value
+        parts = torch.split(value, [height * width for height, width in sizes])
+        tables = [part.view(*size, -1) for part, size in zip(parts, sizes, strict=True)]
+        return objective.join(dict(zip(objective.textures, tables, strict=True)))
+
+    return {name: joined(value) for name, value in memory.items()}
+
+
+def _split(objective: Objective, memory: Memory) -> Memory:
+    """The reverse of ``_joined``; zero for the texels that may not move."""
+
+    def split(value: Tensor) -> Tensor:
+        if value.ndim != 2:
+            return value
+        return torch.cat([table.flatten(0, 1) for table in objective.split(value).values()])
+
+    return {name: split(value) for name, value in memory.items()}

@@ -15,7 +15,7 @@ __all__ = ["SAFE_MARGIN", "Goal", "Loss"]
 
 Loss = Literal["margin", "cross_entropy", "dlr"]
 
-SAFE_MARGIN: Final = 3.0
+SAFE_MARGIN: Final = 1.0
 """A view whose margin is this large is safely won: the margin loss spends no more gradient on it."""
 
 HUGE: Final = 1e30
@@ -34,7 +34,8 @@ class Goal:
 
     ``top_k``: the true class must leave the k best ones (1: it must not be the best). ``loss`` is maximised:
     ``margin`` (Carlini and Wagner 2017, clamped once a view is safely won), ``cross_entropy``, or ``dlr`` (the
-    difference of logits ratio of Croce and Hein 2020, which no scaling of the logits changes).
+    difference of logits ratio of Croce and Hein 2020, which no scaling of the logits changes). ``safe`` is the margin
+    from which a view is safely won.
 
     Raises ``SpecError`` for options that contradict each other; ``check`` does for what depends on the classifier.
     """
@@ -43,6 +44,7 @@ class Goal:
     target: int | None = None
     top_k: int = 1
     loss: Loss = "margin"
+    safe: float = SAFE_MARGIN
 
     def __post_init__(self) -> None:
         if self.loss not in get_args(Loss):
@@ -93,13 +95,13 @@ class Goal:
         ``clamped=False`` leaves out the margin's clamp, so that a view that is safely won has a gradient too.
         """
         losses = _LOSSES[self.loss](self, _finite(logits))
-        return losses.clamp(max=SAFE_MARGIN) if clamped and self.loss == "margin" else losses
+        return losses.clamp(max=self.safe) if clamped and self.loss == "margin" else losses
 
     def settled(self, logits: Logits) -> Bool[Tensor, " views"]:
         """Views that the loss asks no more of: its gradient is zero there."""
         if self.loss != "margin":
             return torch.zeros(len(logits), dtype=torch.bool, device=logits.device)
-        return self.margins(logits) >= SAFE_MARGIN
+        return self.margins(logits) >= self.safe
 
     def _margins(self, logits: Logits) -> PerView:
         subject = self.label if self.target is None else self.target

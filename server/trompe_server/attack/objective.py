@@ -1,6 +1,7 @@
 """What the search asks at each step: how a change of the textures looks to the classifiers, and where it should go.
 
-Textures are one flat tensor here, (texels, 3), all of the object's one after the other.
+Textures are one flat tensor here, (texels, 3): those texels of all of the object's that may move, in the order of the
+surrogate's canvas.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from trompe_server.attack.goal import SAFE_MARGIN, Goal
+from trompe_server.attack.goal import Goal
 from trompe_server.classifiers import WhiteBoxClassifier
-from trompe_server.surrogate import Surrogate
+from trompe_server.surrogate import Canvas, Surrogate
 from trompe_shared.errors import SpecError
 
 __all__ = ["Look", "Objective", "Textures", "members_of"]
@@ -54,8 +55,8 @@ class Look:
 class Objective:
     """The expected loss of a goal over a surrogate's views; of several classifiers, their mean.
 
-    ``masks`` (saliency) let only those pixels' gradients through. Raises ``SpecError`` for a classifier that takes
-    images of another size than the surrogate's.
+    ``masks`` (saliency) let only those pixels' gradients through. ``part``: the texels that a change may touch, by
+    default all. Raises ``SpecError`` for a classifier that takes images of another size than the surrogate's.
     """
 
     textures: Textures
@@ -63,6 +64,7 @@ class Objective:
     members: tuple[WhiteBoxClassifier, ...]
     goal: Goal
     masks: Bool[Tensor, "views H W"] | None
+    part: Canvas | None = None
 
     def __post_init__(self) -> None:
         size = self.surrogate.geometry.size
@@ -73,22 +75,33 @@ class Objective:
                     f"{tuple(size)}: prepare the surrogate for that size, or resize the images for the classifier."
                 )
 
+    @property
+    def canvas(self) -> Canvas:
+        """The texels that may move."""
+        return self._whole if self.part is None else self.part
+
     @cached_property
+    def _whole(self) -> Canvas:
+        return self.surrogate.canvas(self.textures, {name: t[..., 0] >= 0 for name, t in self.textures.items()})
+
+    @property
     def source(self) -> Flat:
         """The unpainted textures."""
-        return self.join(self.textures)
+        return self.canvas.source
 
     def join(self, tables: Mapping[str, Tensor]) -> Tensor:
         """One tensor (texels, ...) of what stands in tables (H, W, ...) by the textures' names."""
-        return torch.cat([tables[name].flatten(0, 1) for name in self.textures])
+        return self.canvas.join([tables[name] for name in self.surrogate.geometry.textures])
 
     def split(self, everything: Tensor) -> dict[str, Tensor]:
-        """The reverse of ``join``; views, no copies."""
-        parts = torch.split(everything, [texture.shape[0] * texture.shape[1] for texture in self.textures.values()])
-        return {
-            name: part.view(*texture.shape[:2], *part.shape[1:])
-            for (name, texture), part in zip(self.textures.items(), parts, strict=True)
-        }
+        """The reverse of ``join``; zero where nothing may move."""
+        names = self.surrogate.geometry.textures
+        tables = dict(zip(names, self.canvas.split(everything), strict=True))
+        return {name: tables[name] for name in self.textures}
+
+    def texels(self, change: Flat) -> Float[Tensor, "reads 3"]:
+        """What the views read of the textures with a ``change``. Differentiable."""
+        return self.canvas.read(self.source + change)
 
     def look(self, change: Flat, batches: Sequence[int], awake: Bool[Tensor, " views"]) -> Look:
         """Loss and gradient at ``change`` over the views of ``batches``, of which only those ``awake`` are looked at.
@@ -96,14 +109,14 @@ class Objective:
         A gradient that is not finite counts as zero.
         """
         leaf = (self.source + change).requires_grad_()
-        texels = self.surrogate.texels(self.split(leaf))
+        texels = self.canvas.read(leaf)
         collected = texels.detach().requires_grad_()
         losses, won, settled, images = 0.0, 0, [], 0
         for batch in batches:
             views = self.surrogate.batches[batch]
             chosen = awake[views.start : views.stop].nonzero()[:, 0]
             resting = len(views) - len(chosen)
-            losses, won = losses + resting * SAFE_MARGIN, won + resting
+            losses, won = losses + resting * self.goal.safe, won + resting
             if len(chosen):
                 loss, reached, safe = self._pull(collected, batch, chosen)
                 losses, won, images = losses + loss, won + reached, images + len(chosen)
@@ -130,7 +143,6 @@ class Objective:
         logits = [member.logits(seen) for member in self.members]
         loss = torch.stack([self.goal.losses(each).sum() for each in logits]).mean()
         (pull,) = torch.autograd.grad(loss, seen)
-        pull.nan_to_num_(0, 0, 0)
         back = pull if everything else torch.zeros_like(shown).index_copy_(0, chosen, pull)
         shown.backward(back)  # type: ignore[no-untyped-call]
         reached = torch.stack([self.goal.reached(each) for each in logits]).all(0)
@@ -147,7 +159,7 @@ class Objective:
     @torch.no_grad()
     def loss(self, change: Flat) -> float:
         """Mean loss at ``change`` over all views; no gradient."""
-        texels, total = self.surrogate.texels(self.split(self.source + change)), 0.0
+        texels, total = self.texels(change), 0.0
         for batch in range(len(self.surrogate.batches)):
             images = self.surrogate.render(texels, batch)
             losses = [self.goal.losses(member.logits(images)).sum() for member in self.members]

@@ -2,7 +2,8 @@
 
 ``fgsm``      one step of epsilon along the sign (Goodfellow et al. 2015)
 ``pgd``       steps of alpha along the sign (Madry et al. 2018)
-``momentum``  along the sign of accumulated gradients, the step falling linearly from 2 alpha to 0 (Dong et al. 2018)
+``momentum``  along the sign of accumulated gradients, the step falling linearly from 2 alpha to 0 (Dong et al. 2018);
+              a long run falls so again and again, each time for twice as long (Loshchilov and Hutter 2017, SGDR)
 ``nesterov``  the same, the gradient taken one momentum step ahead (Lin et al. 2020)
 ``adam``      Adam's step (Kingma and Ba 2015), its size falling likewise, projected
 ``auto``      steps halved when progress stalls, back to the best point so far; no alpha (Croce and Hein 2020, APGD)
@@ -39,6 +40,9 @@ AUTO_MOMENTUM: Final = 0.75
 AUTO_PROGRESS: Final = 0.75
 """Share of an interval's steps that must raise the loss, or the step is halved."""
 
+ROUND: Final = 30
+"""Steps of a run's first round; each round is twice as long as the one before."""
+
 TINY: Final = 1e-30
 
 
@@ -63,8 +67,17 @@ class Pace:
 
     @property
     def falling(self) -> float:
-        """Factor of the step that falls linearly from 2 to 0; its mean is 1."""
-        return 2 * (self.length - self.done - 0.5) / self.length
+        """Factor of the step that falls linearly from 2 to 0 in each round; its mean is 1."""
+        begin, end = self._round
+        return 2 * (end - self.done - 0.5) / (end - begin)
+
+    @property
+    def _round(self) -> tuple[int, int]:
+        """The first step of this round, and the first one after it. The last round takes all that is left."""
+        begin, length = 0, ROUND
+        while begin + 3 * length <= self.length and self.done >= begin + length:
+            begin, length = begin + length, 2 * length
+        return begin, begin + length if begin + 3 * length <= self.length else self.length
 
 
 @dataclass(frozen=True)
@@ -93,11 +106,12 @@ class Optimiser:
 
     step: the next point, from this one, the gradient and the mean loss at ``looks_at``. Returns new tensors.
     looks_at: the change at which the gradient is wanted. The memory's ``best``, where there is one, is the best change
-    that a run has seen.
+    that a run has seen. compares: the losses of different steps, so that all of them must be of one kind.
     """
 
     step: Callable[[Point, Flat, float, Pace, Box], Point]
     looks_at: Callable[[Point, Pace, Box], Flat] = _stands
+    compares: bool = False
 
 
 def _fgsm(point: Point, gradient: Flat, loss: float, pace: Pace, box: Box) -> Point:
@@ -200,7 +214,7 @@ def _remembered(point: Point, name: str, nothing: Tensor | None = None) -> Tenso
 
 def _size(gradient: Flat) -> float:
     """L1 norm, never zero."""
-    return max(float(torch.linalg.vector_norm(gradient, ord=1)), TINY)
+    return max(float(gradient.abs().sum()), TINY)
 
 
 OPTIMISERS: Final[Mapping[OptimiserName, Optimiser]] = {
@@ -209,5 +223,5 @@ OPTIMISERS: Final[Mapping[OptimiserName, Optimiser]] = {
     "momentum": Optimiser(_momentum),
     "nesterov": Optimiser(_momentum, _ahead),
     "adam": Optimiser(_adam),
-    "auto": Optimiser(_auto),
+    "auto": Optimiser(_auto, compares=True),
 }

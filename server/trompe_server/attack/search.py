@@ -3,6 +3,10 @@
 A run begins at the unpainted textures or at random, and takes its share of the steps. Of several runs, and of a method
 that goes back and forth, the change with the highest loss over all of the attack's own views in the surrogate wins;
 nothing else is looked at.
+
+The margin from which a view counts as safely won is small at first, so that the gradient is that of the views still to
+be won. It rises with each step that finds nearly all of its views fooled, for what is won by more is won on unseen
+views too, and falls with each that does not. Where it has risen to the top, the search is over.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,9 +15,11 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from trompe_server.attack.backgrounds import Backgrounds
+from trompe_server.attack.goal import SAFE_MARGIN
 from trompe_server.attack.objective import Look, Objective
 from trompe_server.attack.optimiser import OPTIMISERS, Box, OptimiserName, Pace, Point
 from trompe_server.attack.view_budget import ViewBudget
@@ -29,9 +35,19 @@ REST: Final = 2
 BEGIN: Final = 1
 """Keeps the random numbers of a run's beginning apart from those of a step's views."""
 
-WAKES, SHOWN, BEST, BEST_LOSS = "search.wakes", "search.shown", "search.best", "search.best_loss"
+RISE: Final = 1.15
+"""Factor by which the safe margin rises with a step."""
+
+NEARLY_ALL: Final = 0.99
+"""Share of a step's views that must be fooled for the safe margin to rise."""
+
+SAFE_ENOUGH: Final = 6.0
+"""The safe margin at which the search is over."""
+
+WAKES, SHOWN, SAFE = "search.wakes", "search.shown", "search.safe"
+BEST, BEST_LOSS = "search.best", "search.best_loss"
 """What the search remembers beside its method: the step at which each view is looked at again, the images shown so far,
-the best change of the runs that are over, and its loss."""
+the safe margin, the best change of the runs that are over, and its loss."""
 
 
 @dataclass(frozen=True)
@@ -80,16 +96,22 @@ class Schedule:
 class Search:
     """Moves a point step by step; see the head of this module.
 
-    movable: the texels that may move. within: keeps the images' change in bounds as well, where that is asked for.
+    movable: 1 for texels that may move, else 0. within: keeps the images' change in bounds as well, where that is asked for.
+    backgrounds: what each step's views are set in front of, where not their own.
     """
 
     objective: Objective
     schedule: Schedule
     optimiser: OptimiserName
     box: Box
-    movable: Bool[Tensor, "texels 1"]
+    movable: Float[Tensor, "texels 3"]
     within: ViewBudget | None
     views_per_step: int | None
+    backgrounds: Backgrounds | None
+
+    def over(self, point: Point) -> bool:
+        """Whether all is won so safely that there is nothing left to do."""
+        return self._safe(point) > SAFE_ENOUGH
 
     def begin(self, point: Point, step: int) -> Point:
         """The point that ``step`` starts from: a random one where it is the first of a run that begins so."""
@@ -97,7 +119,7 @@ class Search:
         if pace.done or not (run or self.schedule.random_start):
             return point
         delta = self._at_random(run).to(self.box.texture.device) * self.movable
-        kept = {name: value for name, value in _mine(point.memory).items() if name != WAKES}
+        kept = {name: value for name, value in _mine(point.memory).items() if name not in {WAKES, SAFE}}
         return Point(self._in_view(self.box.project(delta)), kept)
 
     def look(self, point: Point, step: int) -> tuple[Look, Point]:
@@ -106,10 +128,32 @@ class Search:
         nothing = torch.zeros(sum(map(len, batches)), dtype=torch.long, device=point.delta.device)
         wakes = point.memory.get(WAKES, nothing)
         at = OPTIMISERS[self.optimiser].looks_at(point, self.schedule.pace(step)[1], self.box)
-        look = self.objective.look(at, self.schedule.drawn(batches, self.views_per_step, step), wakes <= step)
+        drawn = self.schedule.drawn(batches, self.views_per_step, step)
+        look = self._asked(point, step).look(at, drawn, wakes <= step)
         wakes = wakes.index_fill(0, look.settled, step + 1 + REST)
-        seen = torch.tensor(self.shown(point) + look.images)
-        return look, replace(point, memory={**point.memory, WAKES: wakes, SHOWN: seen})
+        known = {
+            WAKES: wakes,
+            SHOWN: torch.tensor(self.shown(point) + look.images),
+            SAFE: torch.tensor(self._safe_after(look, point)),
+        }
+        return look, replace(point, memory={**point.memory, **known})
+
+    def _safe(self, point: Point) -> float:
+        return float(point.memory.get(SAFE, SAFE_MARGIN))
+
+    def _safe_after(self, look: Look, point: Point) -> float:
+        """The safe margin after a look; other losses have none."""
+        if self.objective.goal.loss != "margin" or OPTIMISERS[self.optimiser].compares:
+            return SAFE_MARGIN
+        safe = self._safe(point)
+        return safe * RISE if look.fooled >= NEARLY_ALL else max(SAFE_MARGIN, safe / RISE)
+
+    def _asked(self, point: Point, step: int) -> Objective:
+        """The objective with the safe margin, and the backgrounds, of a step."""
+        goal, surrogate = replace(self.objective.goal, safe=self._safe(point)), self.objective.surrogate
+        if self.backgrounds is not None:
+            surrogate = self.backgrounds.behind(surrogate, seed=self.schedule.seed, step=step)
+        return replace(self.objective, goal=goal, surrogate=surrogate)
 
     def shown(self, point: Point) -> int:
         """Images that each classifier has been shown so far."""

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from trompe_server.attack.budget import Budget
 from trompe_server.attack.objective import Textures
+from trompe_server.checks import check_mask_size
 from trompe_server.surrogate import Surrogate
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D
@@ -60,11 +61,7 @@ def painted_texels(obj: Object3D, images: Mapping[str, NDArray[np.uint8]]) -> Te
     for name, image in images.items():
         if name not in obj.textures:
             raise SpecError(f"There is no texture {name!r} to mask; {obj.name!r} has {sorted(obj.textures)}.")
-        if image.shape != obj.textures[name].shape:
-            raise SpecError(
-                f"The mask of {name!r} is {image.shape[1]} x {image.shape[0]} pixels, the texture "
-                f"{obj.textures[name].shape[1]} x {obj.textures[name].shape[0]}: paint it at the texture's size."
-            )
+        check_mask_size(name, size=obj.textures[name].shape[:2], mask=image.shape[:2])
     masks = {
         name: torch.from_numpy(images[name].mean(2) >= PAINTED)
         if name in images

@@ -42,7 +42,7 @@ class ViewBudget:
     def of(cls, objective: Objective, epsilon: float) -> "ViewBudget":
         """The bound around the images of the objective's textures."""
         surrogate = objective.surrogate
-        texels = surrogate.texels(objective.split(objective.source))
+        texels = surrogate.texels(objective.textures)
         return cls(objective, epsilon, tuple(surrogate.colours(texels, k)[0] for k in range(len(surrogate.batches))))
 
     def project(self, delta: Flat) -> Flat:
@@ -58,7 +58,7 @@ class ViewBudget:
     def _shrink(self, delta: Flat, *, local: bool) -> Tensor | None:
         """By how much each texel's channel must shrink, as a share of it; ``None`` where all images are within."""
         leaf = delta.clone().requires_grad_()
-        texels = self._texels(leaf)
+        texels = self.objective.texels(leaf)
         change = [self._change(texels.detach(), number) for number in range(len(self.clean))]
         beyond = [each > self.epsilon + TOLERANCE for each in change]
         if not any(each.any() for each in beyond):
@@ -82,10 +82,6 @@ class ViewBudget:
             (at_texels,) = torch.autograd.grad(texels, leaf, total, retain_graph=True)
             sums.append(at_texels)
         return torch.where(sums[1] > 0, sums[0] / sums[1], 0).clamp(0, 1)
-
-    def _texels(self, delta: Flat) -> Tensor:
-        objective = self.objective
-        return objective.surrogate.texels(objective.split(objective.source + delta))
 
     def _change(self, texels: Tensor, number: int) -> Tensor:
         return (self.objective.surrogate.colours(texels, number)[0] - self.clean[number]).abs()

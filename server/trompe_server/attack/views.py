@@ -7,10 +7,9 @@ import numpy as np
 
 from trompe_shared.api import VIEW_LIMITS
 from trompe_shared.errors import SpecError
-from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View
-from trompe_shared.object3d import Object3D
+from trompe_shared.geometry import Camera, Light, View
 
-__all__ = ["ViewDistribution", "framing_distance", "grid_views"]
+__all__ = ["ViewDistribution", "grid_views"]
 
 Range = tuple[float, float]
 Colour = tuple[int, int, int]
@@ -76,11 +75,6 @@ class ViewDistribution:
 
     def _behind(self, more: np.random.Generator) -> Colour:
         return self.backgrounds[int(more.uniform() * len(self.backgrounds))]
-
-
-def framing_distance(obj: Object3D) -> float:
-    """Distance, metres, at which the object fills most of the picture from every side."""
-    return 1.05 * obj.radius / float(np.sin(np.radians(FIELD_OF_VIEW / 2)))
 
 
 def grid_views(

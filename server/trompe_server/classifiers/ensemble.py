@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from trompe_server.checks import check_same_classes
 from trompe_server.classifiers.protocol import WhiteBoxClassifier, Wrapper, resize
 from trompe_shared.errors import ClassifierError
 
@@ -36,22 +37,5 @@ def as_ensemble(classifiers: Sequence[WhiteBoxClassifier]) -> tuple[WhiteBoxClas
     """
     if not classifiers:
         raise ClassifierError("An ensemble needs at least one classifier, got none.")
-    first = next((one for one in classifiers if one.classes is not None), classifiers[0])
-    for other in classifiers:
-        _check_same_classes(first, other)
+    check_same_classes(classifiers)
     return tuple(resized(one, classifiers[0].image_size) for one in classifiers)
-
-
-def _check_same_classes(first: WhiteBoxClassifier, other: WhiteBoxClassifier) -> None:
-    both = f"{first.name!r} and {other.name!r} cannot be attacked together:"
-    if first.n_classes != other.n_classes:
-        raise ClassifierError(
-            f"{both} they have {first.n_classes} and {other.n_classes} classes; name classifiers of the same classes."
-        )
-    if first.classes is None or other.classes is None or first.classes == other.classes:
-        return
-    index = next(i for i, names in enumerate(zip(first.classes, other.classes, strict=True)) if names[0] != names[1])
-    raise ClassifierError(
-        f"{both} class {index} is {first.classes[index]!r} for one and {other.classes[index]!r} for the other; "
-        "name classifiers of the same classes in the same order."
-    )

@@ -18,7 +18,7 @@ from trompe_shared.api import Job, JobState, Progress
 __all__ = ["MAX_LOST", "Claim", "Ending", "JobDesk", "LostJobError", "lose"]
 
 MAX_LOST: Final = 3
-"""A job that ended this many workers is failed."""
+"""A job that ended this many workers, one after the other in the same phase, is failed."""
 
 
 class LostJobError(Exception):
@@ -82,6 +82,7 @@ class JobDesk:
             values: dict[str, Any] = {"progress": progress.model_dump(mode="json")}
             if done is not None:
                 values |= {"done": done, "artifacts": list(dict.fromkeys([*row.artifacts, *public]))}
+                values |= {"lost": 0} if done > row.done else {}
             update_job(connection, row.id, **values)
             return bool(row.cancel_requested)
 

@@ -62,7 +62,8 @@ jobs = sa.Table(
     sqlite_autoincrement=True,
 )
 """``attempts`` says how often a worker took the job up, and is what a worker must name to write; ``lost`` is how often
-one died with it; ``done`` counts the phases that need not be run again; ``events`` the rows of ``job_events``.
+one died with it since it last finished a phase; ``done`` counts the phases that need not be run again; ``events`` the
+rows of ``job_events``.
 """
 sa.Index("jobs_by_state", jobs.c.state, jobs.c.number)
 sa.Index("jobs_by_object", jobs.c.object, jobs.c.number)

@@ -1,5 +1,6 @@
 """The surrogate renderer: rasterise once, then gather. Usable without any server."""
 
+from trompe_server.surrogate.canvas import Canvas
 from trompe_server.surrogate.sampling import SamplingModel
 from trompe_server.surrogate.surrogate import (
     Geometry,
@@ -12,6 +13,7 @@ from trompe_server.surrogate.surrogate import (
 )
 
 __all__ = [
+    "Canvas",
     "Geometry",
     "SamplingModel",
     "Surrogate",

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import FunctionCtx
 
-__all__ = ["MipLayout", "mip_layout", "read_texels"]
+__all__ = ["MipChain", "MipLayout", "Reads", "mip_chains", "mip_layout", "read_texels", "round_level_"]
 
 Reads = Sequence[Int[Tensor, " _"]]
 """Of each mip level in the layout's order, texels (row * width + column), ascending."""
@@ -65,26 +65,27 @@ class _ReadTexels(Function):
 
     @staticmethod
     def forward(ctx: FunctionCtx, layout: MipLayout, reads: Reads, rounded: bool, *textures: Tensor) -> Tensor:
-        chains = _chains(layout, reads)
+        chains = mip_chains(layout, reads)
         ctx.chains = chains  # type: ignore[attr-defined]
         pairs = zip(chains, textures, strict=True)
         return torch.cat([part for chain, texture in pairs for part in chain.read(texture, rounded=rounded)])
 
     @staticmethod
     def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        chains: list[_Chain] = ctx.chains  # type: ignore[attr-defined]
+        chains: list[MipChain] = ctx.chains  # type: ignore[attr-defined]
         counts = [len(level) for chain in chains for level in chain.reads]
         parts = iter(torch.split(gradient, counts))
         return (None, None, None, *(chain.spread([next(parts) for _ in chain.sizes]) for chain in chains))
 
 
-def _chains(layout: MipLayout, reads: Reads) -> list["_Chain"]:
+def mip_chains(layout: MipLayout, reads: Reads) -> list["MipChain"]:
+    """The mip levels of each texture, with what is read of them."""
     levels = iter(reads)
-    return [_Chain(sizes, tuple(next(levels) for _ in sizes)) for sizes in layout.sizes]
+    return [MipChain(sizes, tuple(next(levels) for _ in sizes)) for sizes in layout.sizes]
 
 
 @dataclass(frozen=True)
-class _Chain:
+class MipChain:
     """The mip levels of one texture, and what is read of them."""
 
     sizes: tuple[tuple[int, int], ...]
@@ -164,8 +165,13 @@ def _halved(level: Float[Tensor, "H W channels"], *, rounded: bool) -> Float[Ten
                 level += window
             level.div_(len(windows))
             if rounded:
-                level.mul_(255).add_(0.5 + 1e-4).floor_().div_(255)
+                round_level_(level)
     return level
+
+
+def round_level_(level: Float[Tensor, "*texels channels"]) -> None:
+    """Round a level to 8 bits, in place."""
+    level.mul_(255).add_(0.5 + 1e-4).floor_().div_(255)
 
 
 def _windows(level: Float[Tensor, "H W channels"], axis: int) -> list[Tensor]:

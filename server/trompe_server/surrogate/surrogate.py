@@ -20,6 +20,7 @@ from torch.autograd import Function
 from torch.autograd.function import FunctionCtx
 from torch.nn.functional import softshrink
 
+from trompe_server.surrogate.canvas import Canvas, canvas_of
 from trompe_server.surrogate.pyramid import MipLayout, mip_layout, read_texels
 from trompe_server.surrogate.rasterize import Mesh, mesh_of, project, rasterize
 from trompe_server.surrogate.sampling import AlphaTest, Gather, SamplingModel, Taps, fragments_of, taps_of
@@ -173,7 +174,7 @@ def _joined(numbers: range, views: Sequence[_View], place: Int[Tensor, " texels"
 
 
 class _RenderViews(Function):
-    """Images of a batch of views from the texels, with the gradient's way back.
+    """Images of a batch of views from the texels, with the gradient's way back (where that is not finite, as zero).
 
     ``masks`` (saliency), where given, multiplies the image gradient before it flows into the texture (the paper's
     equation 4).
@@ -199,7 +200,7 @@ class _RenderViews(Function):
     @staticmethod
     def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[Tensor, None, None, None]:
         some: ViewBatch = ctx.some  # type: ignore[attr-defined]
-        pixels = gradient.permute(0, 2, 3, 1).reshape(-1, 3).index_select(0, some.pixel)
+        pixels = gradient.permute(0, 2, 3, 1).reshape(-1, 3).index_select(0, some.pixel).nan_to_num_(0, 0, 0)
         return some.gather.transpose(pixels.mul_(ctx.slopes)), None, None, None  # type: ignore[attr-defined]
 
 
@@ -234,6 +235,16 @@ class Surrogate:
         if self.geometry.sampling.filtered == "linear":
             return self.geometry.texels([decode(texture) for texture in ordered])
         return self.geometry.texels(ordered, rounded=self.geometry.sampling.mips == "rounded")
+
+    def canvas(
+        self, textures: Mapping[str, Float[Tensor, "H W 3"]], moving: Mapping[str, Bool[Tensor, "H W"]]
+    ) -> Canvas:
+        """What may move of ``textures``: the tiles that hold a texel which is ``moving``. ``canvas.read`` is then a
+        cheaper ``texels``."""
+        geometry, linear = self.geometry, self.geometry.sampling.filtered == "linear"
+        rounded = geometry.sampling.mips == "rounded" and not linear
+        whole, masks = ([table[name] for name in geometry.textures] for table in (textures, moving))
+        return canvas_of(whole, masks, geometry.layout, geometry.reads, linear=linear, rounded=rounded)
 
     def render(
         self, texels: Float[Tensor, "texels 3"], batch: int, *, masks: Bool[Tensor, "views H W"] | None = None

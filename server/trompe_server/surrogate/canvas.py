@@ -1,0 +1,219 @@
+"""The part of the textures that moves, as one flat tensor, and what the views read while it does.
+
+Most texels of a texture are seen by no view or lie outside of the charts. What moves is kept in square tiles, and the
+texels of all tiles in an order in which the four that the next mip level averages lie a quarter of the whole apart: so
+a level is made by adding four contiguous arrays, and nothing is made for the rest of the texture, which stays as it is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import FunctionCtx
+
+from trompe_server.surrogate.pyramid import MipChain, MipLayout, Reads, mip_chains, round_level_
+from trompe_server.surrogate.shading import decode
+
+__all__ = ["Canvas", "canvas_of"]
+
+DEPTH = 3
+"""Tiles have sides of up to 2 ** DEPTH texels: larger ones hold more texels that need not move, smaller ones leave more
+to the levels that are made whole."""
+
+
+def canvas_of(
+    textures: Sequence[Float[Tensor, "H W 3"]],
+    moving: Sequence[Bool[Tensor, "H W"]],
+    layout: MipLayout,
+    reads: Reads,
+    *,
+    linear: bool,
+    rounded: bool,
+) -> "Canvas":
+    """The tiles of ``textures`` (sRGB in [0, 1]) in which a texel is ``moving``.
+
+    ``linear``: averaged in linear light, not as they are. Other arguments as for ``read_texels``.
+    """
+    sheets, source, texels = [], [], []
+    for texture, mask, chain in zip(textures, moving, mip_chains(layout, reads), strict=True):
+        tiles = _Tiles.of(chain, mask)
+        source.append(texture.flatten(0, 1).index_select(0, tiles.order))
+        texture = decode(texture) if linear else texture
+        found = tiles.fine.read(texture, rounded=rounded)
+        sheets.append(_Sheet(tiles, found[-1]))
+        texels += [*found[:-1], *(texture.new_zeros(len(level), 3) for level in tiles.coarse.reads)]
+    return Canvas(tuple(sheets), torch.cat(source), torch.cat(texels), linear, rounded)
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """The texels that may move, (texels, 3) in an order of its own.
+
+    source: their sRGB values before anything moves. still: the texels that views read then, sRGB or linear as they are
+    averaged.
+    """
+
+    sheets: tuple["_Sheet", ...]
+    source: Float[Tensor, "texels 3"]
+    still: Float[Tensor, "reads 3"]
+    linear: bool
+    rounded: bool
+
+    @cached_property
+    def counts(self) -> list[int]:
+        """How many texels of each texture may move."""
+        return [len(sheet.tiles.order) for sheet in self.sheets]
+
+    def join(self, tables: Sequence[Tensor]) -> Tensor:
+        """What tables (H, W, ...), one for each texture, say of the texels that may move, (texels, ...)."""
+        parts = zip(self.sheets, tables, strict=True)
+        return torch.cat([table.flatten(0, 1).index_select(0, sheet.tiles.order) for sheet, table in parts])
+
+    def split(self, values: Tensor) -> list[Tensor]:
+        """The reverse of ``join``: tables (H, W, ...) that are zero where nothing may move."""
+        tables = []
+        for sheet, part in zip(self.sheets, torch.split(values, self.counts), strict=True):
+            height, width = sheet.tiles.fine.sizes[0]
+            table = part.new_zeros(height * width, *part.shape[1:]).index_copy_(0, sheet.tiles.order, part)
+            tables.append(table.view(height, width, *part.shape[1:]))
+        return tables
+
+    def read(self, values: Float[Tensor, "texels 3"]) -> Float[Tensor, "reads 3"]:
+        """What views read, as ``Surrogate.texels`` has it, when the canvas has ``values`` (sRGB). Differentiable."""
+        texels: Tensor = _ReadCanvas.apply(decode(values) if self.linear else values, self)  # type: ignore[no-untyped-call]
+        return texels
+
+    def forward(self, values: Float[Tensor, "texels 3"]) -> Float[Tensor, "reads 3"]:
+        """``read`` of values as they are averaged."""
+        texels = self.still.clone()
+        for sheet, part, reads in zip(self.sheets, torch.split(values, self.counts), self._split(texels), strict=True):
+            sheet.read(part, reads, rounded=self.rounded)
+        return texels
+
+    def transpose(self, gradient: Float[Tensor, "reads 3"]) -> Float[Tensor, "texels 3"]:
+        """What the texels of the canvas get from the ``gradient`` by what views read."""
+        parts = zip(self.sheets, self._split(gradient), strict=True)
+        return torch.cat([sheet.spread(reads) for sheet, reads in parts])
+
+    def _split(self, reads: Float[Tensor, "reads 3"]) -> tuple[Tensor, ...]:
+        return torch.split(reads, [sheet.tiles.n_reads for sheet in self.sheets])
+
+
+class _ReadCanvas(Function):
+    """``Canvas.read``, with the gradient's way back."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, values: Tensor, canvas: Canvas) -> Tensor:
+        ctx.canvas = canvas  # type: ignore[attr-defined]
+        return canvas.forward(values.detach())
+
+    @staticmethod
+    def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[Tensor, None]:
+        return ctx.canvas.transpose(gradient), None  # type: ignore[attr-defined]
+
+
+@dataclass(frozen=True)
+class _Tiles:
+    """The tiles of one texture in which something may move.
+
+    fine: the mip levels that are made tile by tile, and the first one that is made whole (all of it is read). coarse:
+    that one and the levels behind it. tiles: which texels of that level they are, ascending. order: the texels (row *
+    width + column) of all tiles, (a texel of the 2 x 2 that become one, the same of the next level, ..., tile).
+    hits: of each fine level which of the texels read lie in tiles, and where.
+    """
+
+    fine: MipChain
+    coarse: MipChain
+    tiles: Int[Tensor, " tiles"]
+    order: Int[Tensor, " texels"]
+    hits: tuple[tuple[Int[Tensor, " _"], Int[Tensor, " _"]], ...]
+
+    @classmethod
+    def of(cls, chain: MipChain, moving: Bool[Tensor, "H W"]) -> "_Tiles":
+        depth = next((k for k, (h, w) in enumerate(chain.sizes[:DEPTH]) if h % 2 or w % 2), DEPTH)
+        height, width = chain.sizes[depth]
+        side = 2**depth
+        rows = moving.byte().view(height, side, -1).amax(1)
+        tiles = rows.view(height, width, side).amax(2).flatten().nonzero()[:, 0]
+        everything = torch.arange(height * width, device=moving.device)
+        place = torch.full_like(everything, -1).index_copy_(0, tiles, everything[: len(tiles)])
+        fine = MipChain(chain.sizes[: depth + 1], (*chain.reads[:depth], everything))
+        coarse = MipChain(chain.sizes[depth:], chain.reads[depth:])
+        hits = tuple(_hits(fine, level, place, len(tiles)) for level in range(depth))
+        return cls(fine, coarse, tiles, _order(tiles, width, depth), hits)
+
+    @property
+    def n_reads(self) -> int:
+        """How many texels views read of this texture, of all its levels."""
+        return sum(map(len, self.fine.reads[:-1])) + sum(map(len, self.coarse.reads))
+
+
+def _order(tiles: Int[Tensor, " tiles"], width: int, depth: int) -> Int[Tensor, " texels"]:
+    """The texels of level 0 of ``tiles``, which are texels of level ``depth``, ``width`` in a row."""
+    order = tiles
+    for level in reversed(range(depth)):
+        across = width << depth - level
+        order = order // (across // 2) * (2 * across) + order % (across // 2) * 2
+        corners = torch.tensor([0, 1, across, across + 1], device=tiles.device)
+        order = (corners[:, None] + order).flatten()
+    return order
+
+
+def _hits(
+    fine: MipChain, level: int, place: Int[Tensor, " coarse"], n_tiles: int
+) -> tuple[Int[Tensor, " hits"], Int[Tensor, " hits"]]:
+    """Which of the texels read of a fine level lie in tiles, and where among the texels of all tiles of the level."""
+    depth = len(fine.sizes) - 1 - level
+    reads, width = fine.reads[level], fine.sizes[level][1]
+    row, column = reads // width, reads % width
+    tile = place[(row >> depth) * (width >> depth) + (column >> depth)]
+    inside = (tile >= 0).nonzero()[:, 0]
+    row, column, where = row[inside], column[inside], tile[inside]
+    for finer in range(depth):
+        corner = 2 * ((row >> finer) & 1) + ((column >> finer) & 1)
+        where = where + corner * (4 ** (depth - 1 - finer) * n_tiles)
+    return inside, where
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """The tiles of one texture, and around them its first level that is made whole, as it is before anything moves."""
+
+    tiles: _Tiles
+    around: Float[Tensor, "coarse 3"]
+
+    def read(self, values: Float[Tensor, "texels 3"], reads: Float[Tensor, "reads 3"], *, rounded: bool) -> None:
+        """Write what is read of each level into ``reads``, where that is not still."""
+        tiles, start = self.tiles, 0
+        for (inside, where), level in zip(tiles.hits, tiles.fine.reads, strict=False):
+            reads[start : start + len(level)].index_copy_(0, inside, values.index_select(0, where))
+            values, start = _averaged(values, rounded=rounded), start + len(level)
+        whole = self.around.index_copy(0, tiles.tiles, values).view(*tiles.coarse.sizes[0], 3)
+        torch.cat(tiles.coarse.read(whole, rounded=rounded), out=reads[start:])
+
+    def spread(self, reads: Float[Tensor, "reads 3"]) -> Float[Tensor, "texels 3"]:
+        """The transpose of ``read``."""
+        tiles = self.tiles
+        counts = [len(level) for level in (*tiles.fine.reads[:-1], *tiles.coarse.reads)]
+        parts, depth = torch.split(reads, counts), len(tiles.hits)
+        total = tiles.coarse.spread(parts[depth:]).view(-1, 3).index_select(0, tiles.tiles)
+        for level in reversed(range(depth)):
+            inside, where = tiles.hits[level]
+            total = total.div(4).expand(4, *total.shape).flatten(0, 1)
+            total.index_add_(0, where, parts[level].index_select(0, inside))
+        return total
+
+
+def _averaged(values: Float[Tensor, "texels 3"], *, rounded: bool) -> Float[Tensor, "quarter 3"]:
+    """The next level of all tiles: columns are averaged, then rows."""
+    values = values.view(2, 2, len(values) // 4, 3)
+    for axis in (1, 0):
+        first, second = values.unbind(axis)
+        values = (first + second).div_(2)
+        if rounded:
+            round_level_(values)
+    return values
