@@ -5,11 +5,13 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test check format clean egl
+.PHONY: help demo test compose check audit format clean egl
 
 help:
 	@echo "make demo    attack an object that comes with Trompe; results in trompe-demo/"
 	@echo "make test    run the tests (those with real objects too, if TROMPE_ASSETS names their folder)"
+	@echo "make compose build the images and test the stack of docker-compose.yml (needs Docker)"
+	@echo "make audit   look for known faults in what is installed, and write its list to out/sbom.json"
 	@echo "make check   format, lint, types, import rules"
 	@echo "make format  put the code into its form"
 	@echo "make clean   remove .venv, caches and trompe-demo/"
@@ -20,11 +22,23 @@ demo: $(VENV)/.installed-server egl
 test: $(VENV)/.installed-dev egl
 	$(BIN)/python -m pytest
 
+compose: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -m compose tests/compose -v -o log_cli=true -o log_cli_level=INFO
+
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The auditors have an environment of their own, so that they do not find themselves.
+audit: $(VENV)/.installed-dev
+	$(PYTHON) -m venv $(VENV)/audit
+	$(VENV)/audit/bin/pip install --quiet pip-audit cyclonedx-bom
+	mkdir -p out
+	$(VENV)/audit/bin/cyclonedx-py environment --output-format JSON --output-file out/sbom.json $(BIN)/python
+	$(BIN)/pip freeze --exclude-editable | sed 's/+cpu//' >out/installed.txt
+	$(VENV)/audit/bin/pip-audit --strict --no-deps --disable-pip -r out/installed.txt
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .

@@ -1,0 +1,10 @@
+"""Health of a renderer: whether it shakes hands. That its port is open says little: the supervisor keeps it open."""
+
+import socket
+
+from trompe_shared.sailenv import REGISTER
+
+with socket.create_connection(("127.0.0.1", 8085), timeout=5) as connection:
+    connection.sendall(REGISTER.encode_request(width=1, height=1, gzip=False))
+    reader = connection.makefile("rb")
+    REGISTER.decode_reply(lambda length: reader.read(length))
