@@ -96,7 +96,7 @@ class Schedule:
 class Search:
     """Moves a point step by step; see the head of this module.
 
-    movable: 1 for texels that may move, else 0. within: keeps the images' change in bounds as well, where that is asked for.
+    movable: 1 for texels that may move, else 0. within: keeps the images' change in bounds, where that is asked for.
     backgrounds: what each step's views are set in front of, where not their own.
     """
 
