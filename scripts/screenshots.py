@@ -19,7 +19,7 @@ from trompe_client import Client
 
 OUT: Final = Path(__file__).parents[1] / "docs" / "images" / "pages"
 FLAGS: Final = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
-WIDTH, HEIGHT = 1100, 800
+WIDTH, HEIGHT = 1100, 1250
 
 
 def main() -> None:

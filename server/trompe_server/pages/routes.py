@@ -108,8 +108,8 @@ def new_job(request: Request, services: ServicesDep) -> HTMLResponse:
         classifiers=classifiers,
         presets={name: {"help": preset.help, "options": dict(preset.options)} for name, preset in PRESETS.items()},
         turns=TURNS,
-        endings=".zip",
-        formats="A flat zip of an .obj, its .mtl and its textures.",
+        endings=".zip,.glb,.gltf,.fbx,.ply,.stl,.obj",
+        formats="GLB, FBX, PLY, STL, or a zip of an .obj or .gltf with its textures.",
     )
 
 
