@@ -1,0 +1,87 @@
+"""The list of jobs, without a browser: it shows a page at a time, however many there are."""
+
+import asyncio
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from trompe_server.access import Tokens
+from trompe_server.api.services import Services
+from trompe_server.app import create_app
+from trompe_server.artifacts import open_folder
+from trompe_server.jobs.store import JobStore
+from trompe_server.jobs.worker import prepare_data
+from trompe_server.library import Library
+from trompe_server.settings import Settings
+from trompe_shared.api import JobRequest
+
+JOBS = 120
+
+
+class Browserless:
+    """Asks the application itself, with no browser and no socket between."""
+
+    def __init__(self, app: FastAPI) -> None:
+        self._app = app
+
+    def get(self, path: str, **options: Any) -> httpx.Response:
+        return asyncio.run(self._get(path, options))
+
+    async def _get(self, path: str, options: dict[str, Any]) -> httpx.Response:
+        transport = httpx.ASGITransport(self._app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+            return await client.get(path, **options)
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browserless]:
+    settings = Settings(data=tmp_path_factory.mktemp("list"))
+    prepare_data(settings)
+    store, files = JobStore(settings.database_url), open_folder(settings.store_url)
+    for seed in range(JOBS):
+        labels = {"sweep": "even" if seed % 2 == 0 else "odd"}
+        store.create(JobRequest.model_validate({"object": "mug", "label": "mug", "seed": seed, "labels": labels}))
+    library = Library(files.within("library"))
+    app = create_app(Services(settings, library, store, files, Tokens(store.engine), list, list))
+    yield Browserless(app)
+    store.close()
+
+
+def jobs_on(page: str) -> list[str]:
+    return re.findall(r'<tr id="job-([0-9a-f]+)"', page)
+
+
+def test_pages_follow_each_other_until_all_jobs_were_shown(client: Browserless) -> None:
+    path, seen = "/jobs", []
+    while path:
+        page = client.get(path).text
+        found = jobs_on(page)
+        assert 0 < len(found) <= 50
+        seen += found
+        older = re.search(r'<a href="([^"]+)">Older</a>', page)
+        path = older[1].replace("&amp;", "&") if older else ""
+    assert len(seen) == len(set(seen)) == JOBS
+
+
+def test_filters_go_along_to_the_next_page(client: Browserless) -> None:
+    page = client.get("/jobs", params={"label": "sweep:odd"}).text
+    (older,) = re.findall(r'<a href="([^"]+)">Older</a>', page)
+    rest = client.get(older.replace("&amp;", "&")).text
+    assert len(jobs_on(page)) + len(jobs_on(rest)) == JOBS / 2
+
+
+@pytest.mark.parametrize("query", ["state=gone", "label=nocolon", "cursor=x"])
+def test_a_filter_that_makes_no_sense_is_told(client: Browserless, query: str) -> None:
+    answer = client.get(f"/jobs?{query}", headers={"Accept": "text/html"})
+    assert answer.status_code in {400, 422}
+    assert answer.headers["content-type"].startswith("text/html")
+    assert "<h1>" in answer.text
+
+
+def test_names_from_users_are_shown_as_text(client: Browserless) -> None:
+    page = client.get("/jobs", params={"label": "a:<script>alert(1)</script>"}).text
+    assert "<script>alert" not in page
