@@ -203,7 +203,7 @@ class _Sheet:
         total = tiles.coarse.spread(parts[depth:]).view(-1, 3).index_select(0, tiles.tiles)
         for level in reversed(range(depth)):
             inside, where = tiles.hits[level]
-            total = total.div(4).expand(4, *total.shape).flatten(0, 1)
+            total = total.div(4).repeat(4, 1)
             total.index_add_(0, where, parts[level].index_select(0, inside))
         return total
 
