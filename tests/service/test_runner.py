@@ -1,16 +1,18 @@
 """How a worker runs a job, without processes: the pipeline is a few lines, the database one that fails on demand."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from trompe_server import database
 from trompe_server.database import DatabaseDownError
+from trompe_server.jobs import heart as heart_module
 from trompe_server.jobs import runner as runner_module
-from trompe_server.jobs.desk import JobDesk
+from trompe_server.jobs.desk import Claim, JobDesk
 from trompe_server.jobs.heart import Heart
 from trompe_server.jobs.roll import WorkerRoll
 from trompe_server.jobs.runner import JobRunner, OpenedJob
@@ -201,6 +203,39 @@ def test_a_job_that_is_lost_unwinds_at_its_next_step(store: JobStore) -> None:
     assert runner.run(claim) is None
     assert pipeline.ran == ["a"]
     assert store.counts()[JobState.queued] == 1
+
+
+def test_nobody_is_called_dead_right_after_all_were_held_up(store: JobStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+
+    class HeldUp(WorkerRoll):
+        """The database is locked during the beat at 35 s."""
+
+        def beat(self, job: str | None, done: Mapping[str, float]) -> None:
+            nonlocal now
+            now += 20.0 if now == 35.0 else 0.0
+            super().beat(job, done)
+
+    monkeypatch.setattr(heart_module, "time", SimpleNamespace(monotonic=lambda: now))
+    job = store.create(JobRequest.model_validate({"object": "mug", "label": "mug"}))[0].id
+    heart = Heart(
+        HeldUp(store.engine, "w", device="cpu"), JobRunner(JobDesk(store.engine, "w"), _nothing), Meter(), silence=30
+    )
+    while now < 30.0:
+        now += 5.0
+        heart.beat()
+    assert JobDesk(store.engine, "never seen").claim(("any",)) is not None
+    now = 35.0
+    heart.beat()
+    assert store.get(job).state is JobState.running, "the other one could not be heard, either"
+    while now < 90.0:
+        now += 5.0
+        heart.beat()
+    assert store.get(job).state is JobState.queued
+
+
+def _nothing(_: Claim) -> OpenedJob:
+    raise AssertionError("there is nothing to open")
 
 
 def test_what_was_done_is_counted() -> None:

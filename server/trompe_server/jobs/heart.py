@@ -41,15 +41,15 @@ class Heart:
 
     def beat(self) -> None:
         """One heartbeat."""
-        if time.monotonic() - self._last > self._silence / 2:
-            self._heard_since = time.monotonic()  # this process was frozen, or its machine asleep
-        self._last = time.monotonic()
         claim, done = self._runner.current, self._meter.take()
         try:
             self._roll.beat(claim.job.id if claim else None, done)
         except BaseException:
             self._meter.add(**done)
             raise
+        if time.monotonic() - self._last > self._silence / 2:
+            self._heard_since = time.monotonic()  # this process was frozen, its machine asleep, the database held up
+        self._last = time.monotonic()
         if claim is not None and not self._runner.desk.holds(claim) and self._runner.current is claim:
             self._runner.lost.set()
         if time.monotonic() - self._heard_since > self._silence:

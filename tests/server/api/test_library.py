@@ -110,7 +110,7 @@ def test_uploads_are_looked_into_a_few_at_a_time_and_nothing_else_waits_for_them
     at_work, most, lock = 0, 0, threading.Lock()
     add = Library.add_object
 
-    def slowly(*arguments):
+    def slowly(*arguments, **options):
         nonlocal at_work, most
         with lock:
             at_work += 1
@@ -118,7 +118,7 @@ def test_uploads_are_looked_into_a_few_at_a_time_and_nothing_else_waits_for_them
         time.sleep(0.05)
         with lock:
             at_work -= 1
-        return add(*arguments)
+        return add(*arguments, **options)
 
     monkeypatch.setattr(Library, "add_object", slowly)
 
