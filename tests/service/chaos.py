@@ -1,0 +1,441 @@
+"""A service of real processes that somebody looks after, and somebody else who kills, freezes and stops them."""
+
+import hashlib
+import json
+import logging
+import os
+import random
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+from trompe_client import Client, Retries
+from trompe_client._job import JobHandle
+from trompe_server.jobs.fake import PHASES, trace
+from trompe_server.jobs.store import JobStore
+from trompe_server.jobs.worker import prepare_data
+from trompe_server.settings import Settings
+from trompe_shared.api import Event, Job, JobRequest, JobState
+
+logger = logging.getLogger(__name__)
+
+WORKERS: Final = 3
+RENDERERS: Final = 3
+REAL_EVERY: Final = 12
+"""One job of so many is a real attack."""
+KINDS: Final = {"serve": "API", "worker": "attack worker", "render": "renderer worker"}
+"""What a process is, by the command that it runs."""
+SHARES: Final = ["API", *["attack worker"] * WORKERS, *["renderer worker"] * RENDERERS]
+RESTART: Final = 0.5
+"""Seconds after which a process that died is started again by the one who looks after it."""
+
+Digests = Mapping[int, Mapping[str, str]]
+"""By the number of a job: the SHA-256 of each of its artifacts, but for the times in them."""
+
+
+def request(number: int) -> JobRequest:
+    """The job with this number: most are short and pretend, some are attacks, with a checkpoint in their middle."""
+    common = {"object": "mug", "label": "mug", "seed": number, "labels": {"run": "chaos"}}
+    if number % REAL_EVERY != REAL_EVERY // 3:
+        return JobRequest.model_validate(common | {"steps": 1})
+    views = {"pool": 0, "azimuths": 2, "elevations": 1, "held_out": 2}
+    return JobRequest.model_validate(common | views | {"steps": 10})
+
+
+def is_real(number: int) -> bool:
+    """Whether the job with this number is an attack."""
+    return request(number).steps > 1
+
+
+def wait_until(condition: Callable[[], Any], *, seconds: float, story: Callable[[], str] = str) -> None:
+    """Return once ``condition`` is true; fails after ``seconds`` with ``story``."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {seconds:.0f} s in vain\n{story()}"
+        time.sleep(0.1)
+
+
+class Kept:
+    """A process that is started again whenever it dies, as compose would do. What it says goes to ``log``."""
+
+    def __init__(self, arguments: Sequence[str], environment: Mapping[str, str], log: Path) -> None:
+        self._command = [sys.executable, "-m", "trompe_server.jobs.leash", *arguments]
+        self._environment, self._log = os.environ | environment, log
+        self._stopping = threading.Event()
+        self.process: subprocess.Popen[bytes] | None = None
+        self._thread = threading.Thread(target=self._look_after, daemon=True)
+        self._thread.start()
+
+    def _look_after(self) -> None:
+        while not self._stopping.is_set():
+            with self._log.open("ab") as log:
+                self.process = subprocess.Popen(
+                    self._command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=self._environment
+                )
+            self.process.wait()
+            assert self.process.stdin is not None
+            self.process.stdin.close()
+            self._stopping.wait(RESTART)
+
+    def close(self) -> None:
+        """End it for good."""
+        self._stopping.set()
+        if self.process is not None:
+            self.process.terminate()
+            try:
+                self.process.wait(40)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+        self._thread.join()
+
+
+class Site:
+    """Three attack workers, three renderer workers and the API on the database at ``url``, all under ``folder``.
+
+    On one machine (``scattered=False``) `trompe serve` looks after the others; else each process stands alone, and the
+    workers have nothing in common but the database and the store.
+    """
+
+    def __init__(self, folder: Path, url: str, *, scattered: bool, silence: float, dawdle: float) -> None:
+        self.folder = folder
+        self.settings = Settings(data=folder / "api", database=url, store=str(folder / "store"), silence=silence)
+        self._environment = {
+            "TROMPE_DATABASE": self.settings.database_url,
+            "TROMPE_STORE": self.settings.store_url,
+            "TROMPE_SILENCE": str(silence),
+            "TROMPE_RATE_LIMIT": "0",
+            "TROMPE_RENDERER_PATIENCE": "120",
+            "TROMPE_PIPELINE": "chaos_pipeline:open_pipeline",
+            "TROMPE_FAKE_SECONDS": str(dawdle),
+            "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]),
+            "OMP_NUM_THREADS": "1",
+        }
+        prepare_data(self.settings)
+        self.store = JobStore(self.settings.database_url, silence=silence)
+        self.port = free_port()
+        self._kept = self._scattered() if scattered else [self._serve(workers=WORKERS, renderers=RENDERERS)]
+
+    def _serve(self, *, workers: int, renderers: int) -> Kept:
+        numbers = ["--workers", str(workers), "--renderers", str(renderers)]
+        return self._keep("api", "serve", "--port", str(self.port), *numbers)
+
+    def _scattered(self) -> list[Kept]:
+        ports = [free_port() for _ in range(RENDERERS)]
+        known = [word for port in ports for word in ("--renderer", f"127.0.0.1:{port}")]
+        renderers = [self._keep(f"renderer-{port}", "render", "--port", str(port)) for port in ports]
+        workers = [self._keep(f"worker-{number}", "worker", *known) for number in range(WORKERS)]
+        return [self._serve(workers=0, renderers=0), *workers, *renderers]
+
+    def _keep(self, name: str, *arguments: str) -> Kept:
+        """A process with a data folder of its own."""
+        own = {"TROMPE_DATA": str(self.folder / name)}
+        return Kept(arguments, self._environment | own, self.folder / f"{name}.log")
+
+    def client(self) -> Client:
+        """A client that outlasts what happens to the API."""
+        url = f"http://127.0.0.1:{self.port}"
+        return Client(url, timeout=120, retries=Retries(limit=1000, longest=1.0))
+
+    def processes(self) -> dict[str, list[int]]:
+        """Ids of the living processes that are ours, by what they are."""
+        table = process_table()
+        roots = {kept.process.pid for kept in self._kept if kept.process is not None}
+        found: dict[str, list[int]] = {kind: [] for kind in KINDS.values()}
+        for pid in sorted(table):
+            kind = kind_of(pid)
+            if kind is not None and roots & set(ancestry(pid, table)):
+                found[kind].append(pid)
+        return found
+
+    def wait_ready(self) -> None:
+        """Return once the API answers and all attack workers are there."""
+        wait_until(lambda: sum(worker.alive for worker in self.store.workers()) == WORKERS, seconds=180, story=self.log)
+        with self.client() as client:
+            client.workers()
+
+    def folder_of(self, job: Job) -> Path:
+        """Where the files of a job are."""
+        return Path(self.settings.store_url) / "jobs" / job.id
+
+    def log(self) -> str:
+        """The last words of all processes."""
+        return "\n".join(f"--- {file.name}\n{file.read_text()[-2500:]}" for file in sorted(self.folder.glob("*.log")))
+
+    def said(self, words: str) -> int:
+        """How often a process has said something."""
+        return sum(file.read_text().count(words) for file in self.folder.glob("*.log"))
+
+    def __enter__(self) -> Self:
+        try:
+            self.wait_ready()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all processes."""
+        threads = [threading.Thread(target=kept.close) for kept in self._kept]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        self.store.close()
+
+
+class Mischief:
+    """What happens to the processes of ``site``; ``story`` tells what happened when, ``deeds`` counts it."""
+
+    def __init__(self, site: Site, *, seed: int) -> None:
+        self._site, self._random = site, random.Random(seed)
+        self._started = time.monotonic()
+        self._told: list[str] = [f"seed {seed}"]
+        self.deeds: Counter[str] = Counter()
+
+    def tell(self, words: str) -> None:
+        """Note what happened just now."""
+        self._told.append(f"{time.monotonic() - self._started:7.1f} s  {words}")
+        logger.info(self._told[-1])
+
+    def story(self) -> str:
+        """All that happened, and the last words of all processes."""
+        return "\n".join([*self._told, self._site.log()])
+
+    def kill(self) -> None:
+        """Kill one process of those that are there; each of API, attack workers and renderers as often as another."""
+        kind = self._random.choice(SHARES)
+        place = self._random.random()
+        pids = self._site.processes()[kind]
+        if not pids:
+            self.tell(f"no {kind} is there to be killed")
+            return
+        pid = pids[int(place * len(pids))]
+        self.tell(f"kill -9 {kind} {pid}, of {pids}; running: {self._running()}")
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+            self.deeds[f"{kind} killed"] += 1
+
+    def freeze(self, *, seconds: float) -> None:
+        """Stop an attack worker that has a job, an attack if there is one, and let it go on after so many seconds."""
+        busy = {job.worker: is_real(job.spec.seed) for job in self._site.store.page(state=JobState.running).jobs}
+        pids = [pid for pid in self._site.processes()["attack worker"] if worker_name_of(pid) in busy]
+        pids = [pid for pid in pids if busy.get(worker_name_of(pid))] or pids
+        if not pids:
+            return
+        pid = self._random.choice(pids)
+        self.tell(f"SIGSTOP {worker_name_of(pid)} {pid}, of {pids}; running: {self._running()}")
+        os.kill(pid, signal.SIGSTOP)
+        self.deeds["attack worker frozen"] += 1
+        try:
+            time.sleep(seconds)
+        finally:
+            self.tell(f"SIGCONT {pid}")
+            os.kill(pid, signal.SIGCONT)
+
+    def _running(self) -> str:
+        try:
+            jobs = self._site.store.page(state=JobState.running, limit=20).jobs
+        except Exception as error:
+            return f"unknown ({type(error).__name__})"
+        return ", ".join(f"{job.spec.seed} ({job.progress.phase}) by {job.worker}" for job in jobs) or "nothing"
+
+    @contextmanager
+    def every(self, pause: float, deed: Callable[[], None]) -> Iterator[None]:
+        """Do it again and again during the block, with so many seconds in between."""
+        stop = threading.Event()
+
+        def repeat() -> None:
+            while not stop.wait(pause):
+                try:
+                    deed()
+                except Exception as error:
+                    self.tell(f"FAILED: {type(error).__name__}: {error}")
+
+        thread = threading.Thread(target=repeat, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
+
+
+@dataclass(frozen=True)
+class Run:
+    """What came of the jobs of one run: each with its history and, by name, the digests of its artifacts."""
+
+    jobs: Mapping[int, Job]
+    events: Mapping[int, Sequence[Event]]
+    digests: Digests
+    seconds: float
+    repeated: int
+    """Phases of pretending jobs that were begun more than once."""
+    left: int
+    """Files that jobs left in the store beside their artifacts."""
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """The run in a few numbers."""
+        moved = [job for job in self.jobs.values() if job.attempts > 1]
+        most = max(job.attempts for job in self.jobs.values())
+        return {
+            "jobs": len(self.jobs),
+            "seconds": round(self.seconds, 1),
+            "ended": dict(Counter(job.state.value for job in self.jobs.values())),
+            "jobs taken up again": len(moved),
+            "attacks among them": sum(is_real(job.spec.seed) for job in moved),
+            "attempts beyond the first": sum(job.attempts - 1 for job in moved),
+            "most attempts": most,
+            "phases begun again": self.repeated,
+            "files left": self.left,
+        }
+
+
+class Submission:
+    """Jobs that are handed in one after the other, ``pause`` seconds apart, while other things happen."""
+
+    def __init__(self, site: Site, count: int, *, pause: float) -> None:
+        self._site, self._count, self._pause = site, count, pause
+        self._started = time.monotonic()
+        self._ids: list[str] = []
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._submit, daemon=True)
+        self._thread.start()
+
+    def _submit(self) -> None:
+        try:
+            with self._site.client() as client:
+                for number in range(self._count):
+                    self._ids.append(client.submit(request(number), key=f"chaos/{number}").id)
+                    time.sleep(self._pause)
+        except BaseException as error:
+            self._error = error
+
+    def ended(self) -> int:
+        """How many have ended; fewer while the database cannot say."""
+        if self._error is not None:
+            raise self._error
+        with suppress(Exception):
+            counts = self._site.store.counts()
+            return sum(counts[state] for state in JobState if state.final)
+        return 0
+
+    def wait(self, *, seconds: float, story: Callable[[], str] = str) -> None:
+        """Return once all were submitted and have ended."""
+        wait_until(lambda: self.ended() >= self._count, seconds=seconds, story=story)
+        self._thread.join()
+        self.seconds = time.monotonic() - self._started
+
+    def run(self) -> Run:
+        """What came of them, as the API tells it."""
+        with self._site.client() as client:
+            handles = list(client.jobs(labels={"run": "chaos"}))
+            assert sorted(handle.id for handle in handles) == sorted(self._ids), (
+                "there are more or fewer than submitted"
+            )
+            jobs = {handle.status.spec.seed: handle.status for handle in handles}
+            digests = {handle.status.spec.seed: self._digests(handle) for handle in handles}
+        events = {number: self._site.store.events(job.id) for number, job in jobs.items()}  # a client stops at the end
+        repeated = sum(self._repeated(job) for job in jobs.values())
+        return Run(jobs, events, digests, self.seconds, repeated, sum(self._left(job) for job in jobs.values()))
+
+    def _digests(self, handle: JobHandle) -> dict[str, str]:
+        files = handle.download(self._site.folder / "downloads" / handle.id)
+        return {file.name: hashlib.sha256(without_times(file)).hexdigest() for file in files}
+
+    def _repeated(self, job: Job) -> int:
+        notes = trace(self._site.folder_of(job))
+        return sum(notes.count(f"begin {phase}") > 1 for phase in PHASES)
+
+    def _left(self, job: Job) -> int:
+        files = [file for file in self._site.folder_of(job).glob("*/*") if file.is_file()]
+        return sum(file.name not in job.artifacts for file in files)
+
+
+def without_times(file: Path) -> bytes:
+    """The bytes of an artifact; of a report, those of all that does not tell how long things took."""
+    if file.name != "result.json":
+        return file.read_bytes()
+    result = json.loads(file.read_bytes())
+    result.pop("seconds", None)
+    return json.dumps(result).encode()
+
+
+def check_history(job: Job, events: Sequence[Event]) -> str | None:
+    """What is wrong with the history of a job; ``None`` where it was taken up, given back and ended as it should."""
+    if [event.id for event in events] != list(range(1, len(events) + 1)):
+        return f"its events are numbered {[event.id for event in events]}"
+    letters = "".join(_letter(event) for event in events)
+    if not re.fullmatch("q(sr*q)*sr*f", letters):
+        return f"its states were {[event.state.value for event in events]}"
+    if letters.count("s") != job.attempts:
+        return f"it was started {letters.count('s')} times in {job.attempts} attempts"
+    return None
+
+
+def _letter(event: Event) -> str:
+    """q: waits, s: is taken up by a worker, r: runs, f: has ended."""
+    if event.state.final:
+        return "f"
+    if event.state is JobState.queued:
+        return "q"
+    return "s" if event.message is not None and event.message.startswith(("started", "goes on with")) else "r"
+
+
+def process_table() -> dict[int, int]:
+    """The parent of each living process."""
+    table = {}
+    for entry in Path("/proc").iterdir():
+        with suppress(FileNotFoundError, ProcessLookupError, ValueError):
+            state, parent = (
+                (entry / "stat").read_text().rpartition(")")[2].split()[:2] if entry.name.isdecimal() else "Z0"
+            )
+            if state != "Z":
+                table[int(entry.name)] = int(parent)
+    return table
+
+
+def ancestry(pid: int, table: Mapping[int, int]) -> Iterator[int]:
+    """A process, its parent, and so on."""
+    while pid in table:
+        yield pid
+        pid = table[pid]
+
+
+def kind_of(pid: int) -> str | None:
+    """What a process of ours is; ``None`` where it is something else."""
+    with suppress(FileNotFoundError, ProcessLookupError, PermissionError):
+        words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+        if "trompe_server.jobs.leash" in words:
+            return KINDS.get(words[words.index("trompe_server.jobs.leash") + 1])
+    return None
+
+
+def worker_name_of(pid: int) -> str | None:
+    """The name of an attack worker, by the lock file that it holds."""
+    with suppress(FileNotFoundError, ProcessLookupError, PermissionError):
+        for entry in Path(f"/proc/{pid}/fd").iterdir():
+            file = Path(os.readlink(entry))
+            if slot := re.fullmatch(r"worker-(\d+)\.lock", file.name):
+                return f"{socket.gethostname()}-{slot[1]}-{file.read_text().strip()}"
+    return None
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port: int = free.getsockname()[1]
+        return port
