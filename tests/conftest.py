@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Generator, Iterator
@@ -21,6 +22,11 @@ Surface = tuple[ArrayLike, ArrayLike, NDArray[np.uint8]]
 
 INSTALLABLE = re.compile("install|NOT TESTED")
 """What the reason says of a test that is skipped for want of something that could be installed."""
+
+
+def pytest_configure() -> None:
+    """Let Ctrl-C reach what tests start, also where a shell ran us in the background and had it ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(wrapper=True)
