@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Final
+from urllib.parse import quote
 
 from playwright.sync_api import Page, sync_playwright
 
@@ -45,11 +46,20 @@ def main() -> None:
 def pages(server: str) -> Mapping[str, str]:
     """What is shown, by name."""
     with Client(server) as client:
-        done = list(islice(client.jobs(state="succeeded"), 2))
+        done = [handle.status for handle in islice(client.jobs(state="succeeded"), 2)]
     if len(done) < 2:
         sys.exit("Two jobs must have succeeded on the server, to show them.")
+    experiments = {job.labels["experiment"] for job in done if "experiment" in job.labels}
+    grid = {"experiment": f"/experiments/{quote(experiments.pop())}"} if experiments else {}
     compared = f"/jobs/compare?a={done[0].id}&b={done[1].id}"
-    return {"start": "/", "new": "/jobs/new", "jobs": "/jobs", "result": f"/jobs/{done[0].id}", "compare": compared}
+    return {
+        "start": "/",
+        "new": "/jobs/new",
+        "jobs": "/jobs",
+        "result": f"/jobs/{done[0].id}",
+        "compare": compared,
+        **grid,
+    }
 
 
 def shoot(page: Page, address: str, file: Path) -> None:

@@ -236,6 +236,9 @@ def test_a_server_that_restarts_in_mid_job_is_waited_for(service: Any, page: Pag
     page.goto(f"{service.url}/jobs/{job}")
     expect(page.locator("[data-field=step]")).to_contain_text("of", timeout=120_000)
 
+    expect(page.locator("#preview img")).to_be_visible(timeout=60_000)
+    assert page.locator("#preview img").evaluate("image => image.naturalWidth / image.naturalHeight") == 2
+
     service.stop()
     expect(page.locator("#notice")).to_contain_text("lost", timeout=15_000)
     service.start()
