@@ -7,6 +7,7 @@ be reached, everything that asks it raises ``DatabaseDownError``.
 
 import logging
 import random
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -137,7 +138,8 @@ def _say_that_it_is_down(context: ExceptionContext) -> BaseException | None:
 
 
 def _no_url(url: str) -> str:
+    shown = re.sub(r"(://[^:/@]*:).*@", r"\1***@", url)
     return (
-        f"{url!r} names no database that can be used: give sqlite:////absolute/path.sqlite or "
+        f"{shown!r} names no database that can be used: give sqlite:////absolute/path.sqlite or "
         "postgresql://user:password@host:5432/name (--database or TROMPE_DATABASE)."
     )

@@ -15,6 +15,7 @@ import pytest
 
 from trompe_server import library as library_module
 from trompe_server.artifacts import Folder, JobArtifacts, LocalArtifacts, job_artifacts, open_folder
+from trompe_server.database import connect
 from trompe_server.errors import NotFoundError, ServiceError
 from trompe_server.jobs.desk import Ending, JobDesk
 from trompe_server.jobs.retention import Retention
@@ -230,3 +231,9 @@ def test_retention_deletes_what_is_old_and_nothing_else(store: JobStore, tmp_pat
 
 def _job(store: JobStore) -> str:
     return store.create(JobRequest.model_validate({"object": "mug", "label": "mug"}))[0].id
+
+
+def test_a_database_url_that_cannot_be_used_is_quoted_without_its_password() -> None:
+    with pytest.raises(ServiceError, match=r"mysql://me:\*\*\*@host/jobs") as caught:
+        connect("mysql://me:geheim@host/jobs")
+    assert "geheim" not in str(caught.value)
