@@ -18,7 +18,7 @@ from trompe_server.jobs.store import JobStore
 from trompe_shared.api import Job, JobList, JobRequest, JobState, Result
 from trompe_shared.errors import SpecError
 
-__all__ = ["Cursor", "Limit", "router"]
+__all__ = ["Cursor", "Limit", "labels_of", "router"]
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=PROBLEMS)
 
@@ -78,7 +78,7 @@ def list_jobs(
     cursor: Cursor = None,
 ) -> JobList:
     """Jobs, newest first."""
-    wanted = _labels(labels)
+    wanted = labels_of(labels)
     return store.page(state=state, labels=wanted, object=object, classifier=classifier, limit=limit, cursor=cursor)
 
 
@@ -182,7 +182,8 @@ def _create(store: JobStore, request: JobRequest, response: Response, key: str |
     return job
 
 
-def _labels(texts: list[str]) -> dict[str, str]:
+def labels_of(texts: list[str]) -> dict[str, str]:
+    """Labels written as ``key:value``. Raises ``SpecError``."""
     labels: dict[str, str] = {}
     for text in texts:
         name, _, value = text.partition(":")

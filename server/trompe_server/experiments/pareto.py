@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogFormatter
 
+from trompe_server.experiments.front import front_of
 from trompe_server.experiments.groups import average, deviation, grouped, known
 from trompe_server.experiments.style import INK, MARKERS, PALETTE, Drawing, drawing
 from trompe_shared.experiment_table import ResultRow
@@ -69,15 +70,8 @@ def configurations(rows: Sequence[ResultRow], *, cost: Cost = "seconds") -> list
 
 
 def pareto_front(points: Sequence[Configuration]) -> list[Configuration]:
-    """The points that no other one beats: none is as cheap or cheaper and as good or better, and better in one of both.
-
-    From the cheapest to the best; of equal points the first.
-    """
-    front: list[Configuration] = []
-    for point in sorted(points, key=lambda p: (p.cost, -p.gain)):
-        if not front or point.gain > front[-1].gain:
-            front.append(point)
-    return front
+    """The configurations that no other one beats in cost and gain; see ``front_of``."""
+    return front_of(points, cost=lambda point: point.cost, gain=lambda point: point.gain)
 
 
 def speed_accuracy_chart(rows: Sequence[ResultRow], *, cost: Cost = "seconds") -> Drawing:

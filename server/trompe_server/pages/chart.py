@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from trompe_server.experiments.front import front_of
+
 __all__ = ["Chart", "Point", "chart"]
 
 LEFT, RIGHT, TOP, BOTTOM = 60.0, 700.0, 20.0, 310.0
@@ -48,6 +50,7 @@ def chart(points: Sequence[Point], *, measure: str) -> Chart:
     def y(drop: float) -> float:
         return round(BOTTOM - (BOTTOM - TOP) * (drop - bottom) / (1 - bottom), 1)
 
+    front = front_of(points, cost=lambda point: point.seconds, gain=lambda point: point.drop)
     objects = sorted({point.object for point in points})
     return Chart(
         points=[
@@ -60,21 +63,12 @@ def chart(points: Sequence[Point], *, measure: str) -> Chart:
             }
             for point in points
         ],
-        front=" ".join(f"{x(point.seconds)},{y(point.drop)}" for point in _front(points)),
+        front=" ".join(f"{x(point.seconds)},{y(point.drop)}" for point in front),
         x_ticks=[{"at": x(value), "text": f"{value:g}"} for value in marks],
         y_ticks=[{"at": y(value / 5), "text": f"{value / 5:.1f}"} for value in range(math.ceil(5 * bottom), 6)],
         objects=objects,
         measure=measure,
     )
-
-
-def _front(points: Sequence[Point]) -> list[Point]:
-    """Points that none beats in speed and in effect, the quickest first."""
-    front: list[Point] = []
-    for point in sorted(points, key=lambda p: (p.seconds, -p.drop)):
-        if not front or point.drop > front[-1].drop:
-            front.append(point)
-    return front
 
 
 def _marks(low: float, high: float) -> list[float]:

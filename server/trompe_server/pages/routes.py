@@ -13,8 +13,8 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from trompe_server.access import hash_secret
-from trompe_server.api.jobs import Cursor
-from trompe_server.api.jobs import _labels as filters_of
+from trompe_server.api.experiments import LABEL
+from trompe_server.api.jobs import Cursor, labels_of
 from trompe_server.api.services import Services, ServicesDep
 from trompe_server.database import DatabaseDownError
 from trompe_server.errors import NotFoundError
@@ -39,7 +39,6 @@ LATEST: Final = 8
 PAGE: Final = 50
 STREAM_INTERVAL: Final = 1.0
 LASTING: Final = {"Cache-Control": "private, max-age=31536000, immutable"}
-EXPERIMENT: Final = "experiment"
 
 State = Annotated[str, Query(pattern=f"^({'|'.join(JobState)})?$")]
 Label = Annotated[str, Query(max_length=264)]
@@ -178,7 +177,7 @@ def experiments(request: Request, services: ServicesDep) -> HTMLResponse:
     """All experiments."""
     found = [
         {"name": group.value, "jobs": {state.value: n for state, n in group.counts.items()}, "created": group.created}
-        for group in services.store.groups(EXPERIMENT)
+        for group in services.store.groups(LABEL)
     ]
     return page(request, "experiments.html", experiments=found)
 
@@ -186,7 +185,7 @@ def experiments(request: Request, services: ServicesDep) -> HTMLResponse:
 @router.get("/experiments/{name:path}")
 def show_experiment(request: Request, services: ServicesDep, name: str, cursor: Cursor = None) -> HTMLResponse:
     """The jobs of an experiment, and their speed against their accuracy."""
-    found = services.store.page(labels={EXPERIMENT: name}, limit=500, cursor=cursor)
+    found = services.store.page(labels={LABEL: name}, limit=500, cursor=cursor)
     if not found.jobs:
         raise NotFoundError(f"There is no experiment {name!r}.")
     pairs = [(_row(services, job), _result(services, job)) for job in found.jobs]
@@ -244,7 +243,7 @@ def _rows(
 ) -> tuple[list[JobRow], str | None]:
     found = services.store.page(
         state=JobState(state) if state else None,
-        labels=filters_of([label]) if label else {},
+        labels=labels_of([label]) if label else {},
         limit=limit,
         cursor=cursor,
     )
