@@ -34,6 +34,9 @@ __all__ = [
 CLASSIFIER_SUFFIXES: Final = (".pt2", ".pt", ".torchscript", ".onnx")
 CLASSIFIER_KINDS: Final = ("torchvision:", "hub:")
 """How names begin that are looked up elsewhere, whatever they end with."""
+SPLIT_SUFFIXES: Final = {".obj", ".gltf"}
+"""Models whose textures and materials lie in files beside them."""
+MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, ".glb", ".fbx", ".ply", ".stl"}
 PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
 
 
@@ -166,27 +169,30 @@ def each_source(sources: Sources) -> Sequence[str | Path]:
 
 
 def object_source(source: str | Path) -> Upload | str:
-    """A zip, an .obj file or a folder that holds one becomes an upload; any other word is a stored object's name.
+    """A zip, a model file or a folder that holds one becomes an upload; any other word is a stored object's name.
 
     Raises ``ObjectError`` for a path that is none of these.
     """
     path = Path(source)
-    is_path = isinstance(source, Path) or path.is_file() or path.suffix.lower() in {".zip", ".obj"}
-    return object_upload(path) if is_path or any(path.glob("*.[oO][bB][jJ]")) else str(source)
+    is_path = isinstance(source, Path) or path.is_file() or path.suffix.lower() in {".zip", *MODEL_SUFFIXES}
+    return object_upload(path) if is_path or (path.is_dir() and _models_in(path)) else str(source)
 
 
 def object_upload(path: Path) -> Upload:
-    """A zip, an .obj file with what lies beside it, or a folder that holds one. Raises ``ObjectError``."""
+    """A zip, a model file (an .obj or .gltf with what lies beside it), or a folder that holds one.
+
+    Raises ``ObjectError``.
+    """
     if path.is_dir():
         return Upload(f"{path.resolve().name}.zip", _zip_folder(path))
     if not path.is_file():
         raise ObjectError(
-            f"There is no file {str(path)!r}. Give a zip, a folder with an .obj, or a stored object's name."
+            f"There is no file {str(path)!r}. Give a zip, a model file, a folder with one, or a stored object's name."
         )
-    if path.suffix.lower() == ".obj":
+    if path.suffix.lower() in SPLIT_SUFFIXES:
         return Upload(f"{path.stem}.zip", _zip_files([path, *_companions(path)]))
-    if not zipfile.is_zipfile(path):
-        raise ObjectError(f"{str(path)!r} is not a zip archive. Give a zip, or the folder or .obj file itself.")
+    if path.suffix.lower() not in MODEL_SUFFIXES and not zipfile.is_zipfile(path):
+        raise ObjectError(f"{str(path)!r} is not a zip archive. Give a zip, or the folder or model file itself.")
     return Upload(path.name, path.read_bytes())
 
 
@@ -257,14 +263,18 @@ def _classes_beside(path: Path) -> list[str] | None:
 
 def _zip_folder(folder: Path) -> bytes:
     files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
-    if not any(file.suffix.lower() == ".obj" for file in files):
-        raise ObjectError(f"The folder {str(folder)!r} holds no .obj file.")
+    if not _models_in(folder):
+        raise ObjectError(f"The folder {str(folder)!r} holds no .obj, .gltf or other model file.")
     return _zip_files(files)
 
 
+def _models_in(folder: Path) -> list[Path]:
+    return [file for file in folder.iterdir() if file.suffix.lower() in MODEL_SUFFIXES]
+
+
 def _companions(mesh: Path) -> list[Path]:
-    """Material files and pictures in the folder of an .obj file."""
-    wanted = {".mtl", ".json", *PICTURE_SUFFIXES}
+    """Material files, buffers and pictures in the folder of an .obj or .gltf file."""
+    wanted = {".mtl", ".json", ".bin", *PICTURE_SUFFIXES}
     return [file for file in mesh.parent.iterdir() if file.is_file() and file.suffix.lower() in wanted]
 
 

@@ -50,6 +50,20 @@ def test_a_zip_is_sent_as_it_is(mug_folder, tmp_path):
     assert object_source(archive) == Upload("cup.zip", archive.read_bytes())
 
 
+@pytest.mark.parametrize("ending", ["glb", "FBX", "ply", "stl"])
+def test_a_model_in_one_file_is_sent_as_it_is(tmp_path, ending):
+    model = tmp_path / f"cup.{ending}"
+    model.write_bytes(b"any bytes: the server reads them")
+    assert object_source(model) == object_source(str(model)) == Upload(model.name, model.read_bytes())
+
+
+def test_a_gltf_file_takes_its_buffers_and_pictures_along(tmp_path):
+    for name in ("cup.gltf", "cup.bin", "paint.png", "notes.txt"):
+        (tmp_path / name).write_text("{}")
+    assert names(object_source(tmp_path / "cup.gltf")) == ["cup.bin", "cup.gltf", "paint.png"]
+    assert "cup.gltf" in names(object_source(tmp_path))
+
+
 def test_a_word_is_the_name_of_a_stored_object_even_where_a_folder_of_that_name_holds_no_mesh(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mug").mkdir()

@@ -178,7 +178,7 @@ GRID: Final = ("azimuths", "elevations")
 def attack(
     server: str | None, token: str | None, key: str | None, detach: bool, out: Path | None, **options: Any
 ) -> None:
-    """Attack OBJECT: a zip, a folder with an .obj, an .obj file, or the name of a stored object.
+    """Attack OBJECT: a zip, a model file (.obj, .glb, .gltf, .fbx, .ply, .stl), a folder with one, or a stored object.
 
     An option marked * can be given several times.
     """

@@ -36,7 +36,7 @@ def list_objects(client: Client) -> None:
 @json_option
 @with_client
 def add_object(client: Client, file: str, name: str | None) -> None:
-    """Store an object: a zip, a folder with an .obj, or an .obj file."""
+    """Store an object: a zip, a model file (.obj, .glb, .gltf, .fbx, .ply, .stl), or a folder with one."""
     stored = client.upload_object(file, name=name)
     say(stored, lambda: f"Object {stored.name}: {stored.id}")
 
