@@ -75,6 +75,7 @@ class JobOptions(TypedDict, total=False):
     azimuths: int
     elevations: int
     pool: int
+    views_per_step: int | None
     ranges: ViewRanges | Mapping[str, Any]
     held_out: int
     priority: Priority

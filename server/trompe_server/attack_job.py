@@ -58,9 +58,6 @@ logger = logging.getLogger(__name__)
 CHUNK: Final = 5
 """Attack steps per phase: what is lost at most when a worker dies."""
 
-VIEWS_PER_STEP: Final = 40
-"""Views of the pool that one step looks at."""
-
 PROBE_STREAM: Final = 0
 """Keeps the random numbers of the probes apart from those of the held-out views."""
 
@@ -244,7 +241,7 @@ class AttackJob:
             restarts=self.spec.restarts,
             masks=masks,
             texels=self._movable,
-            views_per_step=VIEWS_PER_STEP if self.spec.pool else None,
+            views_per_step=self.spec.n_views_per_step,
             backgrounds=self._backgrounds,
             seed=self.spec.seed,
             on_step=on_step,

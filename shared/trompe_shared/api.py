@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 __all__ = [
+    "VIEWS_PER_STEP",
     "VIEW_LIMITS",
     "Accuracy",
     "BackgroundInfo",
@@ -128,6 +129,10 @@ def _as_list(given: Any) -> Any:
     return [given] if isinstance(given, str) else given
 
 
+VIEWS_PER_STEP: Final = 40
+"""Views of a pool that one step looks at, where the job does not say."""
+
+
 class JobSpec(_Schema):
     """What to attack, and how. ``object`` and ``classifier`` are ids or names of stored ones."""
 
@@ -191,10 +196,23 @@ class JobSpec(_Schema):
     elevations: Annotated[int, Field(ge=1, le=180)] = Field(10, description="rows of the paper's grid of views")
     pool: Annotated[int, Field(ge=0, le=2000)] = Field(
         240,
-        description="attack this many random cameras and lights, 40 of them a step; 0: the paper's grid of views",
+        description="attack this many random cameras and lights; 0: the paper's grid of views",
+    )
+    views_per_step: Annotated[int, Field(ge=1, le=2000)] | None = Field(
+        None, description="views that a step looks at, drawn anew each time; null: 40 of a pool, all of the grid"
     )
     ranges: ViewRanges = Field(ViewRanges(), description="what pool and held-out views are drawn from")
     held_out: Annotated[int, Field(ge=0, le=1000)] = Field(60, description="held-out views the result is judged on")
+
+    @property
+    def n_views(self) -> int:
+        """How many views are attacked."""
+        return self.pool or self.azimuths * self.elevations
+
+    @property
+    def n_views_per_step(self) -> int:
+        """How many of them a step looks at."""
+        return min(self.n_views, self.views_per_step or (VIEWS_PER_STEP if self.pool else self.n_views))
 
     @model_validator(mode="before")
     @classmethod

@@ -11,7 +11,16 @@ from trompe_client.cli.connection import out_option, server_option, service, tok
 from trompe_client.cli.following import deliver, follow, follow_our_own
 from trompe_client.cli.options import Sectioned, SectionOption, tag_option
 from trompe_client.cli.output import json_option, say
-from trompe_shared.api import JobRequest, Loss, Needs, Optimiser, Priority, SurrogateModel, ViewRanges
+from trompe_shared.api import (
+    VIEWS_PER_STEP,
+    JobRequest,
+    Loss,
+    Needs,
+    Optimiser,
+    Priority,
+    SurrogateModel,
+    ViewRanges,
+)
 from trompe_shared.errors import SpecError
 
 __all__ = ["attack"]
@@ -110,6 +119,12 @@ GRID: Final = ("azimuths", "elevations")
     type=int,
     metavar="N",
     help="Scores asked per image and step, an even number; only for a classifier without gradients (.onnx).",
+)
+@_search(
+    "--views-per-step",
+    type=int,
+    metavar="N",
+    help=f"Views that a step looks at. Default: {VIEWS_PER_STEP} of a pool, all of the grid.",
 )
 @_search("--surrogate", type=click.Choice(get_args(SurrogateModel)), help=f"Default: {_default('surrogate')}.")
 @_search("--seed", type=int, metavar="S", help=f"Same seed, same bytes. Default: {_default('seed')}.")

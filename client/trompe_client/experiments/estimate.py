@@ -15,7 +15,6 @@ SHOW_LARGE: Final = 0.08
 """The same of 224x224 with MobileNetV2."""
 OVERHEAD: Final = 3.0
 """Seconds of a job for what does not grow with its views: loading networks, searching the sampling, writing."""
-VIEWS_PER_STEP: Final = 40
 
 
 def estimated_seconds(specs: Iterable[JobSpec]) -> float:
@@ -24,10 +23,9 @@ def estimated_seconds(specs: Iterable[JobSpec]) -> float:
 
 
 def _one(spec: JobSpec) -> float:
-    views = spec.pool or spec.azimuths * spec.elevations
-    per_step = min(views, VIEWS_PER_STEP) if spec.pool else views
+    views = spec.n_views
     renders = 2 * (views + spec.held_out) + (5 if spec.surrogate == "curve" else 2) * views
     show = SHOW if spec.classifier == "tiny" else SHOW_LARGE
     networks = 1 + len(spec.ensemble)
-    shown = spec.steps * per_step + views + 0.5 * (2 * views + spec.held_out)
+    shown = spec.steps * spec.n_views_per_step + views + 0.5 * (2 * views + spec.held_out)
     return OVERHEAD + renders * RENDER + networks * shown * show
