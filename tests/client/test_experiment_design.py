@@ -151,7 +151,7 @@ def test_files_are_named_by_their_bytes_and_then_by_what_the_server_called_them(
     assert stored.labels == {"experiment": "small"}
 
 
-@pytest.mark.parametrize("name", ["paper", "quick", "speed_accuracy", "stability"])
+@pytest.mark.parametrize("name", ["paper", "quick", "speed_accuracy", "stability", "surrogates"])
 def test_what_comes_with_trompe_can_be_planned(name: str, assets: Path) -> None:
     assert name in shipped_experiments()
     experiment = load_experiment(name)

@@ -313,7 +313,13 @@ def test_a_dry_run_says_how_many_jobs_there_are_and_asks_nobody() -> None:
 
 def test_the_shipped_files_are_listed() -> None:
     told = CliRunner().invoke(experiment, ["list"])
-    assert [line.split()[0] for line in told.output.splitlines()] == ["paper", "quick", "speed_accuracy", "stability"]
+    assert [line.split()[0] for line in told.output.splitlines()] == [
+        "paper",
+        "quick",
+        "speed_accuracy",
+        "stability",
+        "surrogates",
+    ]
 
 
 def test_a_table_of_another_kind_is_refused(tmp_path: Path) -> None:
