@@ -1,16 +1,27 @@
-"""What the user points at, made ready to send: files are read and options checked before any server is asked."""
+"""What the user points at, made ready to send: files are found and options checked before any server is asked."""
 
 import io
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, TypedDict, Unpack
+from typing import Any, BinaryIO, Final, TypedDict, Unpack
 
 from pydantic import ValidationError
 
-from trompe_shared.api import JobRequest, Loss, Needs, Optimiser, Priority, SurrogateModel, ViewRanges
+from trompe_shared.api import (
+    AttackOn,
+    JobRequest,
+    Loss,
+    Needs,
+    Optimiser,
+    Priority,
+    SunRanges,
+    SurrogateModel,
+    ViewRanges,
+)
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
 
 __all__ = [
@@ -45,16 +56,31 @@ Sources = str | Path | Sequence[str | Path]
 
 @dataclass(frozen=True)
 class Upload:
-    """A file to send, with the form fields that go with it."""
+    """A file to send, with the form fields that go with it.
+
+    ``content`` is its bytes, or the path of the file that holds them: that is read piece by piece while it is sent.
+    """
 
     filename: str
-    data: bytes = field(repr=False)
+    content: bytes | Path = field(repr=False)
     form: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def data(self) -> bytes:
+        """All its bytes."""
+        return self.content.read_bytes() if isinstance(self.content, Path) else self.content
+
+    def opened(self) -> AbstractContextManager[bytes | BinaryIO]:
+        """Its bytes, or the file, open for the time of the block."""
+        return self.content.open("rb") if isinstance(self.content, Path) else nullcontext(self.content)
 
 
 class JobOptions(TypedDict, total=False):
     """Options of a job; those left out take ``JobRequest``'s defaults, where they are explained."""
 
+    attack_on: AttackOn
+    sun: SunRanges | Mapping[str, Any]
+    vertex_budget: float
     epsilon: float
     alpha: float
     tau: float | None
@@ -194,7 +220,7 @@ def object_upload(path: Path) -> Upload:
         return Upload(f"{path.stem}.zip", _zip_files([path, *_companions(path)]))
     if path.suffix.lower() not in MODEL_SUFFIXES and not zipfile.is_zipfile(path):
         raise ObjectError(f"{str(path)!r} is not a zip archive. Give a zip, or the folder or model file itself.")
-    return Upload(path.name, path.read_bytes())
+    return Upload(path.name, path)
 
 
 def named_object_upload(path: Path, name: str | None) -> Upload:
@@ -221,7 +247,7 @@ def classifier_upload(source: str | Path, *, classes: list[str] | None = None, n
         )
     names = classes if classes is not None else _classes_beside(path)
     form = {"classes": json.dumps(names)} if names is not None else {}
-    return Upload(path.name, path.read_bytes(), form | ({"name": name} if name else {}))
+    return Upload(path.name, path, form | ({"name": name} if name else {}))
 
 
 def background_source(source: str | Path) -> Upload | str:
@@ -242,7 +268,7 @@ def mask_upload(path: Path) -> Upload:
 def _picture(path: Path, use: str, remedy: str) -> Upload:
     if not path.is_file():
         raise SpecError(f"There is no {use} picture {str(path)!r}. {remedy}")
-    return Upload(path.name, path.read_bytes())
+    return Upload(path.name, path)
 
 
 def _classes_beside(path: Path) -> list[str] | None:

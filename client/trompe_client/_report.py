@@ -51,7 +51,7 @@ def jobs_table(jobs: Sequence[Job]) -> Table:
     table = _table("job", "state", "object", "label", "classifier", "epsilon", "done", "created", *labels)
     for job in jobs:
         spec = job.spec
-        what = [_short(spec.object), str(spec.label), _short(spec.classifier), f"{spec.epsilon:g}"]
+        what = [_short(spec.object), str(spec.label), _short(spec.classifier), _budget(spec)]
         how = [f"{job.progress.fraction:.0%}", f"{job.created:%Y-%m-%d %H:%M}"]
         table.add_row(job.id, job.state.value, *what, *how, *([_words(job.labels)] if labels else []))
     return table
@@ -143,9 +143,9 @@ def _headline(result: Result) -> str:
     label = f"{result.label_name} ({result.label})" if result.label_name else str(result.label)
     tau = "none" if result.tau is None else f"{result.tau:g}"
     keep = "" if result.spec.keep is None else f", keep {result.spec.keep:g}"
-    numbers = (
-        f"epsilon {result.epsilon:g}, alpha {result.alpha:g}, tau {tau}{keep}, {result.steps} steps, seed {result.seed}"
-    )
+    budget = f"epsilon {result.epsilon:g}, alpha {result.alpha:g}, tau {tau}{keep}"
+    what = budget if result.spec.attack_on == "texture" else result.spec.attack_on
+    numbers = f"{what}, {result.steps} steps, seed {result.seed}"
     through = " and ".join([result.classifier, *(_short(member) for member in result.spec.ensemble)])
     return f"{result.object}, class {label}, attacked through {through}: {numbers}"
 
@@ -177,8 +177,7 @@ def _with_interval(share: float | None, interval: tuple[float, float] | None) ->
 def _facts(result: Result) -> Iterator[tuple[str, str]]:
     if result.goal_reached is not None and (result.spec.target_label is not None or result.spec.top_k > 1):
         yield "goal reached", f"{_percent(result.goal_reached)} of the target views: {_goal(result.spec)}"
-    yield "N% (texels altered)", _percent(result.texels_altered)
-    yield "mean texel change", _levels(result.mean_texel_change)
+    yield from _changed(result)
     yield "max view change", _levels(result.max_view_change)
     if result.views_beyond_epsilon is not None and result.pixels_beyond_epsilon is not None:
         views, pixels = _percent(result.views_beyond_epsilon), f"{result.pixels_beyond_epsilon:.2%}"
@@ -192,6 +191,26 @@ def _facts(result: Result) -> Iterator[tuple[str, str]]:
     if result.evaluations is not None:
         asked = "" if result.queries is None else f", {result.queries:,} scores asked"
         yield "images evaluated", f"{result.evaluations:,} by each attacked classifier{asked}"
+
+
+def _changed(result: Result) -> Iterator[tuple[str, str]]:
+    """What the attack changed of texels, light or vertices."""
+    light, vertices = result.light, result.vertices
+    if result.spec.attack_on == "texture":
+        yield "N% (texels altered)", _percent(result.texels_altered)
+        yield "mean texel change", _levels(result.mean_texel_change)
+    if light is not None:
+        place = {name: getattr(light, name) for name in ("azimuth", "elevation", "intensity", "ambient")}
+        words = ", ".join(f"{name} {value:.3g}" for name, value in place.items() if value is not None)
+        yield "light found", f"{words}; fooled {_percent(light.fooled)} of {light.tried_on} views that judge nothing"
+    if vertices is not None:
+        largest, mean = (f"{1000 * metres:.3g} mm" for metres in (vertices.largest, vertices.mean))
+        yield "vertices moved", f"at most {largest} ({vertices.largest_share:.1%} of the radius), {mean} on average"
+
+
+def _budget(spec: JobSpec) -> str:
+    """Epsilon, or what else may change."""
+    return f"{spec.epsilon:g}" if spec.attack_on == "texture" else spec.attack_on
 
 
 def _goal(spec: JobSpec) -> str:

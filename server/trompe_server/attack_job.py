@@ -1,4 +1,4 @@
-"""The main job: one object, one classifier, one attack, judged in the target renderer.
+"""The main job: one object, one classifier, one attack on the texture, judged in the target renderer.
 
 prepare     the target's images of the unpainted object, what the classifier says of them, its saliency
 calibrate   probes; how the target samples textures; the cheapest colour model that is good enough
@@ -7,12 +7,10 @@ judge       the 8-bit texture goes back into the target; report
 """
 
 import logging
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Final
 
 import numpy as np
 import torch
@@ -30,41 +28,29 @@ from trompe_server.attack import (
     image_gradients,
     movable,
     rank_texels,
-    saliency,
     saliency_masks,
     start,
 )
-from trompe_server.attack_report import Evidence, public_files, saliency_views
+from trompe_server.attack_report import saliency_views
+from trompe_server.beyond_job import LightJob, VertexJob
 from trompe_server.calibration_files import calibration_key, pack_calibration, unpack_calibration
 from trompe_server.classifiers.metered import meter_network
 from trompe_server.classifiers.network import NetworkClassifier
-from trompe_server.job_files import JobFiles
 from trompe_server.library import Library
 from trompe_server.meter import Meter
-from trompe_server.pipeline import VIEWS_AFTER, VIEWS_BEFORE, Artifacts, OnProgress, PhaseReport
+from trompe_server.phased_job import CHUNK, PROBE_STREAM, Image8, PhasedJob
+from trompe_server.pipeline import VIEWS_BEFORE, Artifacts, OnProgress, PhaseReport
 from trompe_server.reports import heat_textures
 from trompe_server.scene import Scene, open_scene
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate.calibration import Calibration, build_surrogate, calibrate
 from trompe_server.target import TargetRenderer
-from trompe_shared.api import JobSpec, JobState, Progress
-from trompe_shared.geometry import View
-from trompe_shared.object3d import Object3D, encode_png
+from trompe_shared.api import JobSpec
+from trompe_shared.object3d import encode_png
 
 __all__ = ["AttackJob", "open_pipeline"]
 
 logger = logging.getLogger(__name__)
-
-CHUNK: Final = 5
-"""Attack steps per phase: what is lost at most when a worker dies."""
-
-PROBE_STREAM: Final = 0
-"""Keeps the random numbers of the probes apart from those of the held-out views."""
-
-SHARES: Final = {"prepare": 0.15, "calibrate": 0.25, "attack": 0.45, "judge": 0.15}
-"""Parts of the progress bar."""
-
-Image8 = NDArray[np.uint8]
 
 
 def open_pipeline(
@@ -75,7 +61,7 @@ def open_pipeline(
     target: TargetRenderer,
     device: str = "cpu",
     meter: Meter | None = None,
-) -> "AttackJob":
+) -> PhasedJob:
     """The phases of the job that ``spec`` describes; ``meter`` counts what its networks are shown.
 
     Raises ``TrompeError`` for what the user can mend.
@@ -85,59 +71,30 @@ def open_pipeline(
         for each in {id(each): each for each in (*scene.members, scene.classifier, *scene.judges)}.values():
             if isinstance(each, NetworkClassifier):
                 meter_network(each.network, meter)
+    if spec.attack_on == "light":
+        return LightJob(spec, scene, artifacts)
+    if spec.attack_on == "vertices":
+        return VertexJob(spec, scene, artifacts)
     return AttackJob(spec, scene, artifacts, library.calibrations)
 
 
-class AttackJob:
-    """One job; see the head of this module. All that a phase leaves for later ones is in ``artifacts``.
+class AttackJob(PhasedJob):
+    """One attack on a texture; see the head of this module.
 
     ``calibrations`` are kept for other jobs: one that would ask the target the same questions asks none.
     """
 
     def __init__(self, spec: JobSpec, scene: Scene, artifacts: Artifacts, calibrations: Folder) -> None:
-        self.spec, self.scene, self.artifacts, self.calibrations = spec, scene, artifacts, calibrations
-        self.files = JobFiles(artifacts, chunks=-(-spec.steps // CHUNK))
+        super().__init__(spec, scene, artifacts)
+        self.calibrations = calibrations
         self._geometry: Future[Geometry] | None = None
         self.budget = Budget(spec.epsilon, spec.alpha, spec.epsilon_view)
 
-    def phases(self) -> list[str]:
-        """See ``Pipeline.phases``."""
-        return self.files.phases
-
-    def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
-        """See ``Pipeline.run``."""
-        kind, _, number = phase.partition("-")
-        self._running = kind, time.perf_counter()
-        if kind == "attack":
-            report = self._attack(int(number), on_progress)
-        else:
-            work = {"prepare": self._prepare, "calibrate": self._calibrate, "judge": self._judge}[kind]
-            report = work(on_progress)
-        self.files.note_seconds(phase, time.perf_counter() - self._running[1])
-        return report
-
     def _prepare(self, on_progress: OnProgress) -> PhaseReport:
-        scene = self.scene
-        total = len(scene.views) + len(scene.held_out)
-        ask = self._asker("prepare", total, on_progress)
-        own = ask(scene.obj, scene.views)
-        self.files.save(VIEWS_BEFORE, own=own, held_out=ask(scene.obj, scene.held_out))
-        if scene.white_box:
-            self.files.save("saliency", maps=saliency(own, scene.members, goal=scene.goal).numpy().astype(np.float16))
+        report = super()._prepare(on_progress)
+        if report.state is None:
             _ = self._masks  # a tau that leaves nothing is told before more is asked
-        if (scene.classifier.predict(own).argmax(axis=1) != scene.label).all():
-            return self._end_without_attack()
-        return PhaseReport(_progress("prepare", 1.0))
-
-    def _end_without_attack(self) -> PhaseReport:
-        name = self.scene.class_name(self.scene.label)
-        note = (
-            f"n.a.: the classifier recognises {name!r} in none of the {len(self.scene.views)} target views "
-            "of the unpainted object, so there is nothing to take away. "
-            "Check --label, --distance, --elevation and --background."
-        )
-        public = public_files(self._evidence(painted=None), self.artifacts, warnings=(note,))
-        return PhaseReport(_progress("judge", 1.0), JobState.not_applicable, note, public)
+        return report
 
     def _calibrate(self, on_progress: OnProgress) -> PhaseReport:
         if not self.files.has_calibration():
@@ -150,7 +107,7 @@ class AttackJob:
             self.files.save_calibration(packed)
             if found.renders:
                 self.calibrations.write(name, packed)
-        return PhaseReport(_progress("calibrate", 1.0))
+        return PhaseReport(self._progress("calibrate", 1.0))
 
     def _calibration_key(self, clean: Image8) -> str:
         scene, spec = self.scene, self.spec
@@ -196,15 +153,16 @@ class AttackJob:
     def _attack(self, chunk: int, on_progress: OnProgress) -> PhaseReport:
         before = self.files.load_state(chunk, step=chunk * CHUNK) if chunk else start(self._textures)
         steps = min(CHUNK, self.spec.steps - before.step)
-        last, taken, asked = _progress("attack", (before.step + steps) / self.spec.steps), [], self.scene.queries or 0
+        last, taken, asked = (
+            self._progress("attack", (before.step + steps) / self.spec.steps),
+            [],
+            self.scene.queries or 0,
+        )
 
         def on_step(step: Step) -> None:
             nonlocal last
             taken.append(step)
-            share = (step.step + 1) / self.spec.steps
-            last = _progress("attack", share).model_copy(
-                update={"step": step.step + 1, "steps": self.spec.steps, "loss": step.loss, "fooled": step.fooled}
-            )
+            last = self._step_progress(step.step + 1, loss=step.loss, fooled=step.fooled)
             on_progress(last)
 
         after = self._ascend(before, steps, on_step)
@@ -251,31 +209,20 @@ class AttackJob:
         scene = self.scene
         deltas = self.files.load_state(self.files.chunks, step=self.spec.steps).deltas
         painted = self.budget.repaint(scene.obj, deltas)
-        ask = self._asker("judge", len(scene.views) + len(scene.held_out), on_progress)
-        self.files.save(VIEWS_AFTER, own=ask(painted, scene.views), held_out=ask(painted, scene.held_out))
+        ask = self._show_judges(painted, scene.views, scene.held_out, on_progress)
+        hot = None
         if self._scores is not None:
-            hot = scene.obj.with_textures(heat_textures(scene.obj.textures, _numpy(self._scores)))
-            self.files.save("hot", images=ask(hot, [scene.views[index] for index in saliency_views(scene)]))
-        public = public_files(self._evidence(painted), self.artifacts, warnings=())
-        return PhaseReport(_progress("judge", 1.0), JobState.succeeded, None, public)
-
-    def _evidence(self, painted: Object3D | None) -> Evidence:
-        """What the report is written from; ``painted`` is ``None`` when there was no attack."""
-        kind, started = self._running
-        return Evidence(
-            spec=self.spec,
-            scene=self.scene,
-            before=self.files.load(VIEWS_BEFORE),
-            after=self.files.load(VIEWS_AFTER) if painted is not None else None,
+            heated = scene.obj.with_textures(heat_textures(scene.obj.textures, _numpy(self._scores)))
+            hot = ask(heated, [scene.views[index] for index in saliency_views(scene)])
+        evidence = replace(
+            self._seen(),
             painted=painted,
-            maps=None if self._maps is None else self._maps.numpy(),
-            scores=None if painted is None or self._scores is None else _numpy(self._scores),
-            hot=self.files.load("hot")["images"] if self.files.has("hot") else None,
-            surrogate=self._surrogate if painted is not None else None,
-            calibration=self._calibration if painted is not None else None,
-            spent=self.files.spent(),
-            seconds=self.files.seconds() | {kind: time.perf_counter() - started},
+            scores=None if self._scores is None else _numpy(self._scores),
+            hot=hot,
+            surrogate=self._surrogate,
+            calibration=self._calibration,
         )
+        return self._report(evidence)
 
     @cached_property
     def _textures(self) -> dict[str, torch.Tensor]:
@@ -334,30 +281,6 @@ class AttackJob:
             within.append(best_texels(rank_texels(self._surrogate, self._textures, gradients), self.spec.keep))
         return movable(self._surrogate, self.budget, self._masks, within=within)
 
-    def _asker(self, phase: str, total: int, on_progress: OnProgress) -> Callable[[Object3D, Sequence[View]], Image8]:
-        """Asks the target for images and tells how far the phase is; ``total`` images are the whole of it."""
-        done = 0
-
-        def on_frame() -> None:
-            nonlocal done
-            done += 1
-            on_progress(_progress(phase, min(1.0, done / total)))
-
-        def ask(obj: Object3D, views: Sequence[View]) -> Image8:
-            return self.scene.target.render(obj, views, size=self.scene.size, on_frame=on_frame)
-
-        return ask
-
 
 def _numpy(scores: Mapping[str, torch.Tensor]) -> dict[str, NDArray[np.float32]]:
     return {name: score.detach().cpu().numpy() for name, score in scores.items()}
-
-
-def _progress(phase: str, share: float) -> Progress:
-    """Progress of the whole job when ``share`` of ``phase`` is done."""
-    done = 0.0
-    for name, part in SHARES.items():
-        if name == phase:
-            return Progress(phase=phase, fraction=done + share * part)
-        done += part
-    raise KeyError(phase)

@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -50,7 +50,7 @@ from trompe_shared.errors import ObjectError
 from trompe_shared.geometry import Camera
 from trompe_shared.object3d import Object3D, encode_png
 
-__all__ = ["Evidence", "public_files", "saliency_views"]
+__all__ = ["Beyond", "Evidence", "public_files", "saliency_views"]
 
 Images = Mapping[str, NDArray[np.uint8]]
 """Target images (views, H, W, 3) of the attack's ``own`` views and of the ``held_out`` ones."""
@@ -65,6 +65,20 @@ LARGE_GAP: Final = 0.1
 
 
 @dataclass(frozen=True)
+class Beyond:
+    """What an attack on something else than the texture tells of itself.
+
+    words: what it changed, for titles. figures: fields of ``Result``. pictures: files by name. predicted: what its
+    model shows of the own views after the attack, (views, H, W, 3); ``None`` where it has no model.
+    """
+
+    words: str
+    figures: Mapping[str, Any]
+    pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    predicted: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True)
 class Evidence:
     """All that the report is written from. What belongs to the attack is ``None`` where there was none (n.a.)."""
 
@@ -72,17 +86,25 @@ class Evidence:
     scene: Scene
     before: Images
     after: Images | None
-    painted: Object3D | None
     maps: NDArray[np.float32] | None
     """Saliency of the own views (views, H, W); this and what is made of it: ``None`` without gradients."""
-    scores: Mapping[str, NDArray[np.float32]] | None
-    """Saliency accumulated per texel (H, W)."""
-    hot: NDArray[np.uint8] | None
-    """The target's images, of ``saliency_views``, of the object painted with ``scores`` as heat."""
-    surrogate: Surrogate | None
-    calibration: Calibration | None
     spent: Spent
     seconds: Mapping[str, float]
+    painted: Object3D | None = None
+    """The object as the attack left it; ``None`` also where it left the object alone."""
+    scores: Mapping[str, NDArray[np.float32]] | None = None
+    """Saliency accumulated per texel (H, W)."""
+    hot: NDArray[np.uint8] | None = None
+    """The target's images, of ``saliency_views``, of the object painted with ``scores`` as heat."""
+    surrogate: Surrogate | None = None
+    calibration: Calibration | None = None
+    beyond: Beyond | None = None
+    """``None`` where the texture was attacked."""
+
+    @property
+    def repainted(self) -> Object3D | None:
+        """The object after an attack on its texture."""
+        return self.painted if self.beyond is None else None
 
     @cached_property
     def logits_before(self) -> Mapping[str, NDArray[np.float32]]:
@@ -101,7 +123,9 @@ def public_files(evidence: Evidence, artifacts: Artifacts, *, warnings: Sequence
     """Write everything that is for the user; returns the names of the files, with those of the target's images."""
     files = _pictures(evidence)
     if evidence.painted is not None:
-        made, refused = _models(evidence.painted, evidence.scene.original)
+        # The form that it came in is written by repainting the original, which would keep its shape.
+        original = evidence.scene.original if evidence.beyond is None else None
+        made, refused = _models(evidence.painted, original)
         files, warnings = files | made, (*warnings, *refused)
     files["result.json"] = _result(evidence, warnings).model_dump_json(indent=1).encode()
     for name, data in files.items():
@@ -132,7 +156,8 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
     spec, scene = evidence.spec, evidence.scene
     target = _accuracy(evidence, "own")
     surrogate = _surrogate_accuracy(evidence)
-    painted, after = evidence.painted, evidence.logits_after or {}
+    painted, after = evidence.repainted, evidence.logits_after or {}
+    budget = {} if spec.attack_on == "texture" else {"epsilon": 0.0, "alpha": 0.0}
     return Result(
         spec=spec,
         object=scene.object_name,
@@ -140,7 +165,7 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
         label_name=scene.class_name(scene.label) if scene.classifier.classes else None,
         classifier=scene.classifier.name,
         ensemble=[member.name for member in scene.members[1:]],
-        **spec.model_dump(include={"epsilon", "alpha", "tau", "seed"}),
+        **(spec.model_dump(include={"epsilon", "alpha", "tau", "seed"}) | budget),
         steps=evidence.spent.steps,
         image_size=scene.size,
         surrogate=surrogate,
@@ -148,7 +173,7 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
         held_out=_accuracy(evidence, "held_out") if scene.held_out else None,
         transfer_gap=transfer_gap(surrogate, target),
         judges=[_judgement(judge, evidence) for judge in scene.judges],
-        **_calibration_fields(evidence),
+        **(_calibration_fields(evidence) if evidence.beyond is None else evidence.beyond.figures),
         texels_altered=texels_altered(scene.obj.textures, painted.textures) if painted else None,
         mean_texel_change=mean_texel_change(scene.obj.textures, painted.textures) if painted else None,
         **_view_changes(evidence),
@@ -179,6 +204,10 @@ def _goal_reached(evidence: Evidence) -> float | None:
 
 def _surrogate_accuracy(evidence: Evidence) -> Accuracy | None:
     """What the classifier says of the surrogate's own images, before and after."""
+    if evidence.beyond is not None and evidence.beyond.predicted is not None:
+        # A model of the target that is built on its own images shows these where nothing has moved.
+        before, after = evidence.logits_before["own"], evidence.scene.classifier.predict(evidence.beyond.predicted)
+        return accuracy(before, after, evidence.scene.label)
     if evidence.surrogate is None or evidence.painted is None:
         return None
     classifier, label = evidence.scene.classifier, evidence.scene.label
@@ -220,21 +249,19 @@ def _calibration_fields(evidence: Evidence) -> dict[str, Any]:
 
 def _view_changes(evidence: Evidence) -> dict[str, Any]:
     """How the target's images changed, over all views: by the paper's constraint, and as people see it."""
-    if evidence.after is None or evidence.painted is None:
+    if evidence.after is None:
         return {"max_view_change": None}
     scene = evidence.scene
     before, after = (np.concatenate([each["own"], each["held_out"]]) for each in (evidence.before, evidence.after))
     views = (*scene.views, *scene.held_out)
     pixels = object_pixels(before, after, behind(views, scene.backdrops, scene.size))
-    beyond = share_beyond(before, after, pixels, epsilon=evidence.spec.epsilon)
+    changes: dict[str, Any] = {"max_view_change": max_view_change(before, after)}
+    if evidence.repainted is not None:
+        beyond = share_beyond(before, after, pixels, epsilon=evidence.spec.epsilon)
+        changes |= {"pixels_beyond_epsilon": beyond[0], "views_beyond_epsilon": beyond[1]}
+        changes["texture_variation"] = total_variation(scene.obj.textures, evidence.repainted.textures)
     seen = perceived_change(before, after, pixels)
-    return {
-        "max_view_change": max_view_change(before, after),
-        "pixels_beyond_epsilon": beyond[0],
-        "views_beyond_epsilon": beyond[1],
-        "texture_variation": total_variation(scene.obj.textures, evidence.painted.textures),
-        **({} if seen is None else asdict(seen)),
-    }
+    return changes | ({} if seen is None else asdict(seen))
 
 
 def _warnings(evidence: Evidence, target: Accuracy, surrogate: Accuracy | None) -> list[str]:
@@ -253,7 +280,7 @@ def _warnings(evidence: Evidence, target: Accuracy, surrogate: Accuracy | None) 
 def _promises(evidence: Evidence, target: Accuracy, surrogate: Accuracy | None) -> list[str]:
     """What to know of an attack that came to nothing, or to less than the surrogate promised."""
     found = []
-    painted = evidence.painted
+    painted = evidence.repainted
     if painted is not None and texels_altered(evidence.scene.obj.textures, painted.textures) == 0:
         found.append(
             "No texel was altered: the classifier's gradient is zero on every view (a saturated softmax, or a step "
@@ -262,8 +289,8 @@ def _promises(evidence: Evidence, target: Accuracy, surrogate: Accuracy | None) 
     gap = transfer_gap(surrogate, target)
     if gap is not None and gap > LARGE_GAP:
         found.append(
-            f"The surrogate promised more than the target kept: its A_drop is larger by {gap:.2f}. "
-            "Try --surrogate auto, or look at the fidelity."
+            f"The surrogate promised more than the target kept: its A_drop is larger by {gap:.2f}."
+            + (" Try --surrogate auto, or look at the fidelity." if evidence.beyond is None else "")
         )
     return found
 
@@ -296,9 +323,11 @@ def _pictures(evidence: Evidence) -> dict[str, bytes]:
     scene = evidence.scene
     title = f"{scene.object_name} as {_short_name(scene, scene.label)!r}, {scene.classifier.name}"
     sheets = _saliency(evidence, f"Saliency of {title}")
-    if evidence.after is not None and evidence.painted is not None:
-        sheets |= _before_and_after(evidence, evidence.after, evidence.painted, title)
-    return {name: encode_png(sheet) for name, sheet in sheets.items()}
+    if evidence.after is not None:
+        sheets |= _before_and_after(evidence, evidence.after, title)
+    more = {} if evidence.beyond is None else evidence.beyond.pictures
+    pictures: dict[str, Image.Image | NDArray[np.uint8]] = {**sheets, **more}
+    return {name: encode_png(picture) for name, picture in pictures.items()}
 
 
 def _saliency(evidence: Evidence, title: str) -> dict[str, Image.Image]:
@@ -315,22 +344,22 @@ def _saliency(evidence: Evidence, title: str) -> dict[str, Image.Image]:
     return sheets
 
 
-def _before_and_after(evidence: Evidence, after: Images, painted: Object3D, title: str) -> dict[str, Image.Image]:
+def _before_and_after(evidence: Evidence, after: Images, title: str) -> dict[str, Image.Image]:
     scene, own = evidence.scene, evidence.before["own"]
     logits_before, logits_after = evidence.logits_before["own"], (evidence.logits_after or {})["own"]
     distinct = _distinct(scene)
     shown = distinct[representative(len(distinct), SHEET_VIEWS)]
     few = distinct[representative(len(distinct), DIFFERENCE_VIEWS)]
-    return {
+    changed = f"epsilon {evidence.spec.epsilon:g}" if evidence.beyond is None else evidence.beyond.words
+    sheets = {
         "contact_sheet.png": contact_sheet(
             own[shown],
             after["own"][shown],
             _verdicts(logits_before[shown], scene),
             _verdicts(logits_after[shown], scene),
-            title=f"{title}, epsilon {evidence.spec.epsilon:g}",
+            title=f"{title}, {changed}",
         ),
         "difference.png": difference_strip(own[few], after["own"][few], title=title),
-        "textures.png": texture_sheet(scene.obj.textures, painted.textures, title=title),
         "predictions.png": prediction_histogram(
             _counts(logits_before, scene),
             _counts(logits_after, scene),
@@ -338,6 +367,9 @@ def _before_and_after(evidence: Evidence, after: Images, painted: Object3D, titl
             title=f"What {title}, is taken for: {len(own)} target views",
         ),
     }
+    if evidence.repainted is not None:
+        sheets["textures.png"] = texture_sheet(scene.obj.textures, evidence.repainted.textures, title=title)
+    return sheets
 
 
 def _counts(logits: NDArray[np.float32], scene: Scene) -> Counter[str]:

@@ -2,10 +2,10 @@
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
@@ -16,6 +16,16 @@ from trompe_server.pipeline import Artifacts, DamagedFileError
 from trompe_server.surrogate.calibration import Calibration
 
 __all__ = ["JobFiles", "Spent"]
+
+
+class HasStep(Protocol):
+    """The state of a search; it knows after how many steps."""
+
+    @property
+    def step(self) -> int: ...
+
+
+State = TypeVar("State", bound=HasStep)
 
 
 @dataclass(frozen=True)
@@ -29,15 +39,16 @@ class Spent:
 
 @dataclass(frozen=True)
 class JobFiles:
-    """The files of one job whose attack takes ``chunks`` phases."""
+    """The files of one job whose attack takes ``chunks`` phases, after those named ``first``."""
 
     artifacts: Artifacts
     chunks: int
+    first: tuple[str, ...] = ("prepare", "calibrate")
 
     @property
     def phases(self) -> list[str]:
         """Names of the job's phases."""
-        return ["prepare", "calibrate", *(f"attack-{chunk:03d}" for chunk in range(self.chunks)), "judge"]
+        return [*self.first, *(f"attack-{chunk:03d}" for chunk in range(self.chunks)), "judge"]
 
     def save(self, name: str, **arrays: NDArray[Any]) -> None:
         """Keep arrays under ``name``."""
@@ -53,17 +64,25 @@ class JobFiles:
         return self.artifacts.exists(f"{name}.npz")
 
     def save_state(self, chunk: int, state: AttackState) -> None:
-        """Keep the checkpoint after ``chunk`` chunks. Two files take turns: the one a chunk starts from outlives it."""
-        self._seal(f"state-{chunk % 2}.npz", save_state(state))
+        """Keep the checkpoint of an attack on a texture; see ``save_checkpoint``."""
+        self.save_checkpoint(chunk, save_state(state))
 
     def load_state(self, chunk: int, *, step: int) -> AttackState:
-        """The checkpoint after ``chunk`` chunks, which are ``step`` steps.
+        """The checkpoint of an attack on a texture; see ``load_checkpoint``."""
+        return self.load_checkpoint(chunk, load_state, step=step)
+
+    def save_checkpoint(self, chunk: int, state: bytes) -> None:
+        """Keep a state after ``chunk`` chunks. Two files take turns: the one a chunk starts from outlives it."""
+        self._seal(f"state-{chunk % 2}.npz", state)
+
+    def load_checkpoint(self, chunk: int, load: Callable[[bytes], State], *, step: int) -> State:
+        """The state after ``chunk`` chunks, which are ``step`` steps; ``load`` reads its bytes.
 
         Raises ``DamagedFileError`` where it is not whole (the file holds checksums), or a later one is in its place.
         """
         name = f"state-{chunk % 2}"
         with _whole(name):
-            state = load_state(self._unseal(f"{name}.npz"))
+            state = load(self._unseal(f"{name}.npz"))
             if state.step != step:
                 raise ValueError(f"it is of step {state.step} instead of {step}")
         return state

@@ -18,7 +18,7 @@ from trompe_server.attack import (
     material_texels,
     painted_texels,
 )
-from trompe_server.checks import check_saliency
+from trompe_server.checks import check_saliency, check_vertices
 from trompe_server.classifiers import (
     Classifier,
     ScoreBasedClassifier,
@@ -40,6 +40,7 @@ __all__ = ["Scene", "open_scene"]
 
 SAILENV: Final = "sailenv"
 DEFAULT_ELEVATION: Final = (0.0, 50.0)
+LEAST_QUERIES: Final = 2
 Image8 = NDArray[np.uint8]
 
 
@@ -50,7 +51,8 @@ class Scene:
     classifier: the first of those that are attacked, by which the result is judged. members: all of them, as the attack
     needs them. goal: what they should say. within: masks of the texels that may change. views: what is attacked;
     ``held_out`` ones are only judged. backdrops: the pictures that views name, (H, W, 3). original: the file that the
-    object came as, and its name; ``None`` where that is ``obj``. device: where torch computes.
+    object came as, and its name; ``None`` where that is ``obj``. device: where torch computes. lights_tried_on: the
+    views by which an attack on the light looks for it; none of them is judged.
     """
 
     obj: Object3D
@@ -66,6 +68,7 @@ class Scene:
     backdrops: Mapping[str, Image8]
     original: tuple[bytes, str] | None = None
     device: str = "cpu"
+    lights_tried_on: tuple[View, ...] = ()
 
     @property
     def label(self) -> int:
@@ -115,6 +118,7 @@ def open_scene(spec: JobSpec, *, library: Library, target: TargetRenderer, devic
     stored = partial(_stored_classifier, library=library, device=device)
     classifier = stored(spec.classifier)
     distance, elevation = _framing(spec, obj, info.name if info.shipped else None)
+    drawn = partial(_drawn, spec, ViewDistribution(distance, elevation, **dict(spec.ranges)))
     pictures = {name: _picture(name, library) for name in spec.background if colour_of(name) is None}
     return Scene(
         obj,
@@ -124,11 +128,13 @@ def open_scene(spec: JobSpec, *, library: Library, target: TargetRenderer, devic
         tuple(stored(judge) for judge in spec.judges),
         _goal(spec, classifier),
         _within(spec, obj, library),
-        *_views(spec, distance, elevation),
+        drawn(spec.pool, POOL_STREAM) if spec.pool else _grid(spec, distance, elevation),
+        drawn(spec.held_out, HELD_OUT_STREAM),
         BackdropTarget(target, pictures) if pictures else target,
         {name: fitted(picture, classifier.image_size) for name, picture in pictures.items()},
         None if info.format == SAILENV else library.original(spec.object),
         device,
+        drawn(spec.n_views_per_step, LIGHT_STREAM) if spec.attack_on == "light" else (),
     )
 
 
@@ -152,7 +158,9 @@ def _members(spec: JobSpec, classifier: Classifier, others: Sequence[Classifier]
 
 
 def _by_scores(spec: JobSpec, classifier: Classifier) -> WhiteBoxClassifier:
-    if spec.queries is None:
+    check_vertices(spec, classifier.name)
+    queries = LEAST_QUERIES if spec.attack_on == "light" else spec.queries  # a light is found without gradients
+    if queries is None:
         raise ClassifierError(
             f"{classifier.name!r} gives scores but no gradients (.onnx). Attack a .pt2 file and name this one as a "
             "judge (--judge), or let gradients be estimated from scores (--queries 10)."
@@ -160,7 +168,7 @@ def _by_scores(spec: JobSpec, classifier: Classifier) -> WhiteBoxClassifier:
     check_saliency(spec, classifier.name)
     behind = colour_of(spec.background[0]) if len(spec.background) == 1 else None
     background = None if behind is None else torch.tensor(behind)[:, None, None] / 255
-    return score_based(classifier, seed=spec.seed, queries=spec.queries, sigma=spec.epsilon, background=background)
+    return score_based(classifier, seed=spec.seed, queries=queries, sigma=spec.epsilon, background=background)
 
 
 def _within(spec: JobSpec, obj: Object3D, library: Library) -> tuple[TexelMasks, ...]:
@@ -190,18 +198,14 @@ def _framing(spec: JobSpec, obj: Object3D, shipped: str | None) -> tuple[float, 
     return distance, elevation
 
 
-def _views(spec: JobSpec, distance: float, elevation: tuple[float, float]) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """The views that are attacked (the pool, else the paper's grid), and those held out."""
+def _drawn(spec: JobSpec, distribution: ViewDistribution, count: int, stream: int) -> tuple[View, ...]:
+    """Random views, other ones for each ``stream``."""
+    generator = np.random.default_rng([spec.seed, stream])
+    return _before(spec.background, distribution.sample(count, generator=generator), generator)
 
-    distribution = ViewDistribution(distance, elevation, **dict(spec.ranges))
 
-    def drawn(count: int, stream: int) -> tuple[View, ...]:
-        generator = np.random.default_rng([spec.seed, stream])
-        return _before(spec.background, distribution.sample(count, generator=generator), generator)
-
-    held_out = drawn(spec.held_out, HELD_OUT_STREAM)
-    if spec.pool:
-        return drawn(spec.pool, POOL_STREAM), held_out
+def _grid(spec: JobSpec, distance: float, elevation: tuple[float, float]) -> tuple[View, ...]:
+    """The paper's views."""
     grid = grid_views(
         distance=distance,
         elevation=elevation,
@@ -209,11 +213,11 @@ def _views(spec: JobSpec, distance: float, elevation: tuple[float, float]) -> tu
         elevations=spec.elevations,
         background=(255, 255, 255),
     )
-    return _before(spec.background, grid, np.random.default_rng([spec.seed, GRID_STREAM])), held_out
+    return _before(spec.background, grid, np.random.default_rng([spec.seed, GRID_STREAM]))
 
 
-HELD_OUT_STREAM, POOL_STREAM, GRID_STREAM = 1, 2, 3
-"""Keep the random numbers of held-out views, pool, the grid's backgrounds and probes (0) apart."""
+HELD_OUT_STREAM, POOL_STREAM, GRID_STREAM, LIGHT_STREAM = 1, 2, 3, 4
+"""Keep the random numbers of held-out views, pool, the grid's backgrounds, tried lights and probes (0) apart."""
 
 
 def _before(backgrounds: Sequence[str], views: Sequence[View], generator: np.random.Generator) -> tuple[View, ...]:

@@ -7,9 +7,12 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 __all__ = [
+    "SUN_LIMITS",
+    "VIEWS_PER_PLACE",
     "VIEWS_PER_STEP",
     "VIEW_LIMITS",
     "Accuracy",
+    "AttackOn",
     "BackgroundInfo",
     "ClassifierInfo",
     "Event",
@@ -20,6 +23,7 @@ __all__ = [
     "JobSpec",
     "JobState",
     "Judgement",
+    "LightFound",
     "Loss",
     "ObjectInfo",
     "Optimiser",
@@ -28,12 +32,15 @@ __all__ = [
     "Progress",
     "RendererInfo",
     "Result",
+    "SunRanges",
     "SurrogateModel",
+    "VerticesMoved",
     "ViewPrediction",
     "ViewRanges",
     "WorkerInfo",
 ]
 
+AttackOn = Literal["texture", "light", "vertices"]
 SurrogateModel = Literal["auto", "diffuse", "calibrated", "curve"]
 Optimiser = Literal["fgsm", "pgd", "momentum", "nesterov", "adam", "auto"]
 Loss = Literal["margin", "cross_entropy", "dlr"]
@@ -125,12 +132,57 @@ VIEW_LIMITS: Final[dict[str, Range]] = {
 """The widest range of each quantity of ``ViewRanges``."""
 
 
+class SunRanges(_Schema):
+    """Where an attack on the light may put it, and how strong; degrees, 360 of azimuth are a full circle."""
+
+    azimuth: Range = (-180.0, 180.0)
+    elevation: Range = (15.0, 88.0)
+    intensity: Range | None = Field(default=None, description="searched too where given; null: each view keeps its own")
+    ambient: Range | None = Field(default=None, description="searched too where given; null: each view keeps its own")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "SunRanges":
+        for name, (least, most) in SUN_LIMITS.items():
+            low, high = getattr(self, name) or (least, most)
+            if not least <= low <= high <= most:
+                raise ValueError(f"{name} must be a range within {least:g}..{most:g}, low end first; got {low} {high}")
+        return self
+
+
+SUN_LIMITS: Final[dict[str, Range]] = {
+    "azimuth": VIEW_LIMITS["light_azimuth"],
+    "elevation": VIEW_LIMITS["light_elevation"],
+    "intensity": VIEW_LIMITS["intensity"],
+    "ambient": VIEW_LIMITS["ambient"],
+}
+"""The widest range of each quantity of ``SunRanges``."""
+
+
 def _as_list(given: Any) -> Any:
     return [given] if isinstance(given, str) else given
 
 
 VIEWS_PER_STEP: Final = 40
 """Views of a pool that one step looks at, where the job does not say."""
+
+VIEWS_PER_PLACE: Final = 12
+"""Views on which each place of the light is tried, where the job does not say."""
+
+_TEXTURE_ONLY: Final = (
+    *("epsilon", "tau", "keep", "materials", "masks", "epsilon_view", "loss", "optimiser", "restarts", "queries"),
+    "surrogate",
+)
+_OPTIONS_OF: Final[dict[str, tuple[str, ...]]] = {
+    "texture": _TEXTURE_ONLY,
+    "light": ("sun",),
+    "vertices": ("vertex_budget",),
+}
+"""Options of a job that mean something for one kind of attack alone."""
+
+
+def _mean_step(epsilon: float) -> float:
+    """The default of ``alpha``."""
+    return min(0.01, max(epsilon / 5, 1e-9))
 
 
 class JobSpec(_Schema):
@@ -148,6 +200,14 @@ class JobSpec(_Schema):
         default_factory=list, description="classifiers that are attacked together with it, for transfer to others"
     )
     judges: list[str] = Field(default_factory=list, description="other classifiers that judge the result")
+    attack_on: AttackOn = Field(
+        "texture",
+        description="what may change: the object's texture, where its main light stands, or (slightly) its vertices",
+    )
+    sun: SunRanges = Field(SunRanges(), description="of light: where it may stand")
+    vertex_budget: Annotated[float, Field(gt=0, le=0.5)] = Field(
+        0.02, description="of vertices: how far one may move, as a share of the object's radius"
+    )
     epsilon: Annotated[float, Field(gt=0, le=1)] = 0.05
     alpha: Annotated[float, Field(gt=0, le=1)] = Field(
         0.01, description="mean step; by default 0.01, or a fifth of epsilon where that is smaller"
@@ -178,7 +238,9 @@ class JobSpec(_Schema):
     )
     surrogate: SurrogateModel = "auto"
     steps: Annotated[int, Field(ge=1, le=10_000)] = Field(
-        90, description="at most so many; the attack ends sooner where all views are safely won"
+        90,
+        description="at most so many; the attack on a texture ends sooner where all views are safely won. "
+        "Of light: places that are tried",
     )
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     distance: Annotated[float, Field(gt=0, le=1000)] | None = Field(
@@ -199,7 +261,9 @@ class JobSpec(_Schema):
         description="attack this many random cameras and lights; 0: the paper's grid of views",
     )
     views_per_step: Annotated[int, Field(ge=1, le=2000)] | None = Field(
-        None, description="views that a step looks at, drawn anew each time; null: 40 of a pool, all of the grid"
+        None,
+        description="views that a step looks at, drawn anew each time; null: 40 of a pool, all of the grid. "
+        "Of light: random views on which all places are tried, and which judge nothing; null: 12",
     )
     ranges: ViewRanges = Field(ViewRanges(), description="what pool and held-out views are drawn from")
     held_out: Annotated[int, Field(ge=0, le=1000)] = Field(60, description="held-out views the result is judged on")
@@ -211,14 +275,16 @@ class JobSpec(_Schema):
 
     @property
     def n_views_per_step(self) -> int:
-        """How many of them a step looks at."""
+        """How many of them a step looks at; of light: on how many others each place is tried."""
+        if self.attack_on == "light":
+            return self.views_per_step or VIEWS_PER_PLACE
         return min(self.n_views, self.views_per_step or (VIEWS_PER_STEP if self.pool else self.n_views))
 
     @model_validator(mode="before")
     @classmethod
     def _small_steps_in_a_small_budget(cls, given: Any) -> Any:
         if isinstance(given, dict) and "alpha" not in given and isinstance(given.get("epsilon"), float):
-            return given | {"alpha": min(0.01, max(given["epsilon"] / 5, 1e-9))}
+            return given | {"alpha": _mean_step(given["epsilon"])}
         return given
 
     @model_validator(mode="after")
@@ -237,6 +303,23 @@ class JobSpec(_Schema):
         if self.queries is not None and self.queries % 2:
             raise ValueError(f"queries come in pairs, on both sides of an image; got {self.queries}, make it even")
         return self
+
+    @model_validator(mode="after")
+    def _nothing_without_effect(self) -> "JobSpec":
+        foreign = [name for kind, names in _OPTIONS_OF.items() if kind != self.attack_on for name in names]
+        idle = [name for name in foreign if getattr(self, name) != _default_of(name)]
+        if self.attack_on != "texture" and self.alpha != _mean_step(self.epsilon):
+            idle.append("alpha")
+        if idle:
+            raise ValueError(
+                f"attack_on is {self.attack_on!r}, and {', '.join(idle)} belong to another kind of attack: leave them "
+                "out, or change attack_on"
+            )
+        return self
+
+
+def _default_of(option: str) -> Any:
+    return JobSpec.model_fields[option].get_default(call_default_factory=True)
 
 
 class JobRequest(JobSpec):
@@ -389,6 +472,25 @@ class Judgement(_Schema):
     held_out: Accuracy | None = None
 
 
+class LightFound(_Schema):
+    """The light that fools most of what was tried; degrees. What is null stayed each view's own."""
+
+    azimuth: float
+    elevation: float
+    intensity: float | None
+    ambient: float | None
+    fooled: float = Field(description="share of the views that it was tried on that were fooled")
+    tried_on: int = Field(description="views that it was tried on; they are in none of the other figures")
+
+
+class VerticesMoved(_Schema):
+    """How far an object's vertices moved, as it is saved."""
+
+    largest: float = Field(description="metres")
+    largest_share: float = Field(description="the same as a share of the object's radius")
+    mean: float = Field(description="over corners of faces, metres")
+
+
 class Result(_Schema):
     """``result.json``: what was asked, what came out, and how well surrogate and target agree."""
 
@@ -398,13 +500,13 @@ class Result(_Schema):
     label_name: str | None
     classifier: str
     ensemble: list[str] = Field(default_factory=list, description="classifiers that were attacked together with it")
-    epsilon: float
+    epsilon: float = Field(description="0 where the texture was not attacked; so is alpha")
     alpha: float
     tau: float | None
     surrogate_model: str
     surrogate_reason: str
     seed: int
-    steps: int = Field(description="steps that the attack took; it ends sooner where all views are safely won")
+    steps: int = Field(description="steps that the attack took, or places of the light that it tried")
     image_size: tuple[int, int]
     surrogate: Accuracy | None
     target: Accuracy
@@ -414,7 +516,11 @@ class Result(_Schema):
     goal_reached: float | None = Field(
         None, description="share of the target views on which the attack's goal is reached after it"
     )
-    texels_altered: float | None = Field(description="share of texels the attack altered (N%)")
+    light: LightFound | None = Field(None, description="where the light was attacked")
+    vertices: VerticesMoved | None = Field(None, description="where vertices were attacked")
+    texels_altered: float | None = Field(
+        description="share of texels the attack altered (N%); null where the texture was not attacked"
+    )
     mean_texel_change: float | None = Field(description="mean |change| over altered texels and channels, [0, 1] units")
     max_view_change: float | None = Field(description="largest |change| of a pixel of a target view, [0, 1] units")
     pixels_beyond_epsilon: float | None = Field(

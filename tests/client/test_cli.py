@@ -21,7 +21,7 @@ from trompe_client._plan import object_source
 from trompe_client._report import result_report
 from trompe_client.cli import connection, main
 from trompe_client.cli.attack import attack
-from trompe_shared.api import JobRequest, JobSpec, JobState, ViewRanges
+from trompe_shared.api import JobRequest, JobSpec, JobState, LightFound, VerticesMoved, ViewRanges
 
 SPEC = JobSpec(object="mug", label="mug")
 
@@ -130,6 +130,44 @@ def test_short_words_for_common_wishes(server, tmp_path, words, wanted):
     done = trompe("attack", "mug", "--label", "mug", *words.split(), "--server", server.url, "--out", tmp_path)
     assert done.exit_code == 0, done.output
     assert server.jobs["job-1"].spec == JobSpec(**SPEC.model_dump() | wanted)
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        pytest.param("light", {"sun": {"azimuth": (0, 360)}}, id="light"),
+        pytest.param("light", {"sun": {"azimuth": (-90, 90), "intensity": (0.5, 2)}}, id="how strong"),
+        pytest.param("vertices", {"vertex_budget": 0.01}, id="vertices"),
+    ],
+)
+def test_light_and_vertices_are_attacked_where_they_are_asked_for(server, tmp_path, words, wanted):
+    sun = [word for name, ends in wanted.get("sun", {}).items() for word in ("--sun", name, *ends)]
+    budget = ["--vertex-budget", wanted["vertex_budget"]] if "vertex_budget" in wanted else []
+    more = ["--attack-on", words, *sun, *budget, "--server", server.url, "--out", tmp_path]
+    done = trompe("attack", "mug", "--label", "mug", *more)
+    assert done.exit_code == 0, done.output
+    assert server.jobs["job-1"].spec == JobSpec.model_validate(
+        SPEC.model_dump() | {"attack_on": words, "label": "mug"} | wanted
+    )
+    assert f": {words}, 90 steps" in done.stdout
+    assert "texel" not in done.stdout
+
+
+def test_options_of_texels_are_wrong_usage_where_the_light_is_attacked(tmp_path):
+    done = trompe("attack", "mug", "--label", "mug", "--attack-on", "light", "--tau", 0.1, "--out", tmp_path)
+    assert done.exit_code == 2
+    assert "attack_on is 'light', and tau belong to another kind of attack" in " ".join(done.stderr.split())
+
+
+def test_a_report_says_which_light_was_found_and_how_far_vertices_moved(client):
+    result = client.submit(SPEC).wait(timeout=20).result()
+    light = LightFound(azimuth=143.2, elevation=44, intensity=None, ambient=0.2, fooled=0.5, tried_on=12)
+    moved = VerticesMoved(largest=0.00202, largest_share=0.02, mean=0.00106)
+    console = Console(width=120, file=io.StringIO(), record=True)
+    console.print(result_report(result.model_copy(update={"light": light, "vertices": moved})))
+    text = console.export_text()
+    assert "azimuth 143, elevation 44, ambient 0.2; fooled 50.0% of 12 views that judge nothing" in text
+    assert "at most 2.02 mm (2.0% of the radius), 1.06 mm on average" in text
 
 
 def test_the_command_line_knows_every_option_of_a_job_and_says_its_default():

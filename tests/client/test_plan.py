@@ -47,14 +47,14 @@ def test_an_obj_file_takes_its_materials_and_pictures_along_but_no_other_mesh(mu
 def test_a_zip_is_sent_as_it_is(mug_folder, tmp_path):
     archive = tmp_path / "cup.zip"
     archive.write_bytes(object_source(mug_folder).data)
-    assert object_source(archive) == Upload("cup.zip", archive.read_bytes())
+    assert object_source(archive) == Upload("cup.zip", archive)
 
 
 @pytest.mark.parametrize("ending", ["glb", "FBX", "ply", "stl"])
 def test_a_model_in_one_file_is_sent_as_it_is(tmp_path, ending):
     model = tmp_path / f"cup.{ending}"
     model.write_bytes(b"any bytes: the server reads them")
-    assert object_source(model) == object_source(str(model)) == Upload(model.name, model.read_bytes())
+    assert object_source(model) == object_source(str(model)) == Upload(model.name, model)
 
 
 def test_a_gltf_file_takes_its_buffers_and_pictures_along(tmp_path):
@@ -111,7 +111,7 @@ def test_a_classifier_is_a_file_by_its_ending(tmp_path, ending):
     with pytest.raises(ClassifierError, match="There is no classifier file"):
         classifier_source(file)
     file.write_bytes(b"net")
-    assert classifier_source(str(file)) == Upload(file.name, b"net")
+    assert classifier_source(str(file)) == Upload(file.name, file)
 
 
 @pytest.mark.parametrize("name", ["mobilenet_v2", "torchvision:vgg16", "hub:owner/nets:small", "hub:owner/nets.pt"])
@@ -122,7 +122,7 @@ def test_a_classifier_is_a_name_otherwise(name):
 def test_a_background_is_a_colour_or_a_picture_file(tmp_path):
     (tmp_path / "room.PNG").write_bytes(b"png")
     assert background_source("#ff8800") == "#ff8800"
-    assert background_source(tmp_path / "room.PNG") == Upload("room.PNG", b"png")
+    assert background_source(tmp_path / "room.PNG") == Upload("room.PNG", tmp_path / "room.PNG")
     with pytest.raises(SpecError, match="There is no background picture"):
         background_source("room2.png")
 
@@ -155,7 +155,7 @@ def test_a_wrong_option_is_named_before_any_server_is_asked(option, words):
 def test_an_ensemble_and_judges_are_files_or_names_one_or_several(tmp_path):
     (tmp_path / "net.pt").write_bytes(b"script")
     planned = plan(ensemble=tmp_path / "net.pt", judges=["tiny", str(tmp_path / "net.pt")], background="black")
-    assert planned.ensemble == (Upload("net.pt", b"script"),)
-    assert planned.judges == ("tiny", Upload("net.pt", b"script"))
+    assert planned.ensemble == (Upload("net.pt", tmp_path / "net.pt"),)
+    assert planned.judges == ("tiny", Upload("net.pt", tmp_path / "net.pt"))
     assert planned.backgrounds == ("black",)
     assert plan(judges="tiny").judges == ("tiny",)

@@ -1,6 +1,7 @@
 """Where the light may stand: the search over it, and what it may look at."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,8 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from trompe_server.array_files import pack_arrays
 from trompe_server.attack import Goal
-from trompe_server.attack.beyond import FoundLight, LightPlace, LightRanges, LightTrial, find_light, light_map
+from trompe_server.attack.beyond import (
+    FoundLight,
+    LightPlace,
+    LightRanges,
+    LightTrial,
+    find_light,
+    light_map,
+    load_light,
+    save_light,
+)
 from trompe_server.classifiers import NetworkClassifier, fake_classifier
 from trompe_server.target import FakeTarget
 from trompe_shared.errors import SpecError
@@ -65,7 +76,7 @@ def test_it_looks_at_the_views_it_says_and_at_no_others() -> None:
     found = find_light(target, VIEWS, Brightness(), goal=Goal(0), ranges=LightRanges(), n_views=5, seed=3)
     assert {view.camera for view in target.asked} == {VIEWS[k].camera for k in found.asked}
     assert len(found.asked) == 5
-    assert found.renders == len(target.asked) == 5 * (32 + 3 * 8)
+    assert found.renders == len(target.asked) == 5 * 56
 
 
 def test_views_that_are_not_asked_for_cannot_change_what_is_found() -> None:
@@ -85,12 +96,32 @@ def test_the_same_seed_finds_the_same_light_on_a_renderer(mug: Object3D) -> None
         def ask(views: Sequence[View]) -> NDArray[np.uint8]:
             return target.render(mug, views, size=SIZE)
 
-        return find_light(
-            ask, VIEWS, network, goal=Goal(label), ranges=LightRanges(), n_views=2, sweep=6, narrower=1, seed=seed
-        )
+        return find_light(ask, VIEWS, network, goal=Goal(label), ranges=LightRanges(), n_views=2, places=12, seed=seed)
 
     assert search(1) == search(1)
     assert search(1).trials != search(2).trials
+
+
+def test_a_search_goes_on_where_it_stopped_also_from_a_file() -> None:
+    target = Hill(50, 50)
+
+    def search(**options: Any) -> FoundLight:
+        return find_light(target, VIEWS, Brightness(), goal=Goal(0), ranges=LightRanges(), n_views=2, **options)
+
+    whole = search(places=30)
+    state = search(places=30, until=3)
+    for until in (16, 17, 30):
+        target.asked.clear()
+        before = load_light(save_light(state))
+        assert before == state
+        state = search(places=30, tried=before.trials, until=until)
+        assert len(target.asked) == 2 * (until - before.step)
+    assert state == whole
+
+
+def test_a_file_that_holds_something_else_is_no_search() -> None:
+    with pytest.raises(ValueError, match="no search for a light"):
+        load_light(pack_arrays({"places": np.zeros((1, 4))}))
 
 
 RANGE = st.tuples(st.floats(0, 1), st.floats(0, 1)).map(sorted)
@@ -152,7 +183,7 @@ def test_the_map_shows_each_light_where_it_stands() -> None:
     """From above: the front below, azimuth 90 on the right; blue fools least, red most."""
     low, high = LightTrial(LightPlace(0, 30), 0.2, -1.0, 0.0), LightTrial(LightPlace(90, 30), 0.9, 2.0, 1.0)
     picture = light_map(FoundLight(high.place, (low, high), (0,)), radius=90)
-    middle = picture.shape[0] // 2
+    middle = picture.shape[1] // 2
     front, right = picture[middle + 60, middle], picture[middle, middle + 60]
     assert front[2] > front[0]
     assert right[0] > right[2]

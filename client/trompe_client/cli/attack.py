@@ -12,12 +12,15 @@ from trompe_client.cli.following import deliver, follow, follow_our_own
 from trompe_client.cli.options import Sectioned, SectionOption, tag_option
 from trompe_client.cli.output import json_option, say
 from trompe_shared.api import (
+    VIEWS_PER_PLACE,
     VIEWS_PER_STEP,
+    AttackOn,
     JobRequest,
     Loss,
     Needs,
     Optimiser,
     Priority,
+    SunRanges,
     SurrogateModel,
     ViewRanges,
 )
@@ -66,6 +69,25 @@ GRID: Final = ("azimuths", "elevations")
 )
 @_networks("--ensemble", multiple=True, metavar=CLASSIFIER, help="Another victim, attacked together with it. *")
 @_networks("--judge", "judges", multiple=True, metavar=CLASSIFIER, help="Another classifier, which only judges. *")
+@_change(
+    "--attack-on",
+    type=click.Choice(get_args(AttackOn)),
+    help=f"The texture, where the main light stands, or (slightly) the vertices. Default: {_default('attack_on')}.",
+)
+@_change(
+    "--sun",
+    multiple=True,
+    type=(click.Choice(list(SunRanges.model_fields)), float, float),
+    metavar="NAME LO HI",
+    help="Of light, where it may stand: azimuth (all around by default), elevation (15 to 88), intensity, ambient "
+    "(each view's own). *",
+)
+@_change(
+    "--vertex-budget",
+    type=float,
+    metavar="SHARE",
+    help=f"Of vertices, how far one may move, a share of the object's radius. Default: {_default('vertex_budget')}.",
+)
 @_change("--epsilon", type=float, metavar="E", help=f"Largest change of a texel, 0..1. Default: {_default('epsilon')}.")
 @_change(
     "--epsilon-view",
@@ -124,7 +146,8 @@ GRID: Final = ("azimuths", "elevations")
     "--views-per-step",
     type=int,
     metavar="N",
-    help=f"Views that a step looks at. Default: {VIEWS_PER_STEP} of a pool, all of the grid.",
+    help=f"Views that a step looks at. Default: {VIEWS_PER_STEP} of a pool, all of the grid; "
+    f"of light {VIEWS_PER_PLACE} that judge nothing.",
 )
 @_search("--surrogate", type=click.Choice(get_args(SurrogateModel)), help=f"Default: {_default('surrogate')}.")
 @_search("--seed", type=int, metavar="S", help=f"Same seed, same bytes. Default: {_default('seed')}.")
@@ -220,12 +243,20 @@ def _check_destination(server: str | None, *, detach: bool, out: Path | None) ->
         raise SpecError("Say where the results shall go by --out DIR, or submit only, by --detach.")
 
 
+Named = tuple[str, float, float]
+"""A range: what of, and its ends."""
+
+
+def _ranges(given: tuple[Named, ...]) -> dict[str, tuple[float, float]]:
+    return {name: (low, high) for name, low, high in given}
+
+
 def _job_options(
-    *, grid: bool, masks: tuple[tuple[str, str], ...], ranges: tuple[tuple[str, float, float], ...], **options: Any
+    *, grid: bool, masks: tuple[tuple[str, str], ...], ranges: tuple[Named, ...], sun: tuple[Named, ...], **options: Any
 ) -> dict[str, Any]:
     """What was given on the command line, as ``plan_attack`` takes it. Raises ``SpecError``."""
     given = {name: value for name, value in options.items() if value is not None}
-    given |= {"masks": dict(masks), "ranges": {name: (low, high) for name, low, high in ranges}}
+    given |= {"masks": dict(masks), "ranges": _ranges(ranges), "sun": _ranges(sun)}
     if grid and given.setdefault("pool", 0):
         raise SpecError("--grid attacks the paper's grid and --pool random views in its place: choose one.")
     if given.get("pool", JobRequest.model_fields["pool"].get_default()) and any(name in given for name in GRID):

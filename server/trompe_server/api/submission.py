@@ -3,7 +3,7 @@
 import re
 from typing import TypeVar
 
-from trompe_server.checks import check_mask_size, check_saliency, check_same_classes
+from trompe_server.checks import check_mask_size, check_saliency, check_same_classes, check_vertices
 from trompe_server.labels import resolve_label
 from trompe_server.library import Library
 from trompe_shared.api import ClassifierInfo, JobSpec, ObjectInfo
@@ -60,7 +60,8 @@ def _check_gradients(spec: JobSpec, classifier: ClassifierInfo) -> None:
         if spec.queries is not None:
             raise SpecError(f"queries are for classifiers that only give scores; {classifier.name!r} gives gradients.")
         return
-    if spec.queries is None:
+    check_vertices(spec, classifier.name)
+    if spec.queries is None and spec.attack_on == "texture":
         raise SpecError(
             f"The classifier {classifier.name!r} gives no gradients: it can be one of the judges, or be attacked by "
             "its scores (queries=10 asks it about ten images for each gradient)."

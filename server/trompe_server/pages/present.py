@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final
 
-from trompe_shared.api import Accuracy, Job, JobSpec, Result, ViewPrediction
+from trompe_shared.api import Accuracy, Job, JobSpec, LightFound, Result, VerticesMoved, ViewPrediction
 
 __all__ = ["TERMS", "ClassNames", "JobRow", "Shown", "command", "differences", "job_row", "present", "viewer_record"]
 
@@ -34,6 +34,7 @@ MEASURES: Final = {
 }
 SHARES: Final = {"texels_altered"}
 PICTURES: Final = {
+    "light_map.png": "The sky from above: lights that were tried, redder where they fool more; the best one ringed",
     "textures.png": "The texture: before, after, and the difference",
     "saliency_object.png": "Where the classifier looks, on the object",
     "predictions.png": "What it is taken for, over all views",
@@ -43,13 +44,14 @@ PHASES: Final = {"prepare": "looking", "calibrate": "probing", "attack": "attack
 
 @dataclass(frozen=True)
 class JobRow:
-    """A job in a list. ``version`` differs where anything that is shown does."""
+    """A job in a list. ``change`` says what may change. ``version`` differs where anything that is shown does."""
 
     id: str
     object: str
     label: str
     classifier: str
-    epsilon: float
+    change: str
+    epsilon: str
     state: str
     live: bool
     fraction: float
@@ -81,7 +83,8 @@ def job_row(job: Job, *, object: str, classifier: str) -> JobRow:
         object=object,
         label=str(job.spec.label),
         classifier=classifier,
-        epsilon=job.spec.epsilon,
+        change=_change(job.spec),
+        epsilon=f"{job.spec.epsilon:g}" if job.spec.attack_on == "texture" else job.spec.attack_on,
         state=job.state.value,
         live=live,
         fraction=progress.fraction,
@@ -93,6 +96,11 @@ def job_row(job: Job, *, object: str, classifier: str) -> JobRow:
         created=job.created,
         artifacts=job.artifacts,
     )
+
+
+def _change(spec: JobSpec) -> str:
+    kinds = {"light": "the light", "vertices": f"vertices within {spec.vertex_budget:.1%} of the radius"}
+    return kinds.get(spec.attack_on, f"epsilon {spec.epsilon:g}")
 
 
 def _how_it_ended(job: Job) -> str:
@@ -126,10 +134,10 @@ class Shown:
 
 def present(result: Result, job: JobRow, *, names: ClassNames) -> Shown:
     """A result; ``names`` says what a class is called."""
-    own = _views(result.views, result.label, names, f"/jobs/{job.id}/pictures/own")
+    own = _views(result.views, result, names, f"/jobs/{job.id}/pictures/own")
     sets = [{"name": "the attack's own", "views": own}]
     if result.held_out_views:
-        unseen = _views(result.held_out_views, result.label, names, f"/jobs/{job.id}/pictures/held_out")
+        unseen = _views(result.held_out_views, result, names, f"/jobs/{job.id}/pictures/held_out")
         sets.append({"name": "held-out", "views": unseen})
     return Shown(
         verdict=_verdict(result, job),
@@ -159,10 +167,19 @@ def _verdict(result: Result, job: JobRow) -> str:
     )
 
 
-def _views(views: Sequence[ViewPrediction], label: int, names: ClassNames, place: str) -> list[dict[str, Any]]:
+def _views(views: Sequence[ViewPrediction], result: Result, names: ClassNames, place: str) -> list[dict[str, Any]]:
     """All views around the object, one after the other by azimuth, as the viewer wants them."""
     order = sorted(range(len(views)), key=lambda k: (views[k].azimuth % 360, views[k].elevation))
-    return [viewer_record(views[k], label, names, f"{place}/{k}") for k in order]
+    moved = f"; after the attack {_light(result.light)}" if result.light else ""
+    records = [viewer_record(views[k], result.label, names, f"{place}/{k}") for k in order]
+    return [record | {"where": record["where"] + moved} for record in records]
+
+
+def _light(light: LightFound) -> str:
+    strength = [
+        f"{name} {value:.2g}" for name in ("intensity", "ambient") if (value := getattr(light, name)) is not None
+    ]
+    return ", ".join([f"from {light.azimuth:.0f}° around", f"{light.elevation:.0f}° up", *strength])
 
 
 def viewer_record(view: ViewPrediction, label: int, names: ClassNames, place: str) -> dict[str, Any]:
@@ -204,6 +221,11 @@ def _share(value: float | None) -> str:
 
 
 def _measures(result: Result) -> Iterable[dict[str, str]]:
+    if result.light:
+        yield {"name": "Light that was found", "value": _light(result.light), "help": LightFound.__doc__ or ""}
+    if result.vertices:
+        moved = f"{1000 * result.vertices.largest:.2g} mm, {result.vertices.largest_share:.1%} of the radius"
+        yield {"name": "Largest move of a vertex", "value": moved, "help": VerticesMoved.__doc__ or ""}
     for field, name in MEASURES.items():
         value = getattr(result, field)
         if value is not None:
@@ -230,7 +252,7 @@ def command(spec: JobSpec, *, object: str, classifier: str) -> str:
     plain = JobSpec.model_validate(spec.model_dump(include={"object", "label", "classifier", "epsilon"}))
     for field in JobSpec.model_fields:
         value = getattr(spec, field)
-        if field in {"object", "label", "classifier", "masks", "ranges"} or value == getattr(plain, field):
+        if field in {"object", "label", "classifier", "masks", "ranges", "sun"} or value == getattr(plain, field):
             continue
         option = f"--{OPTIONS.get(field, field).replace('_', '-')}"
         if field in PAIRS:
@@ -240,8 +262,9 @@ def command(spec: JobSpec, *, object: str, classifier: str) -> str:
                 words += [option, f"{each:g}" if isinstance(each, float) else str(each)]
     if spec.epsilon != JobSpec.model_fields["epsilon"].default:
         words += ["--epsilon", f"{spec.epsilon:g}"]
-    for name, (low, high) in spec.ranges.model_dump(exclude={"light_colours"}, exclude_defaults=True).items():
-        words += ["--range", name, f"{low:g}", f"{high:g}"]
+    for option, given in {"--range": spec.ranges, "--sun": spec.sun}.items():
+        for name, (low, high) in given.model_dump(exclude={"light_colours"}, exclude_defaults=True).items():
+            words += [option, name, f"{low:g}", f"{high:g}"]
     return shlex.join([*words, "--out", "result"])
 
 

@@ -57,6 +57,11 @@ def test_a_classifier_without_gradients_can_be_attacked_by_its_scores(stocked):
     assert stocked.submit(classifier="judge", queries=10).status_code == 201
 
 
+def test_a_light_is_looked_for_with_a_classifier_without_gradients(stocked):
+    stocked.upload_classifier(b"B", "judge.onnx")
+    assert stocked.submit(classifier="judge", attack_on="light").status_code == 201
+
+
 @pytest.mark.parametrize(
     ("spec", "status", "words"),
     [
@@ -78,6 +83,8 @@ def test_a_classifier_without_gradients_can_be_attacked_by_its_scores(stocked):
         pytest.param({"classifier": "judge"}, 422, "gives no gradients", id="black box"),
         pytest.param({"classifier": "judge", "queries": 4, "tau": 0.1}, 422, "need saliency", id="its tau"),
         pytest.param({"classifier": "judge", "queries": 4, "keep": 0.1}, 422, "need saliency", id="its saliency"),
+        pytest.param({"classifier": "judge", "attack_on": "vertices"}, 422, "along gradients", id="its vertices"),
+        pytest.param({"attack_on": "light", "tau": 0.1}, 422, "tau belong to another kind", id="texels of a light"),
         pytest.param({"ensemble": ["judge"]}, 422, "not in the ensemble", id="black box in the ensemble"),
     ],
 )

@@ -1,7 +1,15 @@
 """Beyond texture: the light and the shape of an object as what the attack may change. Usable without any server."""
 
 from trompe_server.attack.beyond.chance import chances
-from trompe_server.attack.beyond.light import FoundLight, LightPlace, LightRanges, LightTrial, find_light
+from trompe_server.attack.beyond.light import (
+    FoundLight,
+    LightPlace,
+    LightRanges,
+    LightTrial,
+    find_light,
+    load_light,
+    save_light,
+)
 from trompe_server.attack.beyond.light_map import light_map
 from trompe_server.attack.beyond.relief import LightProbes, Relief, probe_light
 from trompe_server.attack.beyond.shape import Shape, shape_of, with_vertices
@@ -28,9 +36,11 @@ __all__ = [
     "chances",
     "find_light",
     "light_map",
+    "load_light",
     "load_vertices",
     "move_vertices",
     "probe_light",
+    "save_light",
     "save_vertices",
     "shape_of",
     "with_vertices",

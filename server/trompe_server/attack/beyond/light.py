@@ -6,29 +6,32 @@ around the best place so far. Gradients through Lambert's law with the target's 
 measured (``bench/beyond.py``).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from trompe_server.array_files import pack_arrays, unpack_arrays
 from trompe_server.attack.beyond.chance import chances
 from trompe_server.attack.goal import Goal
 from trompe_server.classifiers import Classifier
+from trompe_shared.api import SUN_LIMITS
 from trompe_shared.errors import SpecError
 from trompe_shared.geometry import View
 
-__all__ = ["FoundLight", "LightPlace", "LightRanges", "LightTrial", "find_light"]
+__all__ = ["FoundLight", "LightPlace", "LightRanges", "LightTrial", "find_light", "load_light", "save_light"]
 
 Range = tuple[float, float]
 Image8 = NDArray[np.uint8]
 Ask = Callable[[Sequence[View]], Image8]
 """Asks the target for images of the object, (views, H, W, 3) uint8."""
 
-SWEEP: Final = 32
-"""Places of the coarse sweep."""
+PLACES: Final = 56
+"""Places of a whole search: those of the coarse sweep, and those of the rounds."""
 
 NARROWER: Final = 3
 """Rounds around the best place; the box is half as wide each time."""
@@ -67,7 +70,7 @@ class LightRanges:
 
     def __post_init__(self) -> None:
         for name, (low, high) in self.given.items():
-            least, most = _LIMITS[name]
+            least, most = SUN_LIMITS[name]
             if not least <= low <= high <= most:
                 raise SpecError(
                     f"The light's {name} must be a range within {least:g}..{most:g}, low end first; got {low} {high}."
@@ -97,14 +100,6 @@ def _height(share: float, low: float, high: float) -> float:
     return float(np.clip(np.degrees(np.arcsin(bottom + share * (top - bottom))), low, high))
 
 
-_LIMITS: Final[dict[str, Range]] = {
-    "azimuth": (-720, 720),
-    "elevation": (-90, 90),
-    "intensity": (0, 100),
-    "ambient": (0, 1),
-}
-
-
 @dataclass(frozen=True)
 class LightTrial:
     """What the target showed with the light at a place, means over the asked views.
@@ -131,6 +126,11 @@ class FoundLight:
     asked: tuple[int, ...]
 
     @property
+    def step(self) -> int:
+        """Places that were tried."""
+        return len(self.trials)
+
+    @property
     def renders(self) -> int:
         """Images that the target was asked for."""
         return len(self.trials) * len(self.asked)
@@ -144,41 +144,75 @@ def find_light(
     goal: Goal,
     ranges: LightRanges,
     n_views: int = 12,
-    sweep: int = SWEEP,
-    narrower: int = NARROWER,
+    places: int = PLACES,
     seed: int = 0,
+    tried: Sequence[LightTrial] = (),
+    until: int | None = None,
     on_trial: Callable[[LightTrial], None] = lambda _: None,
 ) -> FoundLight:
     """The place of the light that fools most (``LightTrial.won``) over ``n_views`` of ``views``, drawn by ``seed``.
 
     Classifiers give scores alone; of several the mean counts, and a view is fooled when all of them are.
-    Asks for ``(sweep + narrower * 8) * n_views`` images. The same seed and the same images give the same light.
+    Asks for ``places * n_views`` images. The same seed and the same images give the same light, in one go or in
+    several: ``tried`` are the trials of a search that went ``until`` so many of its places, to go on with.
     Raises ``SpecError`` for no views or classifiers, or a goal that does not fit one.
     """
     members = tuple(classifier) if isinstance(classifier, Sequence) else (classifier,)
-    if not views or not members or n_views < 1 or sweep < 1:
+    if not views or not members or n_views < 1 or places < 1:
         raise SpecError("A search for a light needs a view, a classifier and a place to try, one of each at least.")
     for member in members:
         goal.check(member.n_classes)
     random = np.random.default_rng(seed)
     asked = tuple(sorted(random.choice(len(views), min(n_views, len(views)), replace=False).tolist()))
-    chosen, trials = [views[k] for k in asked], []
-    centre, best = np.full(len(ranges.given), 0.5), -np.inf
-    for turn in range(narrower + 1):
+    chosen, trials = [views[k] for k in asked], list(tried)
+    for place in islice(_to_try(ranges, trials, places, random), len(tried), places if until is None else until):
+        trials.append(LightTrial(place, *_judged(ask(place.light_up(chosen)), members, goal)))
+        on_trial(trials[-1])
+    return FoundLight(_best(trials).place, tuple(trials), asked)
+
+
+def _best(trials: Sequence[LightTrial]) -> LightTrial:
+    return max(trials, key=lambda trial: trial.won)
+
+
+def _to_try(
+    ranges: LightRanges, trials: Sequence[LightTrial], places: int, random: np.random.Generator
+) -> Iterator[LightPlace]:
+    """At least so many places, in order; ``trials`` grows by what was seen at each before the next is asked for."""
+    sweep = max(places - NARROWER * AROUND, -(-places // 2))
+    shares: list[NDArray[np.float64]] = []
+    centre = np.full(len(ranges.given), 0.5)
+    for turn in range(NARROWER + 1):
+        if turn:
+            won = [trial.won for trial in trials[: len(shares)]]
+            centre = shares[won.index(max(won))]
         for share in _around(centre, AROUND if turn else sweep, 2.0**-turn, random):
-            place = ranges.place(share)
-            trials.append(LightTrial(place, *_judged(ask(place.light_up(chosen)), members, goal)))
-            on_trial(trials[-1])
-            if trials[-1].won > best:
-                centre, best = share, trials[-1].won
-    return FoundLight(max(trials, key=lambda trial: trial.won).place, tuple(trials), asked)
+            shares.append(share)
+            yield ranges.place(share)
+
+
+def save_light(found: FoundLight) -> bytes:
+    """What was found so far as the bytes of an .npz file; exact."""
+    places = [[np.nan if value is None else value for value in vars(trial.place).values()] for trial in found.trials]
+    verdicts = [(trial.won, trial.loss, trial.fooled) for trial in found.trials]
+    return pack_arrays({"places": np.array(places), "verdicts": np.array(verdicts), "asked": np.array(found.asked)})
+
+
+def load_light(data: bytes) -> FoundLight:
+    """What ``save_light`` made bytes of. Raises ``ValueError`` or ``OSError`` where they are damaged."""
+    arrays = unpack_arrays(data)
+    if set(arrays) != {"places", "verdicts", "asked"}:
+        raise ValueError(f"These arrays are no search for a light: {sorted(arrays)}.")
+    places = [
+        LightPlace(azimuth, elevation, *(None if np.isnan(value) else value for value in more))
+        for azimuth, elevation, *more in arrays["places"].tolist()
+    ]
+    trials = [LightTrial(place, *row) for place, row in zip(places, arrays["verdicts"].tolist(), strict=True)]
+    return FoundLight(_best(trials).place, tuple(trials), tuple(arrays["asked"].tolist()))
 
 
 def _around(centre: NDArray[np.float64], count: int, width: float, random: np.random.Generator) -> NDArray[np.float64]:
-    """``count`` points (count, dimensions) that fill a box of ``width`` evenly: Roberts's sequence, shifted at random.
-
-    A copy of ``centre``: it may become another one while these are tried.
-    """
+    """``count`` points (count, dimensions) that fill a box of ``width`` evenly: Roberts's sequence, shifted."""
     dimensions = len(centre)
     root = 2.0
     for _ in range(32):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from trompe_server.attack.beyond.light import FoundLight, LightPlace
-from trompe_server.reports.layout import INK, MARGIN, PAPER
+from trompe_server.reports.layout import INK, MARGIN, PAPER, captioned
 
 __all__ = ["light_map"]
 
@@ -19,8 +19,11 @@ HIGH: Final = (213, 94, 0)
 
 
 def light_map(found: FoundLight, *, radius: int = 200) -> NDArray[np.uint8]:
-    """The object's sky seen from above, (H, W, 3): the zenith in the middle, the horizon at the rim, azimuth 0 (where
-    the grid's light stands) below. Every light tried is a dot, the redder the more it fools; the best one is ringed."""
+    """The object's sky seen from above, (H, W, 3), with two lines that explain it.
+
+    The zenith is in the middle, the horizon at the rim, azimuth 0 (where the grid's light stands) below. Every light
+    tried is a dot, the redder the more it fools (``LightTrial.won``); the best one is ringed.
+    """
     side = 2 * (radius + MARGIN)
     picture = Image.new("RGB", (side, side), PAPER)
     draw = ImageDraw.Draw(picture)
@@ -31,7 +34,11 @@ def light_map(found: FoundLight, *, radius: int = 200) -> NDArray[np.uint8]:
     for number in np.argsort(shares, kind="stable"):
         _disc(draw, _point(found.trials[number].place, radius, side), 7, fill=_colour(float(shares[number])))
     _disc(draw, _point(found.place, radius, side), 11, outline=INK)
-    return np.asarray(picture)
+    best = found.trials[int(won.argmax())]
+    colours = f"from above, front below; chance of fooling: blue {won.min():.2f}, red {won.max():.2f}"
+    words = f"best: azimuth {found.place.azimuth:.0f}, elevation {found.place.elevation:.0f}"
+    fooled = f"it fooled {best.fooled:.0%} of {len(found.asked)} views"
+    return np.asarray(captioned(captioned(picture, colours), f"{words}; {fooled}"))
 
 
 def _point(place: LightPlace, radius: int, side: int) -> tuple[float, float]:

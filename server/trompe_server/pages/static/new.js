@@ -86,7 +86,9 @@ function request() {
   const options = JSON.parse(form.querySelector("[name=preset]:checked").dataset.options);
   const spec = { ...options, object: given.get("object"), classifier: given.get("classifier"), label: given.get("label"), priority: "interactive" };
   if (/^\d+$/.test(spec.label)) spec.label = Number(spec.label);
-  for (const name of ["epsilon", "tau", "distance", "seed"]) if (given.get(name)) spec[name] = Number(given.get(name));
+  spec.attack_on = given.get("attack_on");
+  const numbers = spec.attack_on === "texture" ? ["epsilon", "tau", "distance", "seed"] : ["distance", "seed"];
+  for (const name of numbers) if (given.get(name)) spec[name] = Number(given.get(name));
   if (given.get("background")) spec.background = [given.get("background")];
   return JSON.stringify(spec);
 }
