@@ -115,10 +115,47 @@ def test_configurations_are_means_over_the_objects_that_all_of_them_have() -> No
         row(series="steps", configuration="steps 9", object="mug", held_out_a_drop=0.8, seconds=30),
     ]
     short, long = configurations(rows)
-    assert (short.gain, short.cost, short.jobs) == (pytest.approx(0.5), 15, 2)
+    assert (short.gain, short.cost, short.jobs) == pytest.approx((0.5, 15, 2))
     assert short.spread == pytest.approx(0.1414, abs=1e-3)
     assert (long.gain, long.cost) == (0.8, 30)
     assert "**steps 5**" in pareto_markdown(rows)
+
+
+def test_what_all_configurations_of_a_series_share_is_left_out_of_their_names() -> None:
+    rows = [
+        row(series="preset x held_out", configuration=f"preset {name}, held_out 100") for name in ("fast", "best")
+    ] + [row(series="optimiser x steps", configuration="optimiser fgsm, steps 1")]
+    named = [(each.series, each.name) for each in configurations(rows)]
+    assert named == [
+        ("preset", "preset fast"),
+        ("preset", "preset best"),
+        ("optimiser x steps", "optimiser fgsm, steps 1"),
+    ]
+
+
+def test_the_table_has_both_costs_and_says_on_which_front_a_configuration_is() -> None:
+    rows = [
+        row(series="steps", configuration="steps 5", seconds=10, evaluations=500, held_out_a_drop=0.4),
+        row(series="steps", configuration="steps 9", seconds=30, evaluations=400, held_out_a_drop=0.6),
+        row(series="steps", configuration="steps 90", seconds=90, evaluations=900, held_out_a_drop=0.5),
+    ]
+    text = pareto_markdown(rows)
+    assert "| steps | **steps 5** | 10 | 500 | 0.40 ± 0.00 | 0.90 | 0.10 | time | 1 |" in text
+    assert "| steps | **steps 9** | 30 | 400 | 0.60 ± 0.00 | 0.90 | 0.10 | time, images | 1 |" in text
+    assert "| steps | steps 90 | 90 | 900 |" in text
+
+
+def test_each_preset_is_held_against_the_front() -> None:
+    rows = [
+        row(series="preset", configuration="preset fast", seconds=10, held_out_a_drop=0.5),
+        row(series="preset", configuration="preset balanced", seconds=40, held_out_a_drop=0.8),
+        row(series="preset", configuration="preset best", seconds=90, held_out_a_drop=0.9),
+        row(series="steps", configuration="steps 9", seconds=20, held_out_a_drop=0.85),
+    ]
+    text = pareto_markdown(rows)
+    assert "| preset fast | 10 | 0.50 ± 0.00 | on it; next: steps 9, 2 times the time, A_drop +0.350 |" in text
+    assert "| preset balanced | 40 | 0.80 ± 0.00 | beaten by steps 9, 0.5 times the time, A_drop +0.050 |" in text
+    assert "| preset best | 90 | 0.90 ± 0.00 | on it; nothing does more |" in text
 
 
 def test_the_papers_numbers_have_the_means_that_the_paper_tells() -> None:
@@ -139,7 +176,7 @@ def test_table_one_puts_ours_beside_the_papers_and_leaves_saliency_and_the_unrec
         row(object="toilet", target_a_before=0.1, target_a_drop=0.0),
     ]
     cells = {cell.object: cell for cell in table_one(rows)}
-    assert (cells["candle"].target, cells["candle"].seeds) == (pytest.approx(0.9), 2)
+    assert (cells["candle"].target, cells["candle"].seeds) == pytest.approx((0.9, 2))
     assert cells["candle"].paper is not None
     assert cells["candle"].paper.target_a_drop == pytest.approx(0.7586)
     assert not cells["toilet"].counts

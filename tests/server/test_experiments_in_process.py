@@ -12,15 +12,18 @@ import torch
 from PIL import Image
 
 from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
-from trompe_server.experiments import disturbed, stability, variants
+from trompe_server.experiments import disturbed, suite, variants
 from trompe_server.experiments.disturbed import DisturbedTarget
 from trompe_server.experiments.in_process import run_job
 from trompe_server.experiments.stability import MEASURED, UNFORESEEN, run_suite
+from trompe_server.experiments.suite import Case, Planned, plan_jobs, run_planned
 from trompe_server.experiments.variants import export_variants
+from trompe_server.scene import Scene
+from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry
 from trompe_server.target import FakeTarget
 from trompe_shared.api import JobSpec
 from trompe_shared.errors import SpecError
-from trompe_shared.experiment_table import RESULTS, ResultRow, read_table
+from trompe_shared.experiment_table import RESULTS, ResultRow, RowId, read_table
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, load_object
 
@@ -43,7 +46,7 @@ def _no_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
     def fake(**_: object) -> Iterator[FakeTarget]:
         yield FakeTarget()
 
-    for module in (stability, variants):
+    for module in (suite, variants):
         monkeypatch.setattr(module, "renderer", fake)
 
 
@@ -104,6 +107,19 @@ def test_changed_networks_say_nearly_the_same_and_mask_or_keep_gradients() -> No
     assert gradient(disturbed.quantised(network, 8)) == 0
 
 
+def test_a_network_attacked_in_another_precision_is_judged_as_it_is_and_one_of_another_size_takes_that_size() -> None:
+    network = tiny()
+    images = torch.rand(3, 3, *network.image_size, generator=torch.Generator().manual_seed(0))
+    shown = (images.permute(0, 2, 3, 1) * 255).byte().numpy()
+    half = disturbed.bfloat16_gradients(network)
+    np.testing.assert_array_equal(half.predict(shown), network.predict(shown))
+    assert (half.logits(images) != network.logits(images)).any()
+    small = disturbed.at_size(network, 64)
+    assert small.image_size == (64, 64)
+    assert small.predict(shown).shape == (3, network.n_classes)
+    assert (small.predict(shown) != network.predict(shown)).any()
+
+
 def test_a_job_in_this_process_attacks_the_network_that_is_put_in(tmp_path: Path) -> None:
     spec = JobSpec.model_validate({"object": "mug", "label": "mug"} | SMALL)
     done = run_job(spec, FakeTarget(), tmp_path, change=disturbed.bfloat16)
@@ -142,6 +158,56 @@ def test_the_suite_runs_what_is_missing_and_keeps_the_order_of_its_cases(tmp_pat
     assert rows[0].threads is not None
     assert run("JPEG, quality 75") == kept
     assert told == []
+
+
+def planned(configuration: str, case: Case, *, same: str = "") -> list[Planned]:
+    place = RowId(experiment="some", key="", series="a series", configuration=configuration)
+    return plan_jobs(place, case, SMALL, objects=["mug"], seeds=[0], same=same)
+
+
+@pytest.mark.usefixtures("_no_renderer")
+def test_places_that_ask_the_same_share_a_job_and_rows_that_are_not_wanted_now_are_kept(tmp_path: Path) -> None:
+    plan = [
+        *planned("threads 1", Case(threads=1)),
+        *planned("threads 2", Case(threads=2), same="standard"),
+        *planned("size 128", Case(threads=2), same="standard"),
+    ]
+    told: list[str] = []
+
+    def run(word: str) -> list[ResultRow]:
+        return run_planned(
+            tmp_path,
+            plan,
+            wanted=lambda each: word in each.place.configuration,
+            on_row=lambda row, done, total: told.append(f"{row.configuration}: {done}/{total}"),
+        )
+
+    assert [(row.configuration, row.threads) for row in run("size")] == [("threads 2", 2), ("size 128", 2)]
+    assert told == ["size 128: 1/1"]
+    assert [(row.configuration, row.threads) for row in run("threads")] == [
+        ("threads 1", 1),
+        ("threads 2", 2),
+        ("size 128", 2),
+    ]
+    assert told[1:] == ["threads 1: 2/2"]
+    assert [row.configuration for row in read_table(tmp_path / RESULTS, ResultRow)] == [
+        each.place.configuration for each in plan
+    ]
+
+
+@pytest.mark.usefixtures("_no_renderer")
+def test_a_job_searches_in_the_surrogate_that_is_put_in_and_is_judged_in_the_target(tmp_path: Path) -> None:
+    made: list[Surrogate] = []
+
+    def own(scene: Scene) -> Surrogate:
+        geometry = prepare_geometry(scene.obj, scene.views, size=scene.size, sampling=SamplingModel())
+        made.append(diffuse_surrogate(geometry, scene.views))
+        return made[-1]
+
+    (row,) = run_planned(tmp_path, planned("other", Case(surrogate=own)))
+    assert len(made) == 1
+    assert row.state == "succeeded"
+    assert row.target_a_drop is not None
 
 
 @pytest.mark.usefixtures("_no_renderer")

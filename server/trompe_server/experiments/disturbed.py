@@ -1,4 +1,4 @@
-"""Targets and classifiers that are not what the attack takes them for: what the stability suite is made of."""
+"""Targets and classifiers that are not what the attack takes them for, or not as they come: what suites are made of."""
 
 import io
 import re
@@ -26,7 +26,9 @@ from trompe_shared.object3d import Object3D
 __all__ = [
     "ChangedClassifier",
     "DisturbedTarget",
+    "at_size",
     "bfloat16",
+    "bfloat16_gradients",
     "bounce",
     "brighter_when_dark",
     "flicker",
@@ -197,15 +199,20 @@ def renderer(*, field_of_view: float | None = None) -> Iterator[SailenvTarget]:
 
 @dataclass(frozen=True)
 class ChangedClassifier(Wrapper):
-    """``inner`` with its network replaced by ``network``, which sees images in [0, 1] and gives logits."""
+    """``inner`` with its network replaced by ``network``, which sees images in [0, 1] and gives logits.
+
+    ``size`` (H, W) of the images, where that is not ``inner``'s. Unless it ``judges``, results are judged by ``inner``.
+    """
 
     inner: WhiteBoxClassifier
     network: Network
+    size: tuple[int, int] | None = None
+    judges: bool = True
 
     @property
     def image_size(self) -> tuple[int, int]:
         """See ``Classifier``."""
-        return self.inner.image_size
+        return self.size or self.inner.image_size
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
         """See ``WhiteBoxClassifier``."""
@@ -214,6 +221,8 @@ class ChangedClassifier(Wrapper):
     @torch.no_grad()
     def predict(self, images: Images) -> Logits:
         """See ``Classifier``."""
+        if not self.judges:
+            return self.inner.predict(images)
         parts = [self.network(fit_images(batch, self.image_size)).numpy() for batch in in_batches(images, BATCH)]
         return np.concatenate([np.zeros((0, self.n_classes), np.float32), *parts])
 
@@ -226,6 +235,16 @@ def bfloat16(classifier: WhiteBoxClassifier) -> ChangedClassifier:
             return classifier.logits(images).float()
 
     return ChangedClassifier(classifier, network)
+
+
+def bfloat16_gradients(classifier: WhiteBoxClassifier) -> ChangedClassifier:
+    """Attacked in bfloat16, judged as it is."""
+    return replace(bfloat16(classifier), judges=False)
+
+
+def at_size(classifier: WhiteBoxClassifier, side: int) -> ChangedClassifier:
+    """Shown square images of another size, as only a fully convolutional network can be."""
+    return ChangedClassifier(classifier, classifier.logits, (side, side))
 
 
 def saturated(classifier: WhiteBoxClassifier, factor: float) -> ChangedClassifier:

@@ -11,13 +11,19 @@ from matplotlib.ticker import LogFormatter
 
 from trompe_server.experiments.front import front_of
 from trompe_server.experiments.groups import average, deviation, grouped, known
-from trompe_server.experiments.style import INK, MARKERS, PALETTE, Drawing, drawing
+from trompe_server.experiments.style import GREY, INK, MARKERS, PALETTE, Drawing, drawing
 from trompe_shared.experiment_table import ResultRow
 
 __all__ = ["Configuration", "configurations", "pareto_front", "pareto_markdown", "speed_accuracy_chart"]
 
 Cost = Literal["seconds", "evaluations"]
+Place = tuple[str, str]
+"""Series and configuration."""
 UNITS: Final[dict[Cost, str]] = {"seconds": "wall time of a job, s", "evaluations": "images shown to the classifier"}
+PRESET: Final = "preset"
+"""The series of the presets."""
+LINE, MARGIN = 0.055, 0.35
+"""Height of a line of text as a share of the axis, and room for the first name at the left, as a share of decades."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +53,8 @@ def configurations(rows: Sequence[ResultRow], *, cost: Cost = "seconds") -> list
     groups = grouped(rows, lambda row: (row.series, row.configuration or "base"))
     known_objects = [{row.object for row in group if row.held_out_a_drop is not None} for group in groups.values()]
     common = set.intersection(*known_objects) if known_objects else set()
-    found = []
-    for (series, name), group in groups.items():
+    said, found = _said_once(list(groups)), []
+    for place, group in groups.items():
         same = [row for row in group if row.object in common and row.held_out_a_drop is not None]
         costs = known(same, cost)
         if not costs:
@@ -56,8 +62,7 @@ def configurations(rows: Sequence[ResultRow], *, cost: Cost = "seconds") -> list
         per_seed = [fmean(known(part, "held_out_a_drop")) for part in grouped(same, lambda row: row.seed).values()]
         found.append(
             Configuration(
-                series,
-                name,
+                *said[place],
                 fmean(costs),
                 fmean(known(same, "held_out_a_drop")),
                 deviation(per_seed),
@@ -69,23 +74,38 @@ def configurations(rows: Sequence[ResultRow], *, cost: Cost = "seconds") -> list
     return found
 
 
+def _said_once(places: Sequence[Place]) -> dict[Place, Place]:
+    """(series, configuration) without what is the same in all configurations of a series, such as "held_out 100"."""
+    short: dict[Place, Place] = {}
+    for series, group in grouped(places, lambda place: place[0]).items():
+        parts = [name.split(", ") for _, name in group]
+        constant = set.intersection(*map(set, parts)) if len(parts) > 1 else set()
+        fixed = {part.rpartition(" ")[0] for part in constant}
+        title = " x ".join(word for word in series.split(" x ") if word not in fixed)
+        short |= {
+            place: (title, ", ".join(part for part in split if part not in constant))
+            for place, split in zip(group, parts, strict=True)
+        }
+    return short
+
+
 def pareto_front(points: Sequence[Configuration]) -> list[Configuration]:
     """The configurations that no other one beats in cost and gain; see ``front_of``."""
     return front_of(points, cost=lambda point: point.cost, gain=lambda point: point.gain)
 
 
 def speed_accuracy_chart(rows: Sequence[ResultRow], *, cost: Cost = "seconds") -> Drawing:
-    """A point for each configuration, the front as a line, its points named."""
+    """A point for each configuration, the front as a line, its points named where they stand."""
     points = configurations(rows, cost=cost)
     front = pareto_front(points)
     series = list(dict.fromkeys(point.series for point in points))
     look = {name: (PALETTE[k % len(PALETTE)], MARKERS[k % len(MARKERS)]) for k, name in enumerate(series)}
-    with drawing(size=(10.5, 5.2)) as made:
+    with drawing(size=(10.5, 5.8)) as made:
         (axes,) = made.panels
         for point in points:
             colour, marker = look[point.series]
             axes.errorbar(
-                point.cost, point.gain, yerr=point.spread, color=colour, marker=marker, ms=7, lw=1, mec="white", mew=0.7
+                point.cost, point.gain, yerr=point.spread, color=colour, marker=marker, ms=7, lw=1, mec=INK, mew=0.5
             )
         axes.step([p.cost for p in front], [p.gain for p in front], where="post", color=INK, lw=1, ls="--", zorder=1)
         axes.set_xscale("log")
@@ -94,42 +114,112 @@ def speed_accuracy_chart(rows: Sequence[ResultRow], *, cost: Cost = "seconds") -
         axes.set_xlabel(f"{UNITS[cost]} (mean, log scale)")
         axes.set_ylabel("A_drop on held-out views (mean; bars: deviation over seeds)")
         axes.set_title("Speed against accuracy: up and to the left is better")
-        _name_front(made, axes, front)
+        _name_points(axes, front, points, cost)
         handles = [
-            Line2D([], [], color=look[name][0], marker=look[name][1], ls="", label=name or "configurations")
-            for name in series
+            Line2D([], [], color=look[n][0], marker=look[n][1], mec=INK, mew=0.5, ls="", label=n or "configurations")
+            for n in series
         ]
         handles.append(Line2D([], [], color=INK, ls="--", lw=1, label="Pareto front"))
-        axes.legend(handles=handles, loc="lower right", title="varied", alignment="left")
+        made.figure.legend(handles=handles, loc="outside right upper", title="varied", alignment="left")
     return made
 
 
-def _name_front(made: Drawing, axes: Axes, front: Sequence[Configuration]) -> None:
-    """A number at each point of the front; what the numbers stand for is listed at the right."""
-    for number, point in enumerate(front, 1):
-        axes.annotate(
-            str(number), (point.cost, point.gain), xytext=(-5, 5), textcoords="offset points", ha="right", weight="bold"
-        )
-    listed = [f"{number}  {p.name}: {p.cost:.3g}, {p.gain:.2f}" for number, p in enumerate(front, 1)]
-    blank = [Line2D([], [], ls="", label=words) for words in listed]
-    title = "Pareto front (cost, A_drop)"
-    made.figure.legend(
-        handles=blank, title=title, alignment="left", loc="outside right upper", handlelength=0, handletextpad=0
+def _name_points(axes: Axes, front: Sequence[Configuration], points: Sequence[Configuration], cost: Cost) -> None:
+    """What each point of the front is, to its upper left, where no point can be, and presets below it, to the lower
+    right; room is made for all."""
+    costs, gains = [p.cost for p in points], [p.gain for p in points]
+    low, high = min(gains) - max(p.spread for p in points), max(gains)
+    line = max(high - low, 0.05) * LINE
+    top = bottom = low
+    for point in front:
+        top = max(point.gain + line / 2, top + line)
+        _name_point(axes, point, f"{point.name}: {_told_cost(point.cost, cost)}, {point.gain:.2f}", top, "right")
+    presets = [point for point in points if point.series == PRESET and point not in front]
+    for number, point in enumerate(sorted(presets, key=lambda p: -p.gain)):
+        bottom = min(point.gain - line, bottom - line if number else high)
+        _name_point(axes, point, point.name, bottom, "left")
+    low, high = min(low, bottom) - line, max(top, high) + 2 * line
+    axes.set_xlim(min(costs) / max(max(costs) / min(costs), 2) ** MARGIN, max(costs) * 1.3)
+    axes.set_ylim(low, high)
+    axes.set_yticks([tick for tick in axes.get_yticks() if low <= tick <= 1.001])
+
+
+def _name_point(axes: Axes, point: Configuration, words: str, height: float, side: Literal["left", "right"]) -> None:
+    """Write ``words`` that end (right) or begin (left) above or below a point, with a line to it."""
+    axes.annotate(
+        words,
+        (point.cost, point.gain),
+        xytext=(point.cost, height),
+        textcoords="data",
+        ha=side,
+        va="bottom" if side == "right" else "top",
+        fontsize=8,
+        weight="bold" if point.series == PRESET else "normal",
+        arrowprops={
+            "arrowstyle": "-",
+            "color": GREY,
+            "lw": 0.6,
+            "shrinkB": 4,
+            "relpos": (1, 0) if side == "right" else (0, 1),
+        },
     )
 
 
-def pareto_markdown(rows: Sequence[ResultRow], *, cost: Cost = "seconds") -> str:
-    """A table of all configurations, those on the front in bold."""
-    points = configurations(rows, cost=cost)
-    front = pareto_front(points)
-    unit = "s" if cost == "seconds" else "images"
-    lines = [f"| varied | configuration | {unit} | held-out A_drop | target A_drop | transfer gap | jobs |"]
-    lines.append("|---|---|---:|---:|---:|---:|---:|")
-    for point in sorted(points, key=lambda p: p.cost):
-        name = f"**{point.name}**" if point in front else point.name
-        cells = [f"{point.cost:.3g}", f"{point.gain:.2f} ± {point.spread:.2f}", _cell(point.target), _cell(point.gap)]
+def _told_cost(value: float, cost: Cost) -> str:
+    return f"{value:.3g} s" if cost == "seconds" else f"{value:.0f} images"
+
+
+def pareto_markdown(rows: Sequence[ResultRow]) -> str:
+    """A table of all configurations with both costs, those on a front in bold; before it one of the presets, if any."""
+    by_time, by_images = configurations(rows), configurations(rows, cost="evaluations")
+    images = {(point.series, point.name): point.cost for point in by_images}
+    fronts = {"time": _names(pareto_front(by_time)), "images": _names(pareto_front(by_images))}
+    lines = [
+        "| varied | configuration | s | images | held-out A_drop | target A_drop | transfer gap | on front | jobs |"
+    ]
+    lines.append("|---|---|---:|---:|---:|---:|---:|---|---:|")
+    for point in sorted(by_time, key=lambda p: p.cost):
+        place = point.series, point.name
+        front = [words for words, names in fronts.items() if place in names]
+        name = f"**{point.name}**" if front else point.name
+        cells = [f"{point.cost:.3g}", f"{images[place]:.0f}" if place in images else "n.a."]
+        cells += [_gain(point), _cell(point.target), _cell(point.gap), ", ".join(front)]
         lines.append(f"| {point.series} | {name} | {' | '.join(cells)} | {point.jobs} |")
-    return "\n".join(lines) + "\n"
+    return _presets_markdown(by_time) + "\n".join(lines) + "\n"
+
+
+def _names(points: Sequence[Configuration]) -> set[tuple[str, str]]:
+    return {(point.series, point.name) for point in points}
+
+
+def _presets_markdown(points: Sequence[Configuration]) -> str:
+    """A table of the presets: what each costs and gives, and what on the front it must be held against."""
+    presets, front = [point for point in points if point.series == PRESET], pareto_front(points)
+    if not presets:
+        return ""
+    lines = ["| preset | s | held-out A_drop | beside the Pareto front |", "|---|---:|---:|---|"]
+    for point in presets:
+        lines.append(f"| {point.name} | {point.cost:.3g} | {_gain(point)} | {_beside(point, front)} |")
+    return "\n".join(lines) + "\n\n"
+
+
+def _beside(point: Configuration, front: Sequence[Configuration]) -> str:
+    """What speaks for a configuration, or against it: what is better for as much, or what more would bring."""
+    if point not in front:
+        better = [p for p in front if p.cost <= point.cost and p.gain >= point.gain][-1]
+        return f"beaten by {_against(better, point)}"
+    dearer = [p for p in front if p.cost > point.cost]
+    return f"on it; next: {_against(dearer[0], point)}" if dearer else "on it; nothing does more"
+
+
+def _against(other: Configuration, point: Configuration) -> str:
+    more = other.gain - point.gain
+    small = ", less than the deviation over seeds" if more < max(other.spread, point.spread) else ""
+    return f"{other.name}, {other.cost / point.cost:.2g} times the time, A_drop {more:+.3f}{small}"
+
+
+def _gain(point: Configuration) -> str:
+    return f"{point.gain:.2f} ± {point.spread:.2f}"
 
 
 def _cell(value: float | None) -> str:
