@@ -29,9 +29,9 @@ from bench._common import (
     rescaled,
 )
 from trompe_server.attack import Budget, Goal, attack, movable, start
-from trompe_server.attack_job import CHUNK
 from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
 from trompe_server.memory import keep_freed_memory
+from trompe_server.phased_job import CHUNK
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate.calibration import CALIBRATED_GREYS, CURVE_GREYS, Calibration, Fidelity, build_surrogate
 from trompe_server.surrogate.surrogate import BATCH
