@@ -1,13 +1,16 @@
-"""Whole jobs on the paper's objects, in this process: what the benches of attacks share."""
+"""Whole jobs on the paper's objects, in this process, and tables that grow by them: what benches of attacks share."""
 
+import csv
 import io
 import json
 import os
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
+
+from pydantic import BaseModel
 
 from trompe_server.artifacts import LocalArtifacts
 from trompe_server.attack_job import open_pipeline
@@ -16,7 +19,44 @@ from trompe_server.target import SailenvTarget
 from trompe_shared.api import JobSpec, Result
 from trompe_shared.object3d import load_object
 
-__all__ = ["Paper"]
+__all__ = ["Paper", "Rows"]
+
+Row = TypeVar("Row", bound=BaseModel)
+
+
+class Rows(Generic[Row]):
+    """Rows of one kind, and the CSV ``file`` (if any) that each is added to at once: a bench that was stopped goes on.
+
+    Empty cells are ``None``.
+    """
+
+    def __init__(self, kind: type[Row], file: Path | None) -> None:
+        self.kind, self.file, self.rows = kind, file, list[Row]()
+        if file is not None and file.exists():
+            with file.open(newline="", encoding="utf-8") as lines:
+                for line in csv.DictReader(lines):
+                    self.rows.append(kind.model_validate({name: value or None for name, value in line.items()}))
+
+    def find(self, key: Mapping[str, Any]) -> list[Row]:
+        """The rows that have all values of ``key``."""
+        return [row for row in self.rows if all(getattr(row, name) == value for name, value in key.items())]
+
+    def get(self, key: Mapping[str, Any], make: Callable[[], Row]) -> Row:
+        """The row that has all values of ``key``; where there is none, it is made and added."""
+        found = self.find(key)
+        return found[0] if found else self.add(make())
+
+    def add(self, row: Row) -> Row:
+        """Keep ``row``."""
+        self.rows.append(row)
+        if self.file is not None:
+            new = not self.file.exists()
+            with self.file.open("a", newline="", encoding="utf-8") as file:
+                writer = csv.DictWriter(file, list(self.kind.model_fields), lineterminator="\n")
+                if new:
+                    writer.writeheader()
+                writer.writerow(row.model_dump())
+        return row
 
 
 class Paper:
@@ -51,9 +91,10 @@ class Paper:
         }
         return JobSpec(**(protocol | options))
 
-    def run(self, spec: JobSpec, target: SailenvTarget) -> Result:
-        """One job from beginning to end. It pays for its probes, whatever was found out before."""
-        self.library.calibrations.delete_all()
+    def run(self, spec: JobSpec, target: SailenvTarget, *, known: bool = False) -> Result:
+        """One job from beginning to end. It pays for its probes, unless those of earlier ones count as ``known``."""
+        if not known:
+            self.library.calibrations.delete_all()
         shutil.rmtree(self.folder / "job", ignore_errors=True)
         artifacts = LocalArtifacts(self.folder / "job")
         job = open_pipeline(spec, library=self.library, artifacts=artifacts, target=target)
