@@ -34,6 +34,9 @@ __all__ = ["render"]
     "--supersample", default=1, show_default=True, type=click.IntRange(1, 4), help="Shaded samples along a pixel."
 )
 @click.option(
+    "--anisotropy", default=1, show_default=True, type=click.IntRange(1, 16), help="Of texture filters; 1 is none."
+)
+@click.option(
     "--depth-range", default=10.0, show_default=True, type=click.FloatRange(1e-3, 1000), help="Metres shown as white."
 )
 @click.option(
@@ -48,6 +51,7 @@ def render(
     shadow_map: int,
     msaa: int,
     supersample: int,
+    anisotropy: int,
     depth_range: float,
     time_step: float | None,
     verbose: bool,
@@ -59,7 +63,7 @@ def render(
     There is no authentication: keep it on an address that only those reach who may use it.
     """
     logging.basicConfig(stream=sys.stderr, level=logging.INFO if verbose else logging.WARNING, format="%(message)s")
-    options = Options(Quality(shadows, msaa, shadow_map, supersample), depth_range, time_step)
+    options = Options(Quality(shadows, msaa, shadow_map, supersample, anisotropy), depth_range, time_step)
     try:
         listener = listen(host, port)
     except RendererError as error:

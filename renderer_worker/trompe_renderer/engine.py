@@ -28,7 +28,7 @@ class Engine:
         self._context = create_context()
         self._renderer = ObjectRenderer(quality)
         self._surveyor = Surveyor()
-        self._uploads = Uploads()
+        self._uploads = Uploads(anisotropy=quality.anisotropy)
         self._suns = [pyrender.DirectionalLight() for _ in range(MAX_LIGHTS)]
         self._lamps = [pyrender.PointLight() for _ in range(MAX_LIGHTS)]
         self._camera = pyrender.PerspectiveCamera(yfov=np.radians(FIELD_OF_VIEW), znear=NEAR, zfar=FAR)

@@ -10,13 +10,15 @@ class Quality:
     """How finely pictures are drawn; docs/worker.md has the cost of each.
 
     ``msaa`` is the number of coverage samples a pixel (1 is none), ``shadow_map`` the side of a shadow map in texels,
-    ``supersample`` the number of shaded samples along each side of a pixel.
+    ``supersample`` the number of shaded samples along each side of a pixel, ``anisotropy`` how many times longer
+    than wide the footprint of a pixel may be that textures are averaged over.
     """
 
     shadows: bool = True
     msaa: int = 4
     shadow_map: int = 1024
     supersample: int = 1
+    anisotropy: int = 1
 
 
 @dataclass(frozen=True)

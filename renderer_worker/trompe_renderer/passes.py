@@ -15,7 +15,7 @@ from PIL import Image
 
 from trompe_renderer.backdrop import BackdropPass
 from trompe_renderer.options import Quality
-from trompe_renderer.platform import GL, pyrender
+from trompe_renderer.platform import GL, MAX_ANISOTROPY, pyrender
 from trompe_renderer.scenery import Backdrop
 from trompe_renderer.shaders import framebuffer, renderbuffer
 from trompe_shared.errors import RendererError
@@ -123,7 +123,10 @@ def _check(quality: Quality) -> None:
     limits = {
         "MSAA samples": (quality.msaa, GL.GL_MAX_SAMPLES),
         "shadow map": (quality.shadow_map, GL.GL_MAX_TEXTURE_SIZE),
+        "anisotropy": (quality.anisotropy, MAX_ANISOTROPY),
     }
+    if quality.anisotropy == 1:
+        del limits["anisotropy"]  # which drivers need not know
     for what, (wanted, name) in limits.items():
         most = int(GL.glGetIntegerv(name))
         if wanted > most:

@@ -14,7 +14,7 @@ import numpy as np
 
 from trompe_shared.errors import RendererError
 
-__all__ = ["GL", "create_context", "give_memory_back", "pyrender"]
+__all__ = ["ANISOTROPY", "GL", "MAX_ANISOTROPY", "create_context", "give_memory_back", "pyrender"]
 
 _M_TRIM_THRESHOLD: Final = -1
 _M_MMAP_THRESHOLD: Final = -3
@@ -40,6 +40,8 @@ _prepare()
 try:
     import pyrender
     from OpenGL import GL
+    from OpenGL.GL.EXT.texture_filter_anisotropic import GL_MAX_TEXTURE_MAX_ANISOTROPY_EXT as MAX_ANISOTROPY
+    from OpenGL.GL.EXT.texture_filter_anisotropic import GL_TEXTURE_MAX_ANISOTROPY_EXT as ANISOTROPY
     from pyrender.platforms import egl as _egl
 except (ImportError, AttributeError, OSError) as error:
     raise RendererError(f"OpenGL cannot be loaded ({error}). {_EGL_REMEDY}") from error

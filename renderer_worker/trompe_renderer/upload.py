@@ -1,18 +1,16 @@
 """Objects in the memory of the graphics card. Only the thread that owns the OpenGL context may come here."""
 
-import io
 from collections import OrderedDict
 from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from trompe_renderer import cutout  # noqa: F401 (makes pyrender test alpha)
 from trompe_renderer.model import Model, content_key
-from trompe_renderer.platform import GL, pyrender
-from trompe_shared.object3d import Material, Part, decode_rgb
+from trompe_renderer.platform import ANISOTROPY, GL, pyrender
+from trompe_shared.object3d import Material, Part, decode_rgb, open_image
 from trompe_shared.opacity import opacity_of
 
 __all__ = ["Uploads"]
@@ -40,7 +38,8 @@ class Uploads:
     A mesh serves all models of its shape: it is given the textures of the one that is drawn next.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, anisotropy: int = 1) -> None:
+        self._anisotropy = anisotropy
         self._shapes: list[_Shape] = []
         self._textures: OrderedDict[str, _Texture] = OrderedDict()
         self._pictures = 0
@@ -84,7 +83,7 @@ class Uploads:
             key += _opacity(model.obj.files[name])[0]
         if key not in self._textures:
             pixels = _pixels(use, name, model)
-            self._textures[key] = self._repainted(pixels) or _Texture(pixels)
+            self._textures[key] = self._repainted(pixels) or _Texture(pixels, self._anisotropy)
         self._textures.move_to_end(key)
         self._textures[key].drawn = self._pictures
         return self._textures[key]
@@ -119,8 +118,9 @@ class _Shape:
 class _Texture(pyrender.Texture):  # type: ignore[misc]
     """A texture with mipmaps whose pixels (H, W, channels) can be replaced by others of the same shape."""
 
-    def __init__(self, pixels: Pixels) -> None:
+    def __init__(self, pixels: Pixels, anisotropy: int) -> None:
         super().__init__(sampler=_trilinear())
+        self._anisotropy = anisotropy
         self.shape, self.nbytes = pixels.shape, pixels.nbytes
         self.drawn = 0  # the number of the picture
         self._format = {2: GL.GL_RG, 3: GL.GL_RGB, 4: GL.GL_RGBA}[pixels.shape[2]]
@@ -156,6 +156,8 @@ class _Texture(pyrender.Texture):  # type: ignore[misc]
             (GL.GL_TEXTURE_WRAP_T, sampler.wrapT),
         ):
             GL.glTexParameteri(self.tex_type, name, value)
+        if self._anisotropy > 1:
+            GL.glTexParameterf(self.tex_type, ANISOTROPY, self._anisotropy)
         self._unbind()
         self._waiting = None
 
@@ -192,7 +194,7 @@ def _pixels(use: str, name: str, model: Model) -> Pixels:
             return texture
         return np.dstack([texture, opacity])
     data = model.obj.files[name]
-    return decode_rgb(data, name) if use == "normal" else _roughness_metallic(data)
+    return decode_rgb(data, name) if use == "normal" else _roughness_metallic(data, name)
 
 
 @lru_cache(maxsize=32)
@@ -202,9 +204,9 @@ def _opacity(data: bytes) -> tuple[str, Pixels | None]:
     return ("", None) if opacity is None else (f" cut out by {content_key(opacity)}", opacity)
 
 
-def _roughness_metallic(data: bytes) -> Pixels:
+def _roughness_metallic(data: bytes, name: str) -> Pixels:
     """(H, W, 2) uint8 from a MetallicSmoothness file: 1 - alpha (smoothness), red."""
-    with Image.open(io.BytesIO(data)) as image:
+    with open_image(data, name) as image:
         smoothness = image.getchannel("A") if "A" in image.getbands() else None
         metallic = np.array(image.convert("RGB"))[..., 0]
     plain = np.full(metallic.shape, round(255 * PLAIN_ROUGHNESS), np.uint8)

@@ -15,13 +15,17 @@ from trompe_shared.object3d import Object3D
 
 __all__ = ["calibration_key", "pack_calibration", "unpack_calibration"]
 
+VERSION = 2
+"""Another for each way of calibrating that can find something else from the same answers. 1 knew no anisotropy and no
+shift."""
+
 
 def calibration_key(obj: Object3D, views: Sequence[View], clean: np.ndarray, *, wanted: str, seed: int) -> str:
     """Name of the calibration that these would give: equal for equal objects, views and answers of the target.
 
     ``clean``, the target's images of the unpainted object, stand for the renderer: one that has changed shows it there.
     """
-    digest = hashlib.sha256(json.dumps([wanted, seed, [asdict(view) for view in views]]).encode())
+    digest = hashlib.sha256(json.dumps([VERSION, wanted, seed, [asdict(view) for view in views]]).encode())
     for name in sorted(obj.files):
         digest.update(name.encode() + b"\0" + hashlib.sha256(obj.files[name]).digest())
     digest.update(repr(clean.shape).encode() + np.ascontiguousarray(clean).tobytes())
@@ -41,7 +45,8 @@ def unpack_calibration(data: bytes) -> Calibration:
     arrays = unpack_arrays(data)
     try:
         words = json.loads(arrays["words"].tobytes())
-        words["sampling"] = SamplingModel(**words["sampling"])
+        sampling = SamplingModel(**words["sampling"])
+        words["sampling"] = sampling.but(shift=tuple(sampling.shift))
         words["fidelity"] = Fidelity(**{name: tuple(values) for name, values in words["fidelity"].items()})
         words["greys"] = tuple(words["greys"])
         return Calibration(**words, probes=arrays["probes"])

@@ -14,7 +14,8 @@ import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Final
@@ -35,6 +36,7 @@ __all__ = [
     "encode_png",
     "load_object",
     "object_from_files",
+    "open_image",
     "pack_zip",
     "unpack",
     "unzip",
@@ -113,7 +115,7 @@ class Object3D:
 
     def _repaint(self, name: str, image: Texture) -> bytes:
         """PNG bytes of ``image``, carrying over the alpha channel (opacity) of the file it replaces."""
-        with Image.open(io.BytesIO(self.files[name])) as before:
+        with open_image(self.files[name], name) as before:
             alpha = before.convert("RGBA").getchannel("A") if before.has_transparency_data else None
         picture = Image.fromarray(image)
         if alpha is not None and alpha.size == picture.size:
@@ -133,19 +135,30 @@ def encode_png(image: Image.Image | Texture) -> bytes:
     return buffer.getvalue()
 
 
-def decode_rgb(data: bytes, name: str) -> Texture:
-    """Decode an image file to (H, W, 3) uint8. Raises ``ObjectError`` with ``name`` when it cannot be read."""
+@contextmanager
+def open_image(data: bytes, name: str) -> Iterator[Image.Image]:
+    """An image file that comes from anybody, opened for the time of the block: the one way in for pixels.
+
+    It is of ``IMAGE_FORMATS``, and its sides are looked at before a pixel is decoded. Raises ``ObjectError`` with
+    ``name``, also for what turns out to be damaged within the block.
+    """
     try:
         with Image.open(io.BytesIO(data), formats=IMAGE_FORMATS) as image:
             if max(image.size) > MAX_TEXTURE_SIDE:
                 raise ObjectError(
                     f"Texture {name!r} is {image.size} pixels; at most {MAX_TEXTURE_SIDE} a side are read."
                 )
-            return np.array(image.convert("RGB"))
+            yield image
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise ObjectError(f"Texture {name!r} is too large ({error}); {MAX_TEXTURE_SIDE} a side are read.") from error
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, struct.error) as error:
         raise ObjectError(f"Texture {name!r} cannot be read as an image ({error}). Save it again as a PNG.") from error
+
+
+def decode_rgb(data: bytes, name: str) -> Texture:
+    """Decode an image file to (H, W, 3) uint8. Raises ``ObjectError`` with ``name`` when it cannot be read."""
+    with open_image(data, name) as image:
+        return np.array(image.convert("RGB"))
 
 
 def pack_zip(files: Mapping[str, bytes]) -> bytes:

@@ -4,12 +4,12 @@ As in Unity's Cutout mode a fragment is not drawn where the alpha that it reads 
 the object's shape: an attack repaints colours and leaves it alone.
 """
 
-import io
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+
+from trompe_shared.object3d import open_image
 
 __all__ = ["CUTOFF", "opacity_of"]
 
@@ -18,8 +18,11 @@ CUTOFF: Final = 0.5
 
 
 def opacity_of(data: bytes) -> NDArray[np.uint8] | None:
-    """Alpha (H, W) uint8, row 0 on top, of a readable albedo image file; ``None`` where it cuts nothing out."""
-    with Image.open(io.BytesIO(data)) as image:
+    """Alpha (H, W) uint8, row 0 on top, of an albedo image file; ``None`` where it cuts nothing out.
+
+    Raises ``ObjectError`` for a file that cannot be read.
+    """
+    with open_image(data, "albedo") as image:
         if not image.has_transparency_data:
             return None
         alpha = np.array(image.convert("RGBA").getchannel("A"))

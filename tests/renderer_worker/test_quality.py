@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D, load_object
 
 Boxes = Callable[..., Object3D]
+Make = Callable[..., Any]
 Running = Callable[..., AbstractContextManager[tuple[str, int]]]
 Picture = NDArray[np.uint8]
 
@@ -94,10 +96,31 @@ def test_the_larger_a_shadow_map_is_the_truer_are_the_edges_of_shadows(
     assert off[0] > 1.5 * off[1] > 3 * off[2] > 0
 
 
+def test_an_anisotropic_filter_keeps_stripes_that_run_away_from_the_eye(
+    running_worker: Running, make_object: Make, make_quad: Make
+) -> None:
+    stripes = np.broadcast_to(np.array([0, 0, 255, 255], np.uint8)[:, None, None].repeat(3, 2), (4, 1, 3))
+    floor = make_object(make_quad(np.tile(stripes, (32, 128, 1)), half=0.2))
+    contrast = []
+    for options in ((), ("--anisotropy", "16")):
+        with running_worker(*options) as address:
+            image = shown(address, floor, Camera(0.5, 78, 0), Light(0, 0, 0.0, 1.0))
+        contrast.append(image[20:40, 38:42, 0].std(axis=0).mean())
+    assert contrast[1] > 1.5 * contrast[0]
+
+
 def test_the_help_names_every_option_and_where_its_cost_stands() -> None:
     command = [sys.executable, "-m", "trompe_renderer", "--help"]
     text = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
-    for option in ("--shadows", "--shadow-map", "--msaa", "--supersample", "--depth-range", "--time-step"):
+    for option in (
+        "--shadows",
+        "--shadow-map",
+        "--msaa",
+        "--supersample",
+        "--anisotropy",
+        "--depth-range",
+        "--time-step",
+    ):
         assert option in text
     assert "docs/worker.md" in text
 
@@ -108,6 +131,7 @@ def test_the_help_names_every_option_and_where_its_cost_stands() -> None:
         pytest.param(["--msaa", "32"], "MSAA samples: 32 is more than", id="more samples than the driver has"),
         pytest.param(["--msaa", "0"], "--msaa", id="no samples"),
         pytest.param(["--supersample", "9"], "--supersample", id="too many samples"),
+        pytest.param(["--anisotropy", "17"], "--anisotropy", id="too much anisotropy"),
         pytest.param(["--shadow-map", "3"], "--shadow-map", id="no shadow map"),
         pytest.param(["--depth-range", "0"], "--depth-range", id="no depth"),
     ],

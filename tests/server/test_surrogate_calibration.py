@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +21,11 @@ from trompe_server.surrogate.calibration import (
     CURVE_GREYS,
     MAX_ERROR,
     MIN_EXPLAINED,
+    SATISFYING,
     Calibration,
     build_surrogate,
     calibrate,
+    find_sampling,
     painted_grey,
     painted_noise,
 )
@@ -37,6 +40,7 @@ SIZE = (64, 64)
 MUG = shipped_objects()["mug"]
 VIEWS = [View(Camera(MUG.distance, azimuth, elevation)) for azimuth in (0, 70, 200) for elevation in (5, 40)]
 Image8 = NDArray[np.uint8]
+Make = Callable[..., Any]
 Render = Callable[[Object3D, Sequence[View]], Image8]
 
 
@@ -118,6 +122,48 @@ def test_the_sampling_of_a_known_target_is_recovered(busy_mug: Object3D, truth: 
     assert calibration.fidelity.mean()["explained"] > 0.98
     assert calibration.fidelity.mean()["slope"] == pytest.approx(1, abs=0.03)
     assert calibration.fidelity.mean()["correlation"] > 0.98
+
+
+ASLANT = [View(Camera(0.3, azimuth, elevation)) for azimuth, elevation in ((60, 0), (70, 10), (10, 65), (-72, 5))]
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        pytest.param(SamplingModel(anisotropy=2), id="2"),
+        pytest.param(SamplingModel(anisotropy=4), id="4"),
+        pytest.param(SamplingModel(anisotropy=16, samples="centre", bias=-0.25), id="16, centre, -0.25"),
+        pytest.param(SamplingModel(anisotropy=16, elongated="ellipse", filtered="linear"), id="ellipse, linear"),
+        pytest.param(SamplingModel(shift=(0.5, 0.5)), id="half a pixel"),
+        pytest.param(SamplingModel(shift=(-0.15, 0.3), lod="area", filtered="linear"), id="-0.15, 0.3, area, linear"),
+        pytest.param(SamplingModel(shift=(0.25, 0.0), anisotropy=16), id="both"),
+    ],
+)
+def test_what_few_renderers_do_is_recovered(truth: SamplingModel, make_object: Make, make_quad: Make) -> None:
+    texture = np.random.default_rng(0).integers(40, 216, (96, 96, 3), dtype=np.uint8)
+    calibration = found(make_object(make_quad(texture)), KnownTarget(truth), "curve", views=ASLANT)
+    sampling = calibration.sampling
+    assert (sampling.elongated, sampling.filtered) == (truth.elongated, truth.filtered)
+    assert (sampling.anisotropy > 1) == (truth.anisotropy > 1)
+    assert sampling.shift == pytest.approx(truth.shift, abs=0.06)
+    assert calibration.fidelity.mean()["correlation"] > 0.98
+
+
+def test_nothing_rare_is_looked_for_where_the_usual_satisfies() -> None:
+    tried: list[SamplingModel] = []
+
+    def score(model: SamplingModel) -> float:
+        tried.append(model)
+        return SATISFYING + 0.01 * (model.samples == "centre")
+
+    assert find_sampling(score) == SamplingModel(samples="centre")
+    assert len(tried) == len(set(tried)) < 40
+    assert {(model.anisotropy, model.shift) for model in tried} == {(1, (0.0, 0.0))}
+
+
+def test_something_rare_that_gains_little_is_not_believed() -> None:
+    assert find_sampling(lambda model: 0.5 + 0.019 * (model.anisotropy > 1)) == SamplingModel()
+    assert find_sampling(lambda model: 0.5 + 0.021 * (model.anisotropy > 1)).anisotropy > 1
 
 
 def test_two_probes_a_view_are_taken_where_they_are_good_enough(mug: Object3D) -> None:

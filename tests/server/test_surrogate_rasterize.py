@@ -208,6 +208,14 @@ def test_the_first_of_two_equal_triangles_is_seen() -> None:
     assert set(np.unique(seen_faces(twice, Camera(2, 30, 10)))) == {-1, 0}
 
 
+@pytest.mark.parametrize("camera", [Camera(0.4, 20, 10), Camera(0.5, -50, 35), Camera(0.7, 3, -60)])
+def test_of_two_sheets_in_one_plane_the_first_is_seen_however_they_are_cut_into_triangles(camera: Camera) -> None:
+    square = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]])
+    sheets = mesh_from(square[[[0, 1, 2], [0, 2, 3], [1, 2, 3], [1, 3, 0]]])
+    seen = seen_faces(sheets, camera, size=(128, 128))
+    assert (seen[seen >= 0] < 2).mean() > 0.95
+
+
 @given(triangle_soups(), CAMERAS, st.randoms(use_true_random=False))
 @settings(max_examples=40, deadline=None)
 def test_the_order_of_the_triangles_does_not_matter(soup: Floats, camera: Camera, random: Random) -> None:

@@ -24,6 +24,8 @@ MODELS = [
     SamplingModel(),
     SamplingModel(samples="centre", lod="area", bias=0.7),
     SamplingModel(shade_at="centroid", filtered="linear", cull=False, bias=-1.0),
+    SamplingModel(anisotropy=4, shift=(0.3, -0.4)),
+    SamplingModel(anisotropy=16, elongated="ellipse", samples="centre"),
 ]
 VIEWS = [View(Camera(0.157, 30, 25)), View(Camera(0.2, 200, -20))]
 SIZE = (64, 64)
@@ -52,15 +54,23 @@ def read_values(obj: Object3D, model: SamplingModel = MODELS[0], views: list[Vie
     return list(torch.split(batch.gather.forward(texels), list(batch.counts)))
 
 
-def front_view(texture: Image8, make_object: Make, make_quad: Make, *, pixels: float, **options: Any) -> Tensor:
+def front_view(
+    texture: Image8,
+    make_object: Make,
+    make_quad: Make,
+    *,
+    pixels: float,
+    model: SamplingModel = MODELS[0],
+    **options: Any,
+) -> Tensor:
     """What the pixels read of a square, ``pixels`` wide in the image, that faces the camera: (64, 64, 3), NaN around
     it."""
     focal = SIZE[0] / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
     obj = make_object(make_quad(texture, half=pixels / 2 * DISTANCE / focal, **options))
     views = [View(Camera(DISTANCE, 0, 0))]
-    geometry, _ = reading(obj, views=views)
+    geometry, _ = reading(obj, model, views)
     image = torch.full((SIZE[0] * SIZE[1], 3), torch.nan)
-    image[geometry.batches[0].pixel] = read_values(obj, views=views)[0]
+    image[geometry.batches[0].pixel] = read_values(obj, model, views)[0]
     return image.view(*SIZE, 3)
 
 
@@ -299,3 +309,79 @@ def test_alpha_is_read_at_the_level_that_the_pixel_reads(make_object: Make, make
     )
     assert striped == whole
     assert faint == 0
+
+
+INSIDE = slice(8, 56)
+"""Rows and columns that a square of 64 pixels fills, without those near its edge."""
+
+
+@pytest.mark.parametrize("most", [1, 2, 4, 16])
+def test_a_footprint_four_times_as_long_as_wide_is_read_no_wider_than_the_anisotropy_makes_it(
+    most: int, make_object: Make, make_quad: Make
+) -> None:
+    stripes = np.broadcast_to(noise(1, 64), (256, 64, 3)).copy()
+    model = SamplingModel(anisotropy=most, samples="centre")
+    seen = front_view(stripes, make_object, make_quad, pixels=64, model=model)
+    wide = 4 // min(most, 4)  # texels that become one at the level of detail
+    level = torch.from_numpy(stripes[0] / 255).float().view(64 // wide, wide, 3).mean(1)
+    at = (torch.arange(64) + 0.5) / wide - 0.5
+    first, part = at.floor().long(), (at - at.floor())[:, None]
+    expected = level[first % len(level)] * (1 - part) + level[(first + 1) % len(level)] * part
+    assert torch.allclose(seen[32, INSIDE], expected[INSIDE], atol=0.01)
+
+
+def test_probes_lie_side_by_side_along_the_longer_axis(make_object: Make, make_quad: Make) -> None:
+    texture, model = noise(256, 64), SamplingModel(anisotropy=4, samples="centre")
+    seen = front_view(texture, make_object, make_quad, pixels=64, model=model)
+    averages = torch.from_numpy(texture / 255).float().view(64, 4, 64, 3).mean(1)
+    assert torch.allclose(seen[INSIDE, INSIDE], averages[INSIDE, INSIDE], atol=0.01)
+
+
+def test_a_square_footprint_is_read_by_one_probe(make_object: Make, make_quad: Make) -> None:
+    usual, probed = (
+        front_view(noise(128, 128), make_object, make_quad, pixels=50, model=SamplingModel(anisotropy=most))
+        for most in (1, 16)
+    )
+    assert torch.equal(usual.isnan(), probed.isnan())
+    assert torch.allclose(usual.nan_to_num(), probed.nan_to_num(), atol=1e-3)
+
+
+def test_an_ellipse_is_a_gaussian_over_the_texels_of_the_footprint_and_one_around_it(
+    make_object: Make, make_quad: Make
+) -> None:
+    texture, (x, y) = noise(256, 64), (30, 40)
+    model = SamplingModel(anisotropy=16, elongated="ellipse", samples="centre", bias=0.01)
+    seen = front_view(texture, make_object, make_quad, pixels=64, model=model)[y, x]
+    rows, columns = np.indices((256, 64))
+    squared = ((columns - x) / 2**0.5) ** 2 + ((rows - (4 * y + 1.5)) / 17**0.5) ** 2
+    weight = np.exp(-2 * squared) * (squared < 1)
+    expected = (weight[..., None] * texture / 255).sum((0, 1)) / weight.sum()
+    assert seen.numpy() == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize("shift", [(1.0, 0.0), (0.0, -1.0), (-1.0, 1.0)])
+@pytest.mark.parametrize("samples", ["msaa4", "msaa4-mirrored", "centre"])
+def test_a_shift_by_a_whole_pixel_moves_the_picture_by_one(
+    samples: Any, shift: tuple[float, float], mug: Object3D
+) -> None:
+    pictures = []
+    for model in (SamplingModel(samples=samples), SamplingModel(samples=samples, shift=shift)):
+        geometry, surrogate = reading(mug, model)
+        (batch,) = geometry.batches
+        picture = torch.zeros(len(VIEWS) * SIZE[0] * SIZE[1], 3)
+        picture[batch.pixel] = batch.gather.forward(surrogate.texels(textures_of(mug))) * batch.coverage
+        pictures.append(picture.view(len(VIEWS), *SIZE, 3))
+    right, down = map(int, shift)
+    moved = torch.roll(pictures[0], (-down, -right), (1, 2))
+    assert torch.allclose(moved[:, 1:-1, 1:-1], pictures[1][:, 1:-1, 1:-1], atol=2e-3)
+
+
+def test_what_a_shift_moves_into_the_image_is_seen_at_its_edge(make_object: Make, make_quad: Make) -> None:
+    texture = noise(8, 8)
+    corners, *painted = make_quad(texture, half=0.01)
+    right = DISTANCE * np.tan(np.radians(FIELD_OF_VIEW / 2)) + 0.0105  # begins right of the image
+    obj = make_object((np.asarray(corners) + np.array([right, 0, 0]), *painted))
+    views = [View(Camera(DISTANCE, 0, 0))]
+    counts = [reading(obj, SamplingModel(shift=(shift, 0.0)), views)[0].batches[0].counts for shift in (0.0, 1.0)]
+    assert counts[0] == (0,)
+    assert counts[1] > (0,)

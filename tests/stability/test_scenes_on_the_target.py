@@ -12,8 +12,15 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from trompe_server.attack_report import POOR_VIEW
 from trompe_server.surrogate import SamplingModel, Surrogate, curve_surrogate, prepare_geometry
-from trompe_server.surrogate.calibration import CURVE_GREYS, measure_fidelity, painted_noise
+from trompe_server.surrogate.calibration import (
+    CURVE_GREYS,
+    build_surrogate,
+    calibrate,
+    measure_fidelity,
+    painted_noise,
+)
 from trompe_server.target import SailenvTarget
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, object_from_files
@@ -110,6 +117,21 @@ def coplanar(make_object: MakeObject, make_quad: Make) -> Object3D:
     return make_object(*quads(make_quad, (0.1, 0.0, 64), (0.1, 0.0, 48)))
 
 
+def cut_otherwise(surface: Surface) -> Surface:
+    """The same square, of the two triangles along its other diagonal."""
+    corners, uvs = (np.reshape(values, (6, -1))[[1, 2, 5, 1, 5, 0]].reshape(2, 3, -1) for values in surface[:2])
+    return corners, uvs, surface[2]
+
+
+def flickering(make_object: MakeObject, make_quad: Make) -> Object3D:
+    first, second = quads(make_quad, (0.1, 0.0, 64), (0.1, 0.0, 48))
+    return make_object(turned(first, 33.3), cut_otherwise(turned(second, 33.3)))
+
+
+def sticker(make_object: MakeObject, make_quad: Make) -> Object3D:
+    return make_object(*quads(make_quad, (0.1, 0.0, 64), (0.07, 0.0, 48)))
+
+
 def two_sided(make_object: MakeObject, make_quad: Make) -> Object3D:
     (front,) = quads(make_quad, (0.1, 0.0, 64))
     return make_object(front, reverse(front, noise(24, 24, seed=5)))
@@ -183,6 +205,25 @@ def test_the_surrogate_predicts_what_the_target_shows(
     assert min(fidelity.correlation) >= least
     assert fidelity.mean()["slope"] == pytest.approx(1, abs=0.05)
     assert fidelity.mean()["error"] <= 2 / 255
+
+
+@pytest.mark.parametrize("scene", [flickering, sticker])
+def test_parts_in_one_plane_that_rounding_alone_orders_are_told(
+    scene: Make, target: SailenvTarget, make_object: MakeObject, make_quad: Make
+) -> None:
+    obj, views = scene(make_object, make_quad), AROUND[:4]
+    unlit = {name: np.full_like(obj.textures[name], level) for name, level in (("m0.png", 0), ("m1.png", 200))}
+    seen = target.render(obj.with_textures(unlit), views, size=SIZE)
+    inside = seen[(seen != MAGENTA).any(axis=-1)].max(axis=1) > 100
+    assert 0.05 < inside.mean() < 0.95  # both show, here the one, there the other
+
+    def ask(painted: Object3D, views: Sequence[View]) -> Image8:
+        return target.render(painted, views, size=SIZE)
+
+    clean = ask(obj, views)
+    calibration = calibrate(obj, views, clean, ask, wanted="auto", generator=np.random.default_rng(0))
+    assert not calibration.fidelity.good_enough
+    assert max(build_surrogate(calibration, obj, views, clean).clean_errors()) > POOR_VIEW
 
 
 def test_a_sheet_with_holes_shows_what_is_behind_them_and_a_repaint_keeps_the_holes(

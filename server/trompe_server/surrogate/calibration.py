@@ -6,6 +6,8 @@ judged by how well it predicts what the noise changes in the target's images.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -58,6 +60,9 @@ NOISE_AMPLITUDE: Final = 0.1
 
 TRIAL_VIEWS: Final = 4
 """Views on which hypotheses and colour models are tried."""
+
+KEPT_BYTES: Final = 2**29
+"""Memory of the operators of hypotheses that are kept while others are tried."""
 
 Image8 = NDArray[np.uint8]
 Ask = Callable[[Object3D, Sequence[View]], Image8]
@@ -150,56 +155,124 @@ def _compare(
     return float((predicted - clean).abs().mean()), correlation, product / max(power, 1e-12), explained
 
 
-def find_sampling(score: Callable[[SamplingModel], float]) -> SamplingModel:
+Score = Callable[[SamplingModel], float]
+
+
+def find_sampling(score: Score) -> SamplingModel:
     """The sampling hypothesis with the highest ``score`` (``Fidelity.score``).
 
     One group of members is varied at a time, the most telling first, until a whole round changes nothing; a change
-    must gain 0.002 to be believed. At the end the bias of the level of detail is read off a parabola.
+    must gain 0.002 to be believed. Only where that leaves much unexplained, what few renderers do is tried too. At the
+    end the bias of the level of detail is read off a parabola.
     """
-    known: dict[SamplingModel, float] = {}
+    scored = lru_cache(maxsize=None)(score)
+    best = _climbed(SamplingModel(), scored)
+    for _ in range(MAX_RARE):
+        if scored(best) >= SATISFYING:
+            break
+        leader = max((best.but(**members) for members in RARE), key=scored)
+        if scored(leader) <= scored(best) + CLEARLY:
+            break
+        best = _centred(_climbed(_centred(leader, scored), scored), scored)
+    return _peaked(best, _biased, BIAS_STEP, scored)
 
-    def scored(model: SamplingModel) -> float:
-        if model not in known:
-            known[model] = score(model)
-        return known[model]
 
-    best = SamplingModel()
+def _climbed(best: SamplingModel, score: Score) -> SamplingModel:
+    """The best that can be reached from ``best`` by changing one group of members at a time."""
     for _ in range(MAX_ROUNDS):
         before = best
-        for group in ALTERNATIVES:
-            leader = max((best.but(**members) for members in group), key=scored)
-            best = leader if scored(leader) > scored(best) + 0.002 else best
+        for group in ALTERNATIVES if best.anisotropy == 1 else ELONGATED:
+            leader = max((best.but(**members) for members in group), key=score)
+            best = leader if score(leader) > score(best) + 0.002 else best
         if best == before:
             break
-    return _fine_bias(best, scored)
+    return best
 
 
 MAX_ROUNDS: Final = 4
 
+SATISFYING: Final = 0.93
+"""Score from which on nothing rare is looked for."""
+
+CLEARLY: Final = 0.02
+"""What something rare must gain."""
+
 BIASES: Final = (0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0)
 
-ALTERNATIVES: Final[tuple[tuple[dict[str, object], ...], ...]] = (
+Group = tuple[dict[str, object], ...]
+
+LEVELS: Final[Group] = tuple({"lod": lod, "bias": bias} for lod in ("longer", "area") for bias in BIASES)
+
+ALTERNATIVES: Final[tuple[Group, ...]] = (
     ({"encoding": "srgb"}, {"encoding": "power"}),
     ({"filtered": "encoded"}, {"filtered": "linear"}),
     ({"samples": "msaa4"}, {"samples": "msaa4-mirrored"}, {"samples": "centre"}),
-    tuple({"lod": lod, "bias": bias} for lod in ("longer", "area") for bias in BIASES),
+    LEVELS,
     ({"mips": "exact"}, {"mips": "rounded"}),
     ({"shade_at": "centre"}, {"shade_at": "centroid"}),
     ({"cull": True}, {"cull": False}),
 )
 """Groups of members of the hypothesis that make up for each other, and the values they could have."""
 
+ELONGATED: Final[tuple[Group, ...]] = (
+    tuple({"anisotropy": most} for most in (2, 4, 8, 16)),
+    tuple({"bias": bias} for bias in BIASES),
+    *(group for group in ALTERNATIVES if group is not LEVELS),
+)
+"""The same for filters that follow elongated footprints."""
+
+SHIFTS: Final[Group] = tuple({"shift": shift} for shift in product((-0.25, 0.0, 0.25), repeat=2) if any(shift))
+
+PLAIN_LEVEL: Final[dict[str, object]] = {"lod": "longer", "bias": 0.0, "shade_at": "centre"}
+"""What else makes up for anisotropy that is missed."""
+
+RARE: Final[Group] = (
+    {"anisotropy": 2, "elongated": "probes", **PLAIN_LEVEL},
+    {"anisotropy": 4, "elongated": "probes", **PLAIN_LEVEL},
+    {"anisotropy": 16, "elongated": "probes", **PLAIN_LEVEL},
+    {"anisotropy": 16, "elongated": "ellipse", **PLAIN_LEVEL},
+    *SHIFTS,
+)
+"""Where a search for what few renderers do begins."""
+
+MAX_RARE: Final = 2
+"""How many things that few renderers do one renderer may do."""
+
 BIAS_STEP: Final = 0.25
 
+SHIFT_STEPS: Final = (0.25, 0.125)
 
-def _fine_bias(best: SamplingModel, score: Callable[[SamplingModel], float]) -> SamplingModel:
-    """``best`` with the bias at which the parabola through its own and two neighbouring scores peaks, if that gains."""
-    low, high = (score(best.but(bias=best.bias + step)) for step in (-BIAS_STEP, BIAS_STEP))
+
+def _biased(model: SamplingModel, by: float) -> SamplingModel:
+    return model.but(bias=round(model.bias + by, 4))
+
+
+def _shifted_right(model: SamplingModel, by: float) -> SamplingModel:
+    return model.but(shift=(round(min(1.0, max(-1.0, model.shift[0] + by)), 4), model.shift[1]))
+
+
+def _shifted_down(model: SamplingModel, by: float) -> SamplingModel:
+    return model.but(shift=(model.shift[0], round(min(1.0, max(-1.0, model.shift[1] + by)), 4)))
+
+
+def _centred(best: SamplingModel, score: Score) -> SamplingModel:
+    """``best`` with the shift of its pixels read off parabolas, ever finer; as it is where it has none."""
+    for step in SHIFT_STEPS if any(best.shift) else ():
+        best = _peaked(_peaked(best, _shifted_right, step, score), _shifted_down, step, score)
+    return best
+
+
+def _peaked(
+    best: SamplingModel, moved: Callable[[SamplingModel, float], SamplingModel], step: float, score: Score
+) -> SamplingModel:
+    """``best`` moved to where the parabola through its own and two neighbouring scores peaks, if that gains.
+
+    A step further uphill, where they are no peak.
+    """
+    low, high = (score(moved(best, by)) for by in (-step, step))
     bend = 2 * score(best) - low - high
-    if bend <= 1e-9:
-        return best
-    shift = min(1.0, max(-1.0, (high - low) / (2 * bend))) * BIAS_STEP
-    fine = best.but(bias=round(best.bias + shift, 4))
+    ahead = (high - low) / (2 * bend) if bend > 1e-9 else np.sign(high - low)
+    fine = moved(best, min(1.0, max(-1.0, float(ahead))) * step)
     return fine if score(fine) > score(best) + 0.0005 else best
 
 
@@ -303,7 +376,7 @@ class _Trial:
     probes: dict[int, Image8] = field(default_factory=dict)
     """What was asked for so far, by grey."""
     geometries: dict[SamplingModel, Geometry] = field(default_factory=dict)
-    """Under each hypothesis that was tried; those that differ in colours alone share one."""
+    """Under the hypotheses that were tried last; those that differ in colours alone share one."""
 
     @classmethod
     def of(
@@ -350,9 +423,11 @@ class _Trial:
 
     def _geometry(self, sampling: SamplingModel) -> Geometry:
         key = sampling.but(**{name: getattr(SamplingModel(), name) for name in ("encoding", "filtered", "mips")})
-        if key not in self.geometries:
-            size = (self.clean.shape[1], self.clean.shape[2])
-            self.geometries[key] = prepare_geometry(self.obj, self.views, size=size, sampling=key)
+        size = (self.clean.shape[1], self.clean.shape[2])
+        known = self.geometries.pop(key, None)
+        self.geometries[key] = known or prepare_geometry(self.obj, self.views, size=size, sampling=key)
+        while len(self.geometries) > 1 and sum(each.nbytes for each in self.geometries.values()) > KEPT_BYTES:
+            del self.geometries[next(iter(self.geometries))]
         return self.geometries[key]
 
 

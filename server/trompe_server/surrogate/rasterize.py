@@ -8,7 +8,7 @@ object, and UVs and their screen-space derivatives are exact anywhere on (and be
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -26,6 +26,7 @@ __all__ = [
     "Mesh",
     "Planes",
     "Visibility",
+    "chunks",
     "covered",
     "mesh_of",
     "project",
@@ -50,6 +51,14 @@ FACES_AT_ONCE = 2**14
 
 MAX_CANDIDATES = 2_000_000
 """Pixel-triangle pairs that are tested at once: bounds the memory of the rasteriser (about 200 bytes each)."""
+
+TIE = 2**6 - 1
+"""Last bits of 1/depth in which triangles may differ and count as equally near: those of one plane, whose depths differ
+by rounding alone. That is 3 to 6 micrometres at half a metre, which depth buffers do not tell apart either.
+"""
+
+MARGIN = 1
+"""Pixels around the image where triangles are kept, for samples that lie up to a pixel outside of theirs."""
 
 
 @dataclass(frozen=True)
@@ -141,16 +150,16 @@ def _set_up(positions: Float[Tensor, "faces 3 3"], camera: Camera, size: tuple[i
 def _pixel_box(
     corners: Float[Tensor, "faces 3 3"], size: tuple[int, int]
 ) -> tuple[Int[Tensor, "faces 4"], Bool[Tensor, " faces"]]:
-    """Pixels that each triangle can touch, and whether there are any; the whole image where it reaches behind the
-    camera."""
+    """Pixels of the image and its margin that each triangle can touch, and whether there are any; the whole image where
+    it reaches behind the camera."""
     height, width = size
     depth = corners[..., 2]
     points = corners[..., :2] / depth.clamp(min=NEAR)[..., None]
     limit = torch.tensor([width, height], device=corners.device)
     low, high = points.amin(1), points.amax(1)
     behind = (depth < NEAR).any(1)
-    low = torch.where(behind[:, None], torch.zeros_like(low), low.clamp(min=0)).floor()
-    high = torch.where(behind[:, None], limit - 1.0, torch.minimum(high, limit - 1.0)).floor()
+    low = torch.where(behind[:, None], torch.zeros_like(low), low.clamp(min=-MARGIN)).floor()
+    high = torch.where(behind[:, None], limit - 1.0, torch.minimum(high, limit - 1.0 + MARGIN)).floor()
     touches = (high >= low).all(1) & (depth >= NEAR).any(1)
     return torch.cat([low, high], 1).nan_to_num(0.0).long(), touches
 
@@ -163,13 +172,14 @@ Drawn = Callable[[Int[Tensor, " n"], Int[Tensor, " n"], Int[Tensor, " n"]], Bool
 def rasterize(planes: Planes, size: tuple[int, int], samples: Samples, *, drawn: Drawn | None = None) -> Visibility:
     """The nearest triangle at each of ``samples`` (x, y in pixels) of every pixel. The first one drawn wins ties.
 
-    Triangles are left out of the pixels where they are not ``drawn``.
+    Triangles are left out of the pixels where they are not ``drawn``. Samples may lie up to a pixel outside of theirs.
     """
     height, width = size
+    planes = replace(planes, box=_candidates(planes.box, size, samples))
     nearest = torch.full((height * width * len(samples),), -1, dtype=torch.int64, device=planes.face.device)
-    extent = planes.box[:, 2:] - planes.box[:, :2] + 1
+    extent = (planes.box[:, 2:] - planes.box[:, :2] + 1).clamp(min=0)
     counts = extent[:, 0] * extent[:, 1]
-    for start, stop in _chunks(counts):
+    for start, stop in chunks(counts):
         _draw(planes, start, stop, counts, width, samples, drawn, nearest)
     nearest = nearest.view(-1, len(samples))
     pixel = (nearest >= 0).any(1).nonzero()[:, 0]
@@ -178,8 +188,17 @@ def rasterize(planes: Planes, size: tuple[int, int], samples: Samples, *, drawn:
     return Visibility(planes, pixel, row)
 
 
-def _chunks(counts: Int[Tensor, " n"]) -> list[tuple[int, int]]:
-    """Runs of triangles whose candidates fit into ``MAX_CANDIDATES`` (a single larger triangle is a run of its own)."""
+def _candidates(box: Int[Tensor, "n 4"], size: tuple[int, int], samples: Samples) -> Int[Tensor, "n 4"]:
+    """The pixels of the image with a sample in ``box``, as a box (empty where its end lies before its beginning)."""
+    height, width = size
+    most, least = ([math.floor(choose(axis)) for axis in zip(*samples, strict=True)] for choose in (max, min))
+    moved = box - torch.tensor([*most, *least], device=box.device)
+    first, last = moved[:, :2].clamp(min=0), moved[:, 2:]
+    return torch.cat([first, torch.minimum(last, torch.tensor([width - 1, height - 1], device=box.device))], 1)
+
+
+def chunks(counts: Int[Tensor, " n"]) -> list[tuple[int, int]]:
+    """Runs of things whose candidates fit into ``MAX_CANDIDATES`` (a single larger one is a run of its own)."""
     if not len(counts):
         return []
     total = counts.cumsum(0)
@@ -203,7 +222,8 @@ def _draw(
 ) -> None:
     """Test triangles ``start:stop`` against the pixels of their boxes and keep the nearest per sample, in ``nearest``.
 
-    A key is the float bits of 1/depth (monotone, as it is positive) above the inverted triangle number.
+    A key is the float bits of 1/depth (monotone, as it is positive), less those that ``TIE`` has, above the inverted
+    triangle number.
     """
     row = torch.arange(start, stop, device=counts.device).repeat_interleave(counts[start:stop])
     within = (
@@ -221,7 +241,7 @@ def _draw(
         value = at_corner + edges[:, 0] * sx + edges[:, 1] * sy
         inverse_depth = value.sum(1)
         seen = _inside(value, inverse_depth).nonzero()[:, 0]
-        bits = inverse_depth[seen].contiguous().view(torch.int32).long()
+        bits = inverse_depth[seen].contiguous().view(torch.int32).long() & ~TIE
         keys = (bits << 32) | (0xFFFFFFFF - row[seen])
         nearest.scatter_reduce_(0, base[seen] + index, keys, "amax")
 

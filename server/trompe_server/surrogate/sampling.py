@@ -22,6 +22,7 @@ from trompe_server.surrogate.rasterize import (
     Mesh,
     Planes,
     Visibility,
+    chunks,
     covered,
 )
 from trompe_shared.opacity import CUTOFF
@@ -51,6 +52,13 @@ class SamplingModel:
     encoding: linear light becomes an image by the sRGB curve or by the power 1 / 2.2.
     bias: added to the level of detail.
     cull: triangles seen from behind are invisible.
+    anisotropy: how many times longer than wide a footprint may be that is averaged over; 1 is no more than wide, and
+        then ``lod`` says how wide.
+    elongated: how that is done: by as many trilinear probes along the longer axis as it is times the shorter one, at
+        the level of a probe's share of it (graphics cards), or by a Gaussian over an ellipse of texels (Heckbert, 1989;
+        Mesa's software renderers).
+    shift: where the samples and the centre of a pixel lie, added to where they should: x right and y down, in pixels,
+        within [-1, 1].
     """
 
     samples: Literal["msaa4", "msaa4-mirrored", "centre"] = "msaa4"
@@ -61,11 +69,16 @@ class SamplingModel:
     encoding: Literal["srgb", "power"] = "srgb"
     bias: float = 0.0
     cull: bool = True
+    anisotropy: int = 1
+    elongated: Literal["probes", "ellipse"] = "probes"
+    shift: tuple[float, float] = (0.0, 0.0)
 
     @property
     def positions(self) -> tuple[tuple[float, float], ...]:
-        """Sample positions in a pixel, x right and y down."""
-        return {"msaa4": MSAA4, "msaa4-mirrored": MSAA4_MIRRORED, "centre": CENTRE}[self.samples]
+        """Sample positions in a pixel, x right and y down. Their mean is where the pixel is shaded."""
+        right, down = self.shift
+        table = {"msaa4": MSAA4, "msaa4-mirrored": MSAA4_MIRRORED, "centre": CENTRE}
+        return tuple((x + right, y + down) for x, y in table[self.samples])
 
     def but(self, **changes: object) -> "SamplingModel":
         """This hypothesis with some members changed."""
@@ -112,9 +125,10 @@ def _shading_point(
     share: Float[Tensor, "n samples"], samples: tuple[tuple[float, float], ...], shade_at: str
 ) -> Float[Tensor, "_ 2"]:
     """Where in the pixel a fragment that covers the samples with a ``share`` of 1 (not 0) reads its texture."""
+    positions = torch.tensor(samples, device=share.device)
     if shade_at == "centre":
-        return torch.tensor(CENTRE, device=share.device)
-    return (share @ torch.tensor(samples, device=share.device)) / share.sum(1, keepdim=True)
+        return positions.mean(0, keepdim=True)
+    return (share @ positions) / share.sum(1, keepdim=True)
 
 
 def _texture_coordinates(
@@ -200,22 +214,119 @@ def taps_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout, 
     for texture, (sizes, starts) in enumerate(zip(layout.sizes, layout.starts, strict=True)):
         mine = (mesh.texture[fragments.face] == texture).nonzero()[:, 0]
         uv, duv, entry, part = fragments.uv[mine], fragments.duv[mine], fragments.entry[mine], share[mine]
-        for used, index, weight, blend in _trilinear(uv, duv, sizes, starts, model):
-            entries.append(entry[used, None].expand(-1, 4).reshape(-1))
+        for used, index, weight, blend in _reads(uv, duv, sizes, starts, model):
+            entries.append(entry[used, None].expand_as(index).reshape(-1))
             indices.append(index.reshape(-1))
             weights.append((weight * (blend * part[used])[:, None]).reshape(-1))
     return _merged(torch.cat(entries), torch.cat(indices), torch.cat(weights), layout.total)
 
 
-def _trilinear(
+Sizes = tuple[tuple[int, int], ...]
+Reads = Iterator[tuple[Int[Tensor, " m"], Int[Tensor, "m k"], Float[Tensor, "m k"], Float[Tensor, " m"]]]
+"""Portions of what is read: who reads, flat indices and weights there, and the portion's own weight for each who reads.
+"""
+
+
+def _reads(
+    uv: Float[Tensor, "n 2"], duv: Float[Tensor, "n 2 2"], sizes: Sizes, starts: tuple[int, ...], model: SamplingModel
+) -> Reads:
+    """What fragments read of a texture whose mip levels have ``sizes`` and begin at ``starts``."""
+    if model.anisotropy == 1:
+        return _trilinear(uv, level_of_detail(duv, sizes[0], model), sizes, starts)
+    texels = (duv * torch.tensor([sizes[0][1], sizes[0][0]], device=duv.device)[:, None]).nan_to_num(0.0)
+    if model.elongated == "probes":
+        return _probes(uv, duv, texels, sizes, starts, model)
+    return _ellipses(uv, texels, sizes, starts, model)
+
+
+def _axes(texels: Float[Tensor, "n 2 2"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Length of the longer and of the shorter axis of footprints."""
+    extent = texels.norm(dim=1).clamp(min=1e-8)
+    return extent.amax(1), extent.amin(1)
+
+
+ROUND = 1e-3
+"""A footprint this little longer than wide is as long as wide."""
+
+
+def _probes(
     uv: Float[Tensor, "n 2"],
     duv: Float[Tensor, "n 2 2"],
-    sizes: tuple[tuple[int, int], ...],
+    texels: Float[Tensor, "n 2 2"],
+    sizes: Sizes,
     starts: tuple[int, ...],
     model: SamplingModel,
-) -> Iterator[tuple[Int[Tensor, " m"], Int[Tensor, "m 4"], Float[Tensor, "m 4"], Float[Tensor, " m"]]]:
-    """For the finer and the coarser level: who reads it, flat indices and weights there, and the level's own weight."""
-    level = level_of_detail(duv, sizes[0], model).clamp(0, len(sizes) - 1)
+) -> Reads:
+    """Trilinear probes side by side along the longer axis (EXT_texture_filter_anisotropic); ``texels`` is ``duv`` in
+    texels of level 0."""
+    longer, shorter = _axes(texels)
+    probes = (longer / shorter - ROUND).ceil().clamp(1, model.anisotropy)
+    axis = duv.nan_to_num(0.0).gather(2, texels.norm(dim=1).argmax(1)[:, None, None].expand(-1, 2, 1))[..., 0]
+    count = probes.long()
+    who = torch.arange(len(uv), device=uv.device).repeat_interleave(count)
+    number = torch.arange(len(who), device=uv.device) - (count.cumsum(0) - count)[who]
+    along = (number + 0.5) / probes[who] - 0.5
+    level = (longer / probes).log2() + model.bias
+    for used, index, weight, blend in _trilinear(uv[who] + along[:, None] * axis[who], level[who], sizes, starts):
+        yield who[used], index, weight, blend / probes[who[used]]
+
+
+def _ellipses(
+    uv: Float[Tensor, "n 2"],
+    texels: Float[Tensor, "n 2 2"],
+    sizes: Sizes,
+    starts: tuple[int, ...],
+    model: SamplingModel,
+) -> Reads:
+    """All texels of one mip level in an ellipse with the footprint's axes, a texel wider, by a Gaussian's weights.
+
+    The level is that of the shorter axis, but at least that of the longer one's share ``1 / model.anisotropy``.
+    """
+    longer, shorter = _axes(texels)
+    level = torch.maximum(shorter, longer / model.anisotropy).log2() + model.bias
+    level = level.clamp(0, len(sizes) - 1).floor()
+    scale = torch.minimum(0.5**level, 2 * model.anisotropy / longer)  # no larger where no level is coarse enough
+    size, start = (torch.tensor(table, device=uv.device)[level.long()] for table in (sizes, starts))
+    u, v = uv.nan_to_num(0.0).remainder(1.0).unbind(1)
+    centre = torch.stack([u * size[:, 1], (1 - v) * size[:, 0]], 1) - 0.5
+    for who, x, y, weight in _within(centre, _form(texels * scale[:, None, None])):
+        index = start[who] + y % size[who, 0] * size[who, 1] + x % size[who, 1]
+        yield who, index[:, None], torch.ones_like(weight)[:, None], weight
+
+
+def _form(texels: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 3"]:
+    """(a, b, c) of the ellipses ``a x^2 + 2 b x y + c y^2 < a c - b^2`` (x right, y down) that are footprints, a texel
+    wider."""
+    across, up = texels.unbind(1)
+    return torch.stack([up.square().sum(1) + 1, (across * up).sum(1), across.square().sum(1) + 1], 1)
+
+
+def _within(
+    centre: Float[Tensor, "n 2"], form: Float[Tensor, "n 3"]
+) -> Iterator[tuple[Int[Tensor, " m"], Int[Tensor, " m"], Int[Tensor, " m"], Float[Tensor, " m"]]]:
+    """Which ellipse (``form`` around ``centre``) holds which texels (x, y), by what weight; those of each sum to one.
+
+    The weight is exp(-2 r^2), where r is the distance in units of the ellipse's radius there.
+    """
+    reach = form[:, [2, 0]].sqrt()
+    first = (centre - reach).floor().long()
+    extent = (centre + reach).ceil().long() - first + 1
+    counts = extent[:, 0] * extent[:, 1]
+    for begin, end in chunks(counts):
+        some = counts[begin:end]
+        who = torch.arange(begin, end, device=centre.device).repeat_interleave(some)
+        number = torch.arange(len(who), device=centre.device) - (some.cumsum(0) - some)[who - begin]
+        x, y = first[who, 0] + number % extent[who, 0], first[who, 1] + number // extent[who, 0]
+        right, down, (a, b, c) = x - centre[who, 0], y - centre[who, 1], form[who].unbind(1)
+        squared = (a * right.square() + 2 * b * right * down + c * down.square()) / (a * c - b.square())
+        weight = (-2 * squared).exp() * (squared < 1)
+        total = torch.zeros(len(form), device=centre.device).index_add_(0, who, weight)
+        yield who, x, y, weight / total[who]
+
+
+def _trilinear(uv: Float[Tensor, "n 2"], level: Float[Tensor, " n"], sizes: Sizes, starts: tuple[int, ...]) -> Reads:
+    """The finer and the coarser mip level around ``level`` (unclamped)."""
+    level = level.clamp(0, len(sizes) - 1)
     lower = level.floor().clamp(max=max(len(sizes) - 2, 0))
     for step in (0, 1):
         blend = (level - lower) if step else 1 - (level - lower)
@@ -302,7 +413,7 @@ class AlphaTest:
             )
             uv, duv, _ = _texture_coordinates(planes, self.mesh, row[mine], point)
             read = torch.zeros(len(mine), device=uv.device)
-            for used, index, weight, blend in _trilinear(uv, duv, sizes, starts, self.model):
+            for used, index, weight, blend in _reads(uv, duv, sizes, starts, self.model):
                 read.index_add_(0, used, (self.alpha[index] * weight).sum(1) * blend)
             passed[mine] = read >= CUTOFF
         return passed

@@ -1,0 +1,93 @@
+"""What few renderers do, as the real renderer does it: filters that follow elongated footprints, and pictures a part of
+a pixel aside. The usual hypothesis mispredicts them; the search finds, from images alone, one that does not."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from trompe_server.surrogate import SamplingModel, curve_surrogate, prepare_geometry
+from trompe_server.surrogate.calibration import CURVE_GREYS, Fidelity, calibrate, measure_fidelity, painted_noise
+from trompe_server.target import SailenvTarget
+from trompe_shared.geometry import Camera, View
+from trompe_shared.object3d import Object3D
+from trompe_shared.shipped import shipped_objects
+
+Image8 = NDArray[np.uint8]
+Running = Callable[..., AbstractContextManager[tuple[str, int]]]
+Make = Callable[..., object]
+Ask = Callable[[Object3D, Sequence[View]], Image8]
+SIZE = (96, 96)
+MUG = shipped_objects()["mug"]
+AROUND = [View(Camera(MUG.distance, azimuth, elevation)) for azimuth, elevation in ((0, 5), (70, 40), (200, 20))]
+ASLANT = [View(Camera(0.4, azimuth, elevation)) for azimuth, elevation in ((60, 0), (70, 10), (10, 65), (-72, 5))]
+
+
+def found(obj: Object3D, views: Sequence[View], ask: Ask) -> tuple[SamplingModel, Fidelity, Fidelity]:
+    """The hypothesis that is found, how well it predicts, and how well the usual one does; on another repaint."""
+    clean = ask(obj, views)
+    sampling = calibrate(obj, views, clean, ask, wanted="curve", generator=np.random.default_rng(0)).sampling
+    probes = np.stack([ask(painted(obj, grey), views) for grey in CURVE_GREYS])
+    repainted = painted_noise(obj, np.random.default_rng(1))
+    images = ask(repainted, views)
+
+    def fidelity(model: SamplingModel) -> Fidelity:
+        geometry = prepare_geometry(obj, views, size=SIZE, sampling=model)
+        surrogate = curve_surrogate(geometry, obj, views, clean, CURVE_GREYS, probes)
+        return measure_fidelity(surrogate, obj, clean, repainted, images)
+
+    return sampling, fidelity(sampling), fidelity(SamplingModel())
+
+
+def painted(obj: Object3D, grey: int) -> Object3D:
+    return obj.with_textures({name: np.full((4, 4, 3), grey, np.uint8) for name in obj.textures})
+
+
+@pytest.fixture(scope="module")
+def anisotropic(running_worker: Running) -> Iterator[Ask]:
+    with running_worker("--anisotropy", "16") as address:
+        target = SailenvTarget(*address, timeout=60)
+        yield lambda obj, views: target.render(obj, views, size=SIZE)
+        target.close()
+
+
+def test_a_plane_seen_aslant_by_an_anisotropic_renderer_is_understood(
+    anisotropic: Ask, make_object: Callable[..., Object3D], make_quad: Make
+) -> None:
+    texture = np.random.default_rng(0).integers(40, 216, (160, 160, 3), dtype=np.uint8)
+    sampling, fidelity, usual = found(make_object(make_quad(texture, half=0.12)), ASLANT, anisotropic)
+    assert sampling.anisotropy > 1
+    assert usual.mean()["correlation"] < 0.9
+    assert fidelity.mean()["correlation"] >= 0.98
+    assert fidelity.mean()["slope"] == pytest.approx(1, abs=0.05)
+
+
+def test_an_object_shown_by_an_anisotropic_renderer_is_understood(anisotropic: Ask, mug: Object3D) -> None:
+    sampling, fidelity, usual = found(mug, AROUND, anisotropic)
+    assert sampling.anisotropy > 1
+    assert usual.mean()["correlation"] < 0.9
+    assert fidelity.mean()["correlation"] >= 0.98
+    assert fidelity.good_enough
+
+
+def test_no_anisotropy_and_no_shift_are_seen_where_there_are_none(target: SailenvTarget, mug: Object3D) -> None:
+    sampling, fidelity, _ = found(mug, AROUND, lambda obj, views: target.render(obj, views, size=SIZE))
+    assert (sampling.anisotropy, sampling.shift) == (1, (0.0, 0.0))
+    assert fidelity.mean()["correlation"] >= 0.98
+
+
+@pytest.mark.parametrize(("column", "row"), [(0, 0), (1, 0)])
+def test_a_picture_a_quarter_of_a_pixel_aside_is_understood(
+    column: int, row: int, target: SailenvTarget, mug: Object3D
+) -> None:
+    """Every other pixel of a picture twice as large lies a quarter of a pixel from the middle of those of its size."""
+
+    def ask(obj: Object3D, views: Sequence[View]) -> Image8:
+        return target.render(obj, views, size=(2 * SIZE[0], 2 * SIZE[1]))[:, row::2, column::2]
+
+    sampling, fidelity, usual = found(mug, AROUND, ask)
+    assert sampling.shift == pytest.approx((column / 2 - 0.25, row / 2 - 0.25), abs=0.03)
+    assert usual.mean()["correlation"] < 0.7
+    assert fidelity.mean()["correlation"] >= 0.98
