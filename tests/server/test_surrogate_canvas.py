@@ -79,3 +79,13 @@ def test_a_canvas_holds_the_texels_that_move_and_splits_into_what_it_joins(obj: 
         assert (table | ~mask).all()
     numbers = torch.arange(float(sum(canvas.counts)))
     assert torch.equal(canvas.join(canvas.split(numbers)), numbers)
+
+
+def test_the_same_canvas_is_not_made_twice_and_another_is_made_for_other_texels(
+    obj: Object3D, surrogate: Surrogate
+) -> None:
+    textures, masks = textures_of(obj), some_texels(obj, 0.1)
+    first = surrogate.canvas(textures, masks)
+    assert surrogate.canvas(textures, {name: mask.clone() for name, mask in masks.items()}) is first
+    assert surrogate.canvas(textures, some_texels(obj, 0.9)) is not first
+    assert surrogate.canvas(textures_of(obj), masks) is not first

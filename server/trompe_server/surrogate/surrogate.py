@@ -6,8 +6,9 @@ texels = surrogate.texels(textures)
 images = surrogate.render(texels, batch=0)  # of the views surrogate.batches[0]; differentiable in the textures
 """
 
+import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Final
 
@@ -205,6 +206,19 @@ class _RenderViews(Function):
 
 
 @dataclass(frozen=True)
+class _Painted:
+    """A canvas, and what it was made for."""
+
+    textures: Sequence[Float[Tensor, "H W 3"]]
+    moving: Sequence[Bool[Tensor, "H W"]]
+    canvas: Canvas
+
+    def fits(self, textures: Sequence[Float[Tensor, "H W 3"]], moving: Sequence[Bool[Tensor, "H W"]]) -> bool:
+        """Whether it is the one for these textures, which must be the same tensors."""
+        return all(map(operator.is_, self.textures, textures)) and all(map(torch.equal, self.moving, moving))
+
+
+@dataclass(frozen=True)
 class Surrogate:
     """A differentiable model of the target renderer for fixed views.
 
@@ -218,6 +232,7 @@ class Surrogate:
     base: UInt8[Tensor, "views H W 3"]
     shadings: tuple[Shading, ...]
     missed: tuple[Float[Tensor, "pixels 3"], ...] | None = None
+    _last_canvas: list["_Painted"] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
     def n_views(self) -> int:
@@ -240,11 +255,14 @@ class Surrogate:
         self, textures: Mapping[str, Float[Tensor, "H W 3"]], moving: Mapping[str, Bool[Tensor, "H W"]]
     ) -> Canvas:
         """What may move of ``textures``: the tiles that hold a texel which is ``moving``. ``canvas.read`` is then a
-        cheaper ``texels``."""
+        cheaper ``texels``. An attack asks for the same one every few steps: the last one is kept."""
         geometry, linear = self.geometry, self.geometry.sampling.filtered == "linear"
-        rounded = geometry.sampling.mips == "rounded" and not linear
         whole, masks = ([table[name] for name in geometry.textures] for table in (textures, moving))
-        return canvas_of(whole, masks, geometry.layout, geometry.reads, linear=linear, rounded=rounded)
+        if not (self._last_canvas and self._last_canvas[0].fits(whole, masks)):
+            rounded = geometry.sampling.mips == "rounded" and not linear
+            canvas = canvas_of(whole, masks, geometry.layout, geometry.reads, linear=linear, rounded=rounded)
+            self._last_canvas[:] = [_Painted(whole, masks, canvas)]
+        return self._last_canvas[0].canvas
 
     def render(
         self, texels: Float[Tensor, "texels 3"], batch: int, *, masks: Bool[Tensor, "views H W"] | None = None
