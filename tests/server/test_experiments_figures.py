@@ -24,6 +24,7 @@ from trompe_server.experiments.parquet import write_parquet
 from trompe_server.experiments.report import write_report
 from trompe_server.experiments.stability_chart import behaviours, stability_markdown
 from trompe_server.experiments.style import stamp_of
+from trompe_server.experiments.surrogates import surrogates_markdown
 from trompe_server.experiments.table_one import paper_numbers, table_one, table_one_markdown
 from trompe_shared.errors import SpecError
 from trompe_shared.experiment_table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, write_table
@@ -239,6 +240,41 @@ def series_rows() -> list[ResultRow]:
     ]
 
 
+def surrogate_rows() -> list[ResultRow]:
+    """Two objects attacked in two surrogates, with and without saliency; one of them is hardly recognised."""
+    return [
+        row(
+            key=f"{name}-{surrogate}-{tau}",
+            object=name,
+            target_a_before=before,
+            surrogate=surrogate,
+            tau=tau,
+            target_a_drop=kept,
+            texels_altered=0.4 if tau is None else 0.2,
+            configuration=f"surrogate {surrogate}, tau {tau}",
+        )
+        for name, before in (("candle", 0.8), ("toilet", 0.1))
+        for surrogate, kept in (("diffuse", 0.3), ("calibrated", 0.9))
+        for tau in (0.05, None)
+    ]
+
+
+def test_a_table_sets_surrogates_beside_each_other_by_tau_and_means_count_what_was_recognised() -> None:
+    everything, salient = surrogates_markdown(surrogate_rows()).split("**saliency, τ 0.05**")
+    assert everything.startswith("**all texels**")
+    assert "| candle | 0.80 | 1.00 | **0.30** | 40.0% | 1.00 | **0.90** | 40.0% |" in everything
+    mean = next(line for line in salient.splitlines() if line.startswith("| **mean**"))
+    assert mean.endswith("| 1.00 | **0.30** | 20.0% | 1.00 | **0.90** | 20.0% |")
+    hardly = [each for each in surrogate_rows() if each.object == "toilet"]
+    assert surrogates_markdown(hardly).count("| n.a. | **n.a.** | n.a. | n.a. | **n.a.** | n.a. |") == 2
+
+
+def test_a_budget_that_the_paper_has_not_got_has_no_columns_of_the_paper() -> None:
+    head, *_ = table_one_markdown([row(), row(epsilon=0.01)]).splitlines()[2:]
+    columns = ["object", "A_before", "surrogate, ε 0.01", "target", "surrogate, ε 0.05", "target", "paper: surrogate"]
+    assert head == "| " + " | ".join([*columns, "paper: target"]) + " |"
+
+
 def written(folder: Path, rows: Sequence[ResultRow]) -> Path:
     """The folder of an experiment with these rows, predictions of each, and one picture."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -260,6 +296,12 @@ def written(folder: Path, rows: Sequence[ResultRow]) -> Path:
         pytest.param(grid_rows(), ["table_one", "scatter", "histograms"], id="grid"),
         pytest.param(series_rows(), ["speed_accuracy", "evaluations_accuracy"], id="series"),
         pytest.param(stability_rows(), ["stability"], id="cases"),
+        pytest.param(surrogate_rows(), ["surrogates"], id="surrogates"),
+        pytest.param(
+            [*grid_rows(), row(key="small", series="small", epsilon=0.01, alpha=0.004, configuration="epsilon 0.01")],
+            ["table_one", "scatter", "histograms"],
+            id="grid in two series",
+        ),
     ],
 )
 def test_a_report_holds_what_fits_its_rows_and_needs_nothing_else(

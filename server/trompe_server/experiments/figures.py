@@ -10,6 +10,7 @@ from trompe_server.experiments.pareto import pareto_markdown, speed_accuracy_cha
 from trompe_server.experiments.scatter import texels_scatter
 from trompe_server.experiments.stability_chart import stability_chart, stability_markdown
 from trompe_server.experiments.style import Drawing, stamp_of
+from trompe_server.experiments.surrogates import surrogates_chart, surrogates_markdown, surrogates_of
 from trompe_server.experiments.table_one import table_one_chart, table_one_markdown
 from trompe_shared.errors import SpecError
 from trompe_shared.experiment_table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, read_table
@@ -81,29 +82,40 @@ def plain_rows(data: Data) -> list[ResultRow]:
 FIGURES: dict[str, Kind] = {
     "table_one": Kind(
         "A_drop per object, classifier and epsilon (the paper's Table I)",
-        lambda data: not _cases(data) and _values(data, "series") == 1 and any(row.tau is None for row in data.results),
+        lambda data: _one_setting(data) and any(row.tau is None for row in data.results),
         lambda data: table_one_chart(data.results),
         lambda data: table_one_markdown(data.rows),
     ),
     "scatter": Kind(
         "A_drop against the share of texels altered",
-        lambda data: not _cases(data) and _values(data, "tau") > 1,
+        lambda data: _one_setting(data) and _values(data, "tau") > 1,
         lambda data: texels_scatter(data.results),
+    ),
+    "surrogates": Kind(
+        "What the surrogate promises, and what the target keeps",
+        lambda data: (
+            not _cases(data)
+            and _values(data, "configuration") > 1
+            and _values(data, "series") == 1
+            and len(surrogates_of(data.results)) > 1
+        ),
+        lambda data: surrogates_chart(data.results),
+        lambda data: surrogates_markdown(data.results),
     ),
     "histograms": Kind(
         "What the objects were taken for, before and after",
-        lambda data: not _cases(data) and _values(data, "series") == 1 and bool(data.predictions and plain_rows(data)),
+        lambda data: _one_setting(data) and bool(data.predictions and plain_rows(data)),
         lambda data: prediction_histograms(histogram_rows(plain_rows(data)), data.predictions),
     ),
     "speed_accuracy": Kind(
         "Speed against accuracy",
-        lambda data: not _cases(data) and _values(data, "configuration") > 2 and _values(data, "series") > 1,
+        lambda data: _compares(data),
         lambda data: speed_accuracy_chart(data.results),
         lambda data: pareto_markdown(data.results),
     ),
     "evaluations_accuracy": Kind(
         "Images shown to the classifier against accuracy",
-        lambda data: not _cases(data) and _values(data, "configuration") > 2 and _values(data, "series") > 1,
+        lambda data: _compares(data),
         lambda data: speed_accuracy_chart(data.results, cost="evaluations"),
     ),
     "stability": Kind(
@@ -113,6 +125,18 @@ FIGURES: dict[str, Kind] = {
         lambda data: stability_markdown(data.rows),
     ),
 }
+
+
+def _one_setting(data: Data) -> bool:
+    """Whether the rows differ by what the paper's table tells apart, and by seeds, alone."""
+    places = grouped(data.results, lambda row: (row.object, row.classifier, row.epsilon, row.tau, row.seed))
+    return not _cases(data) and all(len(rows) == 1 for rows in places.values())
+
+
+def _compares(data: Data) -> bool:
+    """Whether the rows are series of settings to compare."""
+    several = _values(data, "configuration") > 2 and _values(data, "series") > 1
+    return several and not _cases(data) and not _one_setting(data)
 
 
 def _cases(data: Data) -> bool:

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from trompe_shared.experiment_table import ResultRow
 
-__all__ = ["average", "deviation", "grouped", "known"]
+__all__ = ["average", "deviation", "grouped", "known", "tau_words"]
 
 K = TypeVar("K", bound=Hashable)
 R = TypeVar("R")
@@ -34,3 +34,8 @@ def average(values: Iterable[float | None]) -> float | None:
 def deviation(values: Sequence[float]) -> float:
     """Their standard deviation; 0 for one."""
     return stdev(values) if len(values) > 1 else 0.0
+
+
+def tau_words(tau: float | None) -> str:
+    """What a threshold is called in figures and tables."""
+    return "all texels" if tau is None else f"saliency, τ {tau:g}"

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from matplotlib.lines import Line2D
 
-from trompe_server.experiments.groups import grouped
+from trompe_server.experiments.groups import grouped, tau_words
 from trompe_server.experiments.style import INK, MARKERS, PALETTE, Drawing, drawing
 from trompe_server.experiments.table_one import paper_numbers
 from trompe_shared.experiment_table import ResultRow
@@ -45,7 +45,7 @@ def texels_scatter(rows: Sequence[ResultRow]) -> Drawing:
             axes.set_xlim(left=0)
         made.panels[0].set_ylabel("A_drop in the target (share)")
         handles = [
-            *(Line2D([], [], color=PALETTE[k], marker="o", ls="", label=_tau(tau)) for k, tau in enumerate(taus)),
+            *(Line2D([], [], color=PALETTE[k], marker="o", ls="", label=tau_words(tau)) for k, tau in enumerate(taus)),
             *(Line2D([], [], color=INK, marker=MARKERS[k], ls="", label=f"ε {e:g}") for k, e in enumerate(epsilons)),
         ]
         made.figure.legend(handles=handles, loc="outside right upper")
@@ -58,7 +58,3 @@ def _dots(rows: Sequence[ResultRow]) -> list[_Dot]:
         for row in rows
         if row.texels_altered is not None and row.target_a_drop is not None
     ]
-
-
-def _tau(tau: float | None) -> str:
-    return "all texels" if tau is None else f"saliency, τ {tau:g}"

@@ -22,7 +22,7 @@ from trompe_server.experiments.groups import average, grouped
 from trompe_server.experiments.style import BLUE, GREEN, GREY, INK, Drawing, drawing
 from trompe_shared.experiment_table import ResultRow
 
-__all__ = ["Cell", "PaperCell", "paper_numbers", "table_one", "table_one_chart", "table_one_markdown"]
+__all__ = ["RECOGNISED", "Cell", "PaperCell", "paper_numbers", "table_one", "table_one_chart", "table_one_markdown"]
 
 RECOGNISED: Final = 0.3
 """Objects that are recognised in a smaller share of the views than this count in no mean."""
@@ -131,20 +131,18 @@ def _inception(epsilon: float) -> list[PaperCell]:
 
 def _markdown(cells: Sequence[Cell], *, with_paper: bool) -> str:
     epsilons = sorted({cell.epsilon for cell in cells})
-    names = ["surrogate", "target", *(["paper: surrogate", "paper: target"] if with_paper else [])]
-    head = [
-        "object",
-        "A_before",
-        *(f"{names[0]}, ε {epsilon:g}" if k == 0 else name for epsilon in epsilons for k, name in enumerate(names)),
-    ]
+    told = {epsilon for epsilon in epsilons if with_paper and any(c.paper for c in cells if c.epsilon == epsilon)}
+    head = ["object", "A_before"]
+    for epsilon in epsilons:
+        head += [f"surrogate, ε {epsilon:g}", "target", *(["paper: surrogate", "paper: target"] * (epsilon in told))]
     lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * (len(head) - 1)]
     for object_, row in grouped(cells, lambda cell: cell.object).items():
         by_epsilon = {cell.epsilon: cell for cell in row}
         figures = [_number(row[0].a_before)]
         for epsilon in epsilons:
-            figures += _figures(by_epsilon.get(epsilon), with_paper=with_paper)
+            figures += _figures(by_epsilon.get(epsilon), with_paper=epsilon in told)
         lines.append(f"| {object_} | " + " | ".join(figures) + " |")
-    means = [text for epsilon in epsilons for text in _means(cells, epsilon, with_paper=with_paper)]
+    means = [text for epsilon in epsilons for text in _means(cells, epsilon, with_paper=epsilon in told)]
     lines.append("| **mean** of those with A_before ≥ 0.3 | | " + " | ".join(means) + " |")
     return "\n".join(lines) + "\n"
 

@@ -1,0 +1,82 @@
+"""What each surrogate promises and what the target keeps of it, and how many texels that took."""
+
+from collections.abc import Sequence
+
+from trompe_server.experiments.groups import average, grouped, tau_words
+from trompe_server.experiments.style import GREY, MARKERS, PALETTE, Drawing, drawing
+from trompe_server.experiments.table_one import RECOGNISED
+from trompe_shared.experiment_table import ResultRow
+
+__all__ = ["surrogates_chart", "surrogates_markdown", "surrogates_of"]
+
+
+def surrogates_of(rows: Sequence[ResultRow]) -> list[str]:
+    """The surrogates that were asked for."""
+    return list(dict.fromkeys(row.surrogate for row in rows))
+
+
+def surrogates_chart(rows: Sequence[ResultRow]) -> Drawing:
+    """A panel for each tau: a dot for each object and surrogate, promised against kept. On the line nothing is lost."""
+    panels, names = _by_tau(rows), surrogates_of(rows)
+    with drawing(size=(1.2 + 3.2 * len(panels), 3.9), panels=(1, len(panels)), sharex=True, sharey=True) as made:
+        for axes, (tau, group) in zip(made.panels, panels.items(), strict=True):
+            axes.plot([0, 1], [0, 1], color=GREY, lw=0.8, zorder=1)
+            for number, name in enumerate(names):
+                dots = [
+                    (row.surrogate_a_drop, row.target_a_drop)
+                    for row in group
+                    if row.surrogate == name and row.surrogate_a_drop is not None and row.target_a_drop is not None
+                ]
+                axes.plot(
+                    [promised for promised, _ in dots],
+                    [kept for _, kept in dots],
+                    marker=MARKERS[number],
+                    color=PALETTE[number],
+                    ls="",
+                    ms=7,
+                    mec="white",
+                    mew=0.6,
+                    clip_on=False,
+                    label=name if axes is made.panels[0] else None,
+                )
+            axes.set_title(tau_words(tau))
+            axes.set_xlabel("A_drop promised by the surrogate (share)")
+            axes.set_xlim(0, 1)
+            axes.set_ylim(0, 1)
+        made.panels[0].set_ylabel("A_drop kept in the target (share)")
+        made.figure.legend(loc="outside lower center", ncols=len(names))
+    return made
+
+
+def surrogates_markdown(rows: Sequence[ResultRow]) -> str:
+    """For each tau a table: objects down, surrogates across."""
+    names = surrogates_of(rows)
+    head = ["object", "A_before", *(word for name in names for word in (f"{name}: promised", "kept", "texels altered"))]
+    parts = []
+    for tau, group in _by_tau(rows).items():
+        lines = [f"**{tau_words(tau)}**", "", "| " + " | ".join(head) + " |", "|---|" + "---:|" * (len(head) - 1)]
+        counting = [row for row in group if (row.target_a_before or 0) >= RECOGNISED]
+        for object_, some in grouped(group, lambda row: row.object).items():
+            before = average(row.target_a_before for row in some)
+            lines.append(_line(object_, "n.a." if before is None else f"{before:.2f}", some, names))
+        lines.append(_line(f"**mean** of those with A_before ≥ {RECOGNISED:g}", "", counting, names))
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def _line(title: str, before: str, rows: Sequence[ResultRow], names: Sequence[str]) -> str:
+    cells = [title, before]
+    for name in names:
+        mine = [row for row in rows if row.surrogate == name]
+        promised, kept = average(row.surrogate_a_drop for row in mine), average(row.target_a_drop for row in mine)
+        altered = average(row.texels_altered for row in mine)
+        cells += [_share(promised), f"**{_share(kept)}**", "n.a." if altered is None else f"{altered:.1%}"]
+    return "| " + " | ".join(cells) + " |"
+
+
+def _by_tau(rows: Sequence[ResultRow]) -> dict[float | None, list[ResultRow]]:
+    return grouped(sorted(rows, key=lambda row: row.tau or -1.0), lambda row: row.tau)
+
+
+def _share(value: float | None) -> str:
+    return "n.a." if value is None else f"{value:.2f}"
