@@ -47,7 +47,7 @@ class Backgrounds:
         odds = np.ones(len(self.pictures)) if self.odds is None else np.asarray(self.odds)
         generator = np.random.default_rng([seed, step, STREAM])
         drawn = generator.choice(len(odds), size=len(self.own), p=odds / odds.sum())
-        parts = {field.name: getattr(surrogate, field.name) for field in fields(Surrogate)}
+        parts = {field.name: getattr(surrogate, field.name) for field in fields(Surrogate) if field.init}
         pictures = self.pictures.to(surrogate.base.device)
         return _Elsewhere(**parts, pictures=pictures, was=torch.tensor(list(self.own)), now=torch.from_numpy(drawn))
 
