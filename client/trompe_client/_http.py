@@ -36,7 +36,11 @@ class BlockingPort:
 
     @asynccontextmanager
     async def open(self, request: Request[Any], *, silence: float | None = None) -> AsyncIterator["_Answer"]:
-        with _translated(self._url), self._http.stream(**_arguments(request, silence)) as response:
+        with (
+            _translated(self._url),
+            _arguments(request, silence) as arguments,
+            self._http.stream(**arguments) as response,
+        ):
             yield _Answer(response)
 
     async def sleep(self, seconds: float) -> None:
@@ -69,8 +73,8 @@ class AsyncPort:
 
     @asynccontextmanager
     async def open(self, request: Request[Any], *, silence: float | None = None) -> AsyncIterator["_AsyncAnswer"]:
-        with _translated(self._url):
-            async with self._http.stream(**_arguments(request, silence)) as response:
+        with _translated(self._url), _arguments(request, silence) as arguments:
+            async with self._http.stream(**arguments) as response:
                 yield _AsyncAnswer(response)
 
     async def sleep(self, seconds: float) -> None:
@@ -144,18 +148,24 @@ def _options(connection: Connection) -> dict[str, Any]:
     }
 
 
-def _arguments(request: Request[Any], silence: float | None) -> dict[str, Any]:
+@contextmanager
+def _arguments(request: Request[Any], silence: float | None) -> Iterator[dict[str, Any]]:
+    """What httpx is told; a file that is to be sent is open for the time of the block, and httpx reads it in pieces."""
     upload = request.upload
-    arguments = {
+    arguments: dict[str, Any] = {
         "method": request.method,
         "url": request.path,
         "params": list(request.params),
         "headers": dict(request.headers) | ({"Content-Type": "application/json"} if request.json else {}),
         "content": request.json,
-        "data": dict(upload.form) if upload else None,
-        "files": {"file": (upload.filename, upload.data)} if upload else None,
     }
-    return arguments if silence is None else arguments | {"timeout": httpx.Timeout(silence)}
+    if silence is not None:
+        arguments["timeout"] = httpx.Timeout(silence)
+    if upload is None:
+        yield arguments
+        return
+    with upload.opened() as content:
+        yield arguments | {"data": dict(upload.form), "files": {"file": (upload.filename, content)}}
 
 
 @contextmanager

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import click
 
@@ -13,6 +13,9 @@ from trompe_server.doctor import check_all, in_json, in_words
 from trompe_server.log import log_to_stderr
 from trompe_server.settings import Settings
 from trompe_shared.errors import TrompeError
+
+if TYPE_CHECKING:
+    from trompe_server.jobs.renderers import Renderers
 
 __all__ = [
     "data_option",
@@ -41,6 +44,20 @@ _store = click.option(
     "--store",
     metavar="URL",
     help="Folder or URL, such as s3://bucket, of files (or TROMPE_STORE). Default: the data folder.",
+)
+_renderer = click.option(
+    "--renderer",
+    "listed",
+    multiple=True,
+    metavar="HOST:PORT",
+    help="A renderer worker that shows the objects. Several share the work.",
+)
+_renderers_dns = click.option(
+    "--renderers-dns",
+    "names",
+    multiple=True,
+    metavar="NAME:PORT",
+    help="A name that the DNS resolves to the addresses of all renderer workers, looked up again and again.",
 )
 _device = click.option("--device", metavar="DEVICE", help="cpu, cuda or cuda:1 (or TROMPE_DEVICE). Default: cpu.")
 
@@ -86,49 +103,47 @@ def _announce(line: str) -> None:
     type=click.IntRange(0, 64),
     help="Renderer workers, which share each job's images (or TROMPE_RENDERERS). Default: 1.",
 )
+@_renderer
+@_renderers_dns
 @_device
 @data_option
 @database_option
 @_store
 @for_people
-def serve(host: str, port: int, data: Path | None, **options: str | int | None) -> None:
-    """Run the service: REST API, its attack workers and renderer workers, one folder of data."""
+def serve(
+    host: str,
+    port: int,
+    data: Path | None,
+    listed: tuple[str, ...],
+    names: tuple[str, ...],
+    **options: str | int | None,
+) -> None:
+    """Run the service: REST API, its attack workers and renderer workers, one folder of data.
+
+    Renderer workers that run elsewhere are named by --renderer or --renderers-dns; --renderers 0 starts none here.
+    """
     from trompe_server.serving import run_service
 
     log_to_stderr()
-    run_service(settings_of(data, **options), host=host, port=port, announce=_announce)
+    run_service(settings_of(data, **options), _renderers_at(listed, names), host=host, port=port, announce=_announce)
 
 
 @click.command()
 @data_option
 @database_option
 @_store
-@click.option(
-    "--renderer",
-    "renderers",
-    multiple=True,
-    metavar="HOST:PORT",
-    help="A renderer worker that shows the objects. Several share the work.",
-)
-@click.option(
-    "--renderers-dns",
-    "names",
-    multiple=True,
-    metavar="NAME:PORT",
-    help="A name that the DNS resolves to the addresses of all renderer workers, looked up again and again.",
-)
+@_renderer
+@_renderers_dns
 @_device
 @for_people
-def worker(data: Path | None, renderers: tuple[str, ...], names: tuple[str, ...], **options: str | None) -> None:
+def worker(data: Path | None, listed: tuple[str, ...], names: tuple[str, ...], **options: str | None) -> None:
     """Run an attack worker, which takes one job after the other, of any machine that shares database and store."""
-    from trompe_server.jobs.renderers import Renderers
     from trompe_server.jobs.worker import run_worker
 
-    if not renderers and not names:
+    if not listed and not names:
         raise click.UsageError("Say where the renderer workers are: --renderer HOST:PORT or --renderers-dns NAME:PORT.")
-    found = Renderers(tuple(_address(each) for each in renderers), tuple(_address(each) for each in names))
     log_to_stderr()
-    run_worker(settings_of(data, **options), found, announce=_announce)
+    run_worker(settings_of(data, **options), _renderers_at(listed, names), announce=_announce)
 
 
 @click.command()
@@ -142,6 +157,12 @@ def migrate(data: Path | None, database: str | None) -> None:
     log_to_stderr()
     prepare_data(settings_of(data, database=database))
     _announce("the database is up to date")
+
+
+def _renderers_at(listed: tuple[str, ...], names: tuple[str, ...]) -> "Renderers":
+    from trompe_server.jobs.renderers import Renderers
+
+    return Renderers(tuple(_address(each) for each in listed), tuple(_address(each) for each in names))
 
 
 def _address(text: str) -> tuple[str, int]:

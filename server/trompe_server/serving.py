@@ -17,6 +17,7 @@ from trompe_server.app import create_app
 from trompe_server.artifacts import open_folder
 from trompe_server.errors import ServiceError
 from trompe_server.files import exclusive
+from trompe_server.jobs.renderers import Renderers
 from trompe_server.jobs.store import JobStore
 from trompe_server.jobs.supervisor import Supervisor
 from trompe_server.jobs.worker import prepare_data
@@ -32,12 +33,16 @@ CHECKPOINT_PAGES: Final = 10_000
 """Pages of 4 KiB that SQLite's log may have before the API moves them; the workers do at 1000."""
 
 
-def run_service(settings: Settings, *, host: str, port: int, announce: Callable[[str], None]) -> None:
-    """Serve until SIGTERM or SIGINT. ``announce`` is given one line once everything is up; port 0 takes a free one.
+def run_service(
+    settings: Settings, elsewhere: Renderers, *, host: str, port: int, announce: Callable[[str], None]
+) -> None:
+    """Serve until SIGTERM or SIGINT, with renderers of its own and those ``elsewhere``.
+
+    ``announce`` is given one line once everything is up; port 0 takes a free one.
 
     Raises ``ServiceError`` where the address, the data folder or one of the children is not to be had.
     """
-    _refuse_without_renderers(settings)
+    _refuse_without_renderers(settings, elsewhere)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _leave)
     prepare_data(settings)
@@ -45,7 +50,7 @@ def run_service(settings: Settings, *, host: str, port: int, announce: Callable[
     with (
         exclusive(settings.data / "serve.lock", _in_use(settings)),
         _listen(host, port) as listener,
-        Supervisor(settings) as supervisor,
+        Supervisor(settings, elsewhere) as supervisor,
     ):
         supervisor.start()
         _serve_http(settings, supervisor, listener, announce)
@@ -132,11 +137,12 @@ def _refuse_public(host: str, settings: Settings) -> None:
         )
 
 
-def _refuse_without_renderers(settings: Settings) -> None:
-    if settings.workers and not settings.renderers:
+def _refuse_without_renderers(settings: Settings, elsewhere: Renderers) -> None:
+    if settings.workers and not settings.renderers and elsewhere == Renderers():
         raise ServiceError(
             f"{settings.workers} attack workers have nothing to see by without a renderer: start some with "
-            "--renderers, or no attack worker with --workers 0, where workers elsewhere do the work."
+            "--renderers, name some with --renderer HOST:PORT, or start no attack worker with --workers 0, where "
+            "workers elsewhere do the work."
         )
 
 

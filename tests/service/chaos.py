@@ -19,6 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
+from processes import wait_until
+
 from trompe_client import Client, Retries
 from trompe_client._job import JobHandle
 from trompe_server.jobs.fake import PHASES, trace
@@ -55,14 +57,6 @@ def request(number: int) -> JobRequest:
 def is_real(number: int) -> bool:
     """Whether the job with this number is an attack."""
     return request(number).steps > 1
-
-
-def wait_until(condition: Callable[[], Any], *, seconds: float, story: Callable[[], str] = str) -> None:
-    """Return once ``condition`` is true; fails after ``seconds`` with ``story``."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {seconds:.0f} s in vain\n{story()}"
-        time.sleep(0.1)
 
 
 class Kept:

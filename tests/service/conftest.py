@@ -1,6 +1,5 @@
 """What the tests of the service share: databases of both kinds, and worker processes that run fake pipelines."""
 
-import importlib.util
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,19 +10,10 @@ import pytest
 from trompe_server.jobs.store import JobStore
 from trompe_server.settings import Settings
 
+sys.path.append(str(Path(__file__).parent))  # of what lies beside this file, for the tests as well
 
-def _load(name: str) -> Any:
-    """A module that lies beside this file."""
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-        assert spec is not None
-        assert spec.loader is not None
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-Postgres = _load("postgres").Postgres
+from postgres import Postgres, find_programs
+from processes import Service, listening
 
 
 @pytest.fixture(scope="session")
@@ -39,7 +29,7 @@ def postgres() -> Iterator[Any]:
 
 
 def _running() -> Iterator[Any]:
-    programs = _load("postgres").find_programs()
+    programs = find_programs()
     if programs is None:
         pytest.skip("NOT TESTED ON POSTGRESQL: there is no initdb here; install it: sudo apt-get install postgresql")
     server = Postgres(programs)
@@ -71,13 +61,13 @@ def store(database_url: str) -> Iterator[JobStore]:
 @pytest.fixture
 def renderer() -> Iterator[int]:
     """The port of something that plays a renderer for fake pipelines."""
-    with _load("processes").listening() as port:
+    with listening() as port:
         yield port
 
 
 @pytest.fixture
 def service(database_url: str, tmp_path: Path, renderer: int) -> Iterator[Any]:
     """A service whose workers count as dead after two seconds of silence; on each kind of database."""
-    service = _load("processes").Service(Settings(data=tmp_path, database=database_url, silence=2.0), renderer)
+    service = Service(Settings(data=tmp_path, database=database_url, silence=2.0), renderer)
     yield service
     service.close()

@@ -6,7 +6,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,11 +20,11 @@ from trompe_shared.api import Job, JobRequest, JobState
 FAKE = "trompe_server.jobs.fake:open_pipeline"
 
 
-def wait_until(condition: Callable[[], Any], *, seconds: float = 60.0) -> Any:
-    """What ``condition`` returns once it is true; fails after ``seconds``."""
+def wait_until(condition: Callable[[], Any], *, seconds: float = 60.0, story: Callable[[], str] = str) -> Any:
+    """What ``condition`` returns once it is true; fails after ``seconds`` with ``story``."""
     deadline = time.monotonic() + seconds
     while not (value := condition()):
-        assert time.monotonic() < deadline, "waited in vain"
+        assert time.monotonic() < deadline, f"waited {seconds:.0f} s in vain\n{story()}"
         time.sleep(0.02)
     return value
 
@@ -34,6 +34,26 @@ def listening() -> Iterator[int]:
     """A port that accepts connections and never says anything: enough of a renderer for a fake pipeline."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         yield server.getsockname()[1]
+
+
+@contextmanager
+def serving(
+    data: Path, *options: str, log: Path, environment: Mapping[str, str]
+) -> Iterator[tuple["subprocess.Popen[str]", str]]:
+    """``trompe serve`` for the time of the block: its process, and its URL. What it says goes to ``log``."""
+    command = [sys.executable, "-m", "trompe_server.jobs.leash", "serve", "--port", "0", "--data", str(data), *options]
+    pipe, own = subprocess.PIPE, os.environ | environment
+    with (
+        log.open("wb") as words,
+        subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=words, text=True, env=own) as process,
+    ):
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line.startswith("trompe serving on http://127.0.0.1:"), log.read_text()
+        try:
+            yield process, line.split()[-1]
+        finally:
+            process.terminate()
 
 
 class WorkerProcess:

@@ -5,7 +5,6 @@ drawn from a seed, and each failure tells it.
 """
 
 import logging
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,12 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from chaos import Digests, Mischief, Run, Site, Submission, check_history, is_real
 
 from trompe_shared.api import JobState
-
-sys.path.append(str(Path(__file__).parent))
-
-from chaos import Digests, Mischief, Run, Site, Submission, check_history, is_real
 
 pytestmark = pytest.mark.chaos
 

@@ -229,6 +229,20 @@ def test_retention_deletes_what_is_old_and_nothing_else(store: JobStore, tmp_pat
     assert files.within("jobs").folders() == sorted([running, queued])
 
 
+@pytest.mark.parametrize(
+    ("days", "seconds"),
+    [
+        pytest.param(30, 3600, id="a month: every hour"),
+        pytest.param(1 / 24, 900, id="an hour: every quarter of it"),
+        pytest.param(1e-9, 1, id="no time: every second"),
+    ],
+)
+def test_retention_looks_often_enough_that_little_is_kept_for_longer(
+    days: float, seconds: float, store: JobStore, tmp_path: Path
+) -> None:
+    assert Retention(store, open_folder(tmp_path), days=days).interval == pytest.approx(seconds)
+
+
 def _job(store: JobStore) -> str:
     return store.create(JobRequest.model_validate({"object": "mug", "label": "mug"}))[0].id
 

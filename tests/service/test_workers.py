@@ -6,22 +6,12 @@ import time
 from typing import Any
 
 import pytest
+from processes import Service, wait_until
 
 from trompe_server.artifacts import LocalArtifacts
 from trompe_server.jobs.fake import PHASES, trace
 from trompe_server.settings import Settings
 from trompe_shared.api import JobState
-
-Service = Any
-"""``processes.Service``, which lies beside this file."""
-
-
-def wait_until(condition: Any, *, seconds: float = 60.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
-    return value
 
 
 def test_jobs_run_one_after_the_other_and_each_ends_as_its_pipeline_says(service: Service) -> None:
@@ -275,10 +265,7 @@ class TestOutage:
 
     @pytest.fixture
     def service(self, postgres: Any, tmp_path: Any, renderer: int) -> Any:
-        import sys
-
-        settings = Settings(data=tmp_path, database=postgres.database(), silence=20.0)
-        service = sys.modules["processes"].Service(settings, renderer)
+        service = Service(Settings(data=tmp_path, database=postgres.database(), silence=20.0), renderer)
         yield service
         service.close()
 

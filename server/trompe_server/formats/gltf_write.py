@@ -1,16 +1,14 @@
 """Any object as a GLB file: what a viewer shows of it is what SAILenv's renderers show."""
 
-import io
 import json
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from trompe_server.formats.gltf_container import BIN_CHUNK
 from trompe_server.formats.gltf_repaint import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, FLOAT, UNSIGNED_INT, glb
-from trompe_shared.object3d import IMAGE_FORMATS, Material, Object3D, encode_png
+from trompe_shared.object3d import Material, Object3D, encode_png, open_image
 from trompe_shared.opacity import CUTOFF, opacity_of
 from trompe_shared.wavefront import Part
 
@@ -91,7 +89,7 @@ class _Writer:
         if material.metallic is None:
             pbr |= {"metallicFactor": 0.0, "roughnessFactor": PLAIN_ROUGHNESS}
         else:
-            converted = _metallic_roughness(files[material.metallic])
+            converted = _metallic_roughness(files[material.metallic], material.metallic)
             pbr["metallicRoughnessTexture"] = {"index": self._texture(f"{material.metallic} as glTF", converted)}
         entry: Json = {"name": material.name, "pbrMetallicRoughness": pbr}
         if material.normal is not None:
@@ -102,24 +100,24 @@ class _Writer:
 
     def _texture(self, name: str, data: bytes) -> int:
         if name not in self._textures:
-            data, kind = _portable(data)
+            data, kind = _portable(data, name)
             view = self._view(data, {})
             image = self._add("images", {"bufferView": view, "mimeType": kind, "name": name.rsplit(".", 1)[0]})
             self._textures[name] = self._add("textures", {"sampler": 0, "source": image})
         return self._textures[name]
 
 
-def _portable(data: bytes) -> tuple[bytes, str]:
+def _portable(data: bytes, name: str) -> tuple[bytes, str]:
     """An image file in an encoding that glTF allows, and its MIME type."""
-    with Image.open(io.BytesIO(data), formats=IMAGE_FORMATS) as image:
+    with open_image(data, name) as image:
         if image.format in {"PNG", "JPEG"}:
             return data, f"image/{image.format.lower()}"
         return encode_png(image.convert("RGBA" if image.has_transparency_data else "RGB")), "image/png"
 
 
-def _metallic_roughness(data: bytes) -> bytes:
+def _metallic_roughness(data: bytes, name: str) -> bytes:
     """glTF's map, green roughness and blue metallic, from Unity's, red metallic and alpha smoothness."""
-    with Image.open(io.BytesIO(data), formats=IMAGE_FORMATS) as image:
+    with open_image(data, name) as image:
         smoothness = np.array(image.getchannel("A")) if "A" in image.getbands() else None
         metallic = np.array(image.convert("RGB"))[..., 0]
     plain = np.full(metallic.shape, round(255 * PLAIN_ROUGHNESS), np.uint8)

@@ -3,7 +3,6 @@
 Colours are sRGB-encoded uint8 in images and linear in [0, 1] as factors.
 """
 
-import io
 from collections.abc import Sequence
 from typing import Final
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from trompe_shared.object3d import IMAGE_FORMATS, decode_rgb, encode_png
+from trompe_shared.object3d import decode_rgb, encode_png, open_image
 
 __all__ = [
     "Pixels",
@@ -47,7 +46,7 @@ def encode_srgb(linear: ArrayLike) -> Pixels:
 def decode(data: bytes, name: str) -> tuple[Pixels, Pixels | None]:
     """Colours (H, W, 3) and, where the image has one, alpha (H, W). Raises ``ObjectError``."""
     rgb = decode_rgb(data, name)
-    with Image.open(io.BytesIO(data), formats=IMAGE_FORMATS) as image:
+    with open_image(data, name) as image:
         if not image.has_transparency_data:
             return rgb, None
         return rgb, np.array(image.convert("RGBA").getchannel("A"))

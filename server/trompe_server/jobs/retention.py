@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 DAY: Final = 86_400.0
 INTERVAL: Final = 3600.0
-"""Seconds between two runs, by whichever worker is first."""
+"""Seconds between two runs, by whichever worker is first; less where jobs are kept for less than four of them."""
 
 
 class Retention:
@@ -23,16 +23,17 @@ class Retention:
 
     def __init__(self, store: JobStore, files: Folder, *, days: float) -> None:
         self._store, self._files, self._kept = store, files, days * DAY
+        self.interval = max(1.0, min(INTERVAL, self._kept / 4))
 
     def run_forever(self) -> None:
-        """Clear up every hour, where this is asked for and no other process does it."""
+        """Clear up again and again, where this is asked for and no other process does it."""
         while self._kept:
             try:
-                if take_lease(self._store.engine, "retention", seconds=INTERVAL * 0.9):
+                if take_lease(self._store.engine, "retention", seconds=self.interval * 0.9):
                     self.run()
             except Exception:
-                logger.exception("old jobs could not be deleted; trying again in an hour")
-            time.sleep(INTERVAL)
+                logger.exception("old jobs could not be deleted; trying again in %.0f s", self.interval)
+            time.sleep(self.interval)
 
     def run(self) -> int:
         """Clear up now; how many jobs were deleted. Files go first, so that none is left of which nobody knows."""

@@ -15,9 +15,11 @@ from types import TracebackType
 from typing import Final, Self
 
 from trompe_server.errors import ServiceError
+from trompe_server.jobs.renderers import Address, Renderers
 from trompe_server.jobs.worker import READY
 from trompe_server.settings import Settings
 from trompe_shared.api import RendererInfo
+from trompe_shared.errors import RendererError
 
 __all__ = ["Child", "Supervisor"]
 
@@ -32,6 +34,8 @@ NICE: Final = 10
 """How far the children stand back for the API, which shall answer at once while they compute on all cores."""
 GIVE_UP: Final = 3
 """A child that died so often before it was ever ready will not come up."""
+ASKED_AT_ONCE: Final = 16
+"""Renderers that are asked at a time whether they are there: one that is not takes a second to say nothing."""
 
 
 class Child:
@@ -132,10 +136,13 @@ class Child:
 
 
 class Supervisor:
-    """The children of ``trompe serve``; a context manager. A renderer keeps its port when it is started again."""
+    """The children of ``trompe serve``; a context manager. A renderer keeps its port when it is started again.
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
+    Renderers ``elsewhere`` are used and asked whether they are there, but others look after them.
+    """
+
+    def __init__(self, settings: Settings, elsewhere: Renderers) -> None:
+        self._settings, self._elsewhere = settings, elsewhere
         self._ports = [0] * settings.renderers
         listening = re.compile(r"^trompe renderer listening on (\S+):(\d+)$")
         self.renderers = [
@@ -175,18 +182,30 @@ class Supervisor:
         words = [f"the {child.name} is not up" for child in (*self.workers, *self.renderers) if not child.up]
         if not words and not all(_accepts("127.0.0.1", port) for port in self._ports):
             words.append("a renderer worker does not answer")
+        if not self._ports and self._elsewhere != Renderers() and not any(info.alive for info in self.renderer_infos()):
+            words.append("none of the renderer workers elsewhere answers")
         return words
 
     def renderer_infos(self) -> list[RendererInfo]:
         """The renderer workers, and which of them accept connections."""
-        return [RendererInfo(address=f"127.0.0.1:{port}", alive=_accepts("127.0.0.1", port)) for port in self._ports]
+        with ThreadPoolExecutor(ASKED_AT_ONCE) as pool:
+            return list(pool.map(_info, [*(("127.0.0.1", port) for port in self._ports), *self._addresses_elsewhere()]))
+
+    def _addresses_elsewhere(self) -> list[Address]:
+        """None where no name of theirs can be resolved."""
+        try:
+            return self._elsewhere.addresses()
+        except RendererError:
+            return []
 
     def _render(self, number: int) -> list[str]:
         return ["render", "--host", "127.0.0.1", "--port", str(self._ports[number])]
 
     def _work(self) -> list[str]:
-        renderers = [word for port in self._ports for word in ("--renderer", f"127.0.0.1:{port}")]
-        return ["worker", *renderers]
+        listed = [*(("127.0.0.1", port) for port in self._ports), *self._elsewhere.listed]
+        renderers = [word for host, port in listed for word in ("--renderer", f"{host}:{port}")]
+        names = [word for name, port in self._elsewhere.dns for word in ("--renderers-dns", f"{name}:{port}")]
+        return ["worker", *renderers, *names]
 
 
 def worker_environment(settings: Settings) -> dict[str, str]:
@@ -199,6 +218,11 @@ def worker_environment(settings: Settings) -> dict[str, str]:
         "TROMPE_DEVICE": settings.device,
         "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(threads)),
     }
+
+
+def _info(address: Address) -> RendererInfo:
+    host, port = address
+    return RendererInfo(address=f"{host}:{port}", alive=_accepts(host, port))
 
 
 def _accepts(host: str, port: int) -> bool:

@@ -1,7 +1,6 @@
 """A target renderer behind SAILenv's socket protocol: a Trompe renderer worker, or SAILenv itself."""
 
 import contextlib
-import io
 import math
 import socket
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -9,11 +8,10 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from trompe_shared.errors import ProtocolError, RendererError, RendererLostError
+from trompe_shared.errors import ObjectError, ProtocolError, RendererError, RendererLostError
 from trompe_shared.geometry import View, light_travel_direction, sailenv_pose
-from trompe_shared.object3d import Object3D
+from trompe_shared.object3d import Object3D, decode_rgb
 from trompe_shared.opacity import opacity_of
 from trompe_shared.sailenv import (
     COMMANDS,
@@ -307,10 +305,9 @@ def _key(command: str, values: Mapping[str, Any]) -> tuple[str, Any]:
 
 def _picture(data: bytes, size: Size) -> Images:
     try:
-        with Image.open(io.BytesIO(data)) as image:
-            picture = np.array(image.convert("RGB"))
-    except (OSError, ValueError, SyntaxError) as error:
-        raise ProtocolError(f"A view of {len(data)} bytes is not an image ({error}).") from error
+        picture = decode_rgb(data, "view")
+    except ObjectError as error:
+        raise ProtocolError(f"A view of {len(data)} bytes is not an image ({error.__cause__ or error}).") from error
     if picture.shape[:2] != size:
         raise ProtocolError(f"A view of {picture.shape[:2]} pixels came where {size} was asked for (height, width).")
     return picture

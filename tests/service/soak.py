@@ -1,0 +1,181 @@
+"""A watch over a running service: what its processes hold and its folder takes, sample by sample; and what grows."""
+
+import csv
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from chaos import KINDS, ancestry, kind_of, process_table
+from numpy.typing import ArrayLike
+from processes import serving
+
+MIB: Final = 2**20
+PAGE: Final = os.sysconf("SC_PAGE_SIZE")
+ALLOWED: Final = {"MiB": (0.05, 16.0), "handles": (0.0, 3.0), "threads": (0.0, 3.0), "files": (0.05, 20.0)}
+"""By its unit, how much a quantity may seem to grow in all: a share of its median, and so much more."""
+LEAST_SAMPLES: Final = 20
+PASSING: Final = ("data/jobs", "data/library/calibrations")
+"""What retention deletes."""
+
+Row = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Soaked:
+    """A running ``trompe serve``; ``folder`` holds its data and what it keeps for the moment."""
+
+    process: "subprocess.Popen[str]"
+    url: str
+    folder: Path
+    log: Path
+
+    def processes(self) -> dict[str, list[int]]:
+        """Ids of its processes by what they are, without those that read one upload and end."""
+        table = process_table()
+        found: dict[str, list[int]] = {kind: [] for kind in KINDS.values()}
+        for pid in sorted(table):
+            line = list(ancestry(pid, table))
+            kind = next((kind for each in line if (kind := kind_of(each)) is not None), None)
+            if kind is not None and self.process.pid in line and not _reads_an_upload(pid):
+                found[kind].append(pid)
+        return found
+
+    def sample(self) -> Row:
+        """What it takes now, by process and quantity."""
+        row: Row = {}
+        for kind, pids in self.processes().items():
+            held = [_held(pid) for pid in pids]
+            row |= {f"{kind} {unit}": sum(each[unit] for each in held) for unit in ("MiB", "handles", "threads")}
+        for name, sizes in (("passing", self.passing()), ("lasting", self._lasting())):
+            row |= {f"{name} MiB": sum(sizes) / MIB, f"{name} files": len(sizes)}
+        return row
+
+    def passing(self) -> list[int]:
+        """Bytes of each file that is there for a time only: more where more was done of late."""
+        return [size for place in PASSING for size in _sizes(self.folder / place)]
+
+    def _lasting(self) -> list[int]:
+        """Bytes of each other file."""
+        return _sizes(self.folder, without=[self.folder / place for place in PASSING])
+
+
+@contextmanager
+def soaking(folder: Path, *, kept: float) -> Iterator[Soaked]:
+    """A service that deletes jobs which ended more than ``kept`` seconds ago."""
+    home, log = folder / "service", folder / "serve.log"
+    (home / "moment").mkdir(parents=True)
+    own = {"TMPDIR": str(home / "moment"), "TROMPE_RETENTION_DAYS": str(kept / 86_400)}
+    with serving(home / "data", log=log, environment=own) as (process, url):
+        yield Soaked(process, url, home, log)
+
+
+class Watch:
+    """Takes a sample of ``service`` every so many seconds, for the time of the block, and writes each to ``file``."""
+
+    def __init__(self, service: Soaked, file: Path, *, every: float) -> None:
+        self._service, self._file, self._every = service, file, every
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self.rows: list[Row] = []
+
+    def _look(self) -> None:
+        started = time.monotonic()
+        with self._file.open("w", newline="") as file:
+            while not self._stopping.is_set():
+                self.rows.append({"seconds": time.monotonic() - started} | self._service.sample())
+                writer = csv.DictWriter(file, list(self.rows[0]))
+                if len(self.rows) == 1:
+                    writer.writeheader()
+                writer.writerow({name: round(value, 1) for name, value in self.rows[-1].items()})
+                file.flush()
+                self._stopping.wait(self._every)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._stopping.set()
+        self._thread.join()
+
+
+@dataclass(frozen=True)
+class Trend:
+    """How one quantity went: its ``median``, what it ``grew`` in all, and how much of that is ``allowed``."""
+
+    name: str
+    median: float
+    grew: float
+    allowed: float
+
+    @property
+    def flat(self) -> bool:
+        """Whether it stayed as it was."""
+        return self.grew <= self.allowed
+
+    def __str__(self) -> str:
+        words = "" if self.flat else "  GROWS"
+        return f"{self.name:24} median {self.median:9.1f}   grew {self.grew:7.1f}   allowed {self.allowed:6.1f}{words}"
+
+
+def trends(rows: Sequence[Row], *, warm: float) -> list[Trend]:
+    """The trend of each quantity from ``warm`` seconds on, but for what passes."""
+    used = [row for row in rows if row["seconds"] >= warm]
+    assert len(used) >= LEAST_SAMPLES, f"{len(used)} samples after the warm-up tell nothing; soak for longer"
+    times = [row["seconds"] for row in used]
+    return [
+        trend(name, times, [row[name] for row in used])
+        for name in used[0]
+        if name.split()[-1] in ALLOWED and not name.startswith("passing")
+    ]
+
+
+def trend(name: str, times: ArrayLike, values: ArrayLike) -> Trend:
+    """The trend of one quantity, which is named ``... UNIT``.
+
+    Growth is the median slope (Theil and Sen) times the time: what is just running, or just open, does not count.
+    """
+    run, rise = (np.subtract.outer(*[np.asarray(each, float)] * 2) for each in (times, values))
+    grew = float(np.median(rise[run > 0] / run[run > 0]) * run.max())
+    share, more = ALLOWED[name.split()[-1]]
+    median = float(np.median(values))
+    return Trend(name, median, grew, share * median + more)
+
+
+def _reads_an_upload(pid: int) -> bool:
+    with suppress(OSError):
+        return b"trompe_server.sandbox" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    return True
+
+
+def _held(pid: int) -> Row:
+    """What a process holds; nothing where it has just ended."""
+    folder = Path("/proc", str(pid))
+    with suppress(OSError):
+        resident = int((folder / "statm").read_text().split()[1]) * PAGE
+        handles, threads = (len(os.listdir(folder / each)) for each in ("fd", "task"))
+        return {"MiB": resident / MIB, "handles": handles, "threads": threads}
+    return {"MiB": 0, "handles": 0, "threads": 0}
+
+
+def _sizes(folder: Path, *, without: Sequence[Path] = ()) -> list[int]:
+    """Bytes of each file below ``folder`` and not below ``without``; files come and go meanwhile."""
+    sizes: list[int] = []
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if Path(place, name) not in without]
+        for name in names:
+            with suppress(FileNotFoundError):
+                sizes.append(os.stat(os.path.join(place, name)).st_size)
+    return sizes
+
+
+def summary(found: Sequence[Trend], counts: dict[str, Any]) -> str:
+    """What was done, and all trends, a line each."""
+    return "\n".join([str(counts), *map(str, found)])

@@ -1,0 +1,211 @@
+"""The service in use for long: jobs of all kinds, uploads good and bad, downloads, deletions; nothing grows.
+
+TROMPE_SOAK_MINUTES (120) says for how long, TROMPE_SOAK_CSV where the samples go. Figures: ``--log-cli-level=INFO``.
+"""
+
+import io
+import itertools
+import logging
+import os
+import random
+import shutil
+import time
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+from processes import wait_until
+from soak import LEAST_SAMPLES, Watch, soaking, summary, trend, trends
+
+from trompe_client import BadRequest, Client, JobCancelled
+from trompe_client._job import JobHandle
+from trompe_server.formats.gltf_write import write_glb
+from trompe_shared.object3d import load_object
+from trompe_shared.shipped import ShippedObject, shipped_objects
+
+logger = logging.getLogger(__name__)
+
+MINUTES = float(os.environ.get("TROMPE_SOAK_MINUTES", "120"))
+PAUSE = 4.0
+"""Seconds between two things that are asked."""
+GRID = {"pool": 0, "azimuths": 3, "elevations": 2, "held_out": 4, "steps": 10}
+POOL = {"pool": 12, "views_per_step": 6, "held_out": 4, "steps": 10}
+
+
+def zipped(files: dict[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
+
+
+def hostile_files() -> dict[str, bytes]:
+    """What has to be refused, by file name."""
+    picture = io.BytesIO()
+    Image.new("1", (20_000, 20_000)).save(picture, "PNG")
+    mesh = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    table = b'{"m": {"albedo": "t.png"}}'
+    return {
+        "bomb.zip": zipped({"t.obj": mesh, "t.bin": bytes(80 * 2**20)}),
+        "picture.zip": zipped({"t.obj": mesh, "t_mat_def.json": table, "t.png": picture.getvalue()}),
+        "noise.glb": b"glTF" + random.Random(0).randbytes(100_000),
+        "path.zip": zipped({"t.obj": mesh, "../../t.png": b""}),
+    }
+
+
+class User:
+    """Somebody who uses the service at ``client`` one thing at a time.
+
+    ``counts`` is what was done, ``seen`` are the objects that were attacked.
+    """
+
+    def __init__(self, client: Client, folder: Path) -> None:
+        self._client, self._folder = client, folder
+        self._objects = itertools.cycle(shipped_objects().values())
+        self._seeds = itertools.count()
+        self.counts: Counter[str] = Counter()
+        self.seen: set[str] = set()
+        self._hostile = itertools.cycle(sorted(self._saved(hostile_files())))
+
+    def _saved(self, files: dict[str, bytes]) -> list[Path]:
+        self._folder.mkdir(exist_ok=True)
+        for name, data in files.items():
+            (self._folder / name).write_bytes(data)
+        return [self._folder / name for name in files]
+
+    def turns(self) -> Iterator[Callable[[], None]]:
+        """What is done, for ever."""
+        return itertools.cycle(
+            [
+                lambda: self.attack("grid", GRID),
+                self.upload_something_hostile,
+                lambda: self.attack("pool", POOL),
+                self.cancel_a_long_one,
+                lambda: self.attack("tau", GRID | {"tau": 0.1}),
+                self.attack_a_glb,
+                lambda: self.attack("two backgrounds", POOL | {"background": ["white", "#335577"]}),
+                self.delete_one,
+            ]
+        )
+
+    def _next(self) -> ShippedObject:
+        chosen = next(self._objects)
+        self.seen.add(chosen.name)
+        return chosen
+
+    def _submit(self, source: str | Path, label: str, options: dict[str, Any]) -> JobHandle:
+        return self._client.attack(source, label=label, classifier="tiny", seed=next(self._seeds), **options)
+
+    def attack(self, kind: str, options: dict[str, Any]) -> None:
+        """Attack the next shipped object and fetch everything."""
+        chosen = self._next()
+        self._fetch(self._submit(chosen.name, chosen.label, options).wait(600))
+        self.counts[kind] += 1
+
+    def attack_a_glb(self) -> None:
+        """Upload the next shipped object as GLB, attack it, and fetch everything."""
+        chosen = self._next()
+        (file,) = self._saved({f"{chosen.name}.glb": write_glb(load_object(chosen.read()))})
+        self._fetch(self._submit(file, chosen.label, GRID).wait(600))
+        self.counts["GLB"] += 1
+
+    def _fetch(self, job: JobHandle) -> None:
+        folder = self._folder / "fetched"
+        assert "adversarial.zip" in {file.name for file in job.download(folder)}
+        job.archive(folder / "all.zip")
+        assert job.result().steps >= 1
+        for path in ("/", "/jobs", f"/jobs/{job.id}", f"/jobs/{job.id}/preview.png", "/metrics", "/v1/objects"):
+            httpx.get(self._client.server + path, headers={"Accept": "text/html"}).raise_for_status()
+        shutil.rmtree(folder)
+
+    def upload_something_hostile(self) -> None:
+        """Send what is refused."""
+        with pytest.raises(BadRequest):
+            self._client.upload_object(next(self._hostile))
+        self.counts["refused"] += 1
+
+    def cancel_a_long_one(self) -> None:
+        """Cancel a job in the middle of its attack."""
+        chosen = self._next()
+        job = self._submit(chosen.name, chosen.label, GRID | {"steps": 10_000})
+        while not job.refresh().progress.step:
+            assert not job.status.state.final
+            time.sleep(0.2)
+        job.cancel()
+        with pytest.raises(JobCancelled):
+            job.wait(60)
+        self.counts["cancelled"] += 1
+
+    def delete_one(self) -> None:
+        """Make a job, and delete it at once when it has ended."""
+        self._submit("mug", "mug", GRID).wait(600).delete()
+        self.counts["deleted"] += 1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(60 * MINUTES + 1800)
+def test_in_hours_of_mixed_use_memory_handles_threads_and_disk_stay_flat(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING, "httpx")
+    duration = 60 * MINUTES
+    kept = max(20.0, min(300.0, duration / 12))
+    file = Path(os.environ.get("TROMPE_SOAK_CSV", tmp_path / "soak.csv"))
+    with soaking(tmp_path, kept=kept) as service, Client(service.url) as client:
+        user, before = User(client, tmp_path / "user"), service.processes()
+        begun, warm = time.monotonic(), duration / 4
+        with Watch(service, file, every=min(30.0, duration / 180)) as watch:
+            for turn in user.turns():
+                known = len(user.seen)
+                turn()
+                time.sleep(PAUSE)
+                passed = time.monotonic() - begun
+                if len(user.seen) > known:
+                    warm = max(warm, passed)
+                if passed > duration:
+                    break
+        wait_until(lambda: not service.passing(), seconds=2 * kept + 60, story=lambda: "retention leaves files behind")
+        assert list(client.jobs()) == []
+        assert service.processes() == before, f"a process was started again\n{service.log.read_text()[-4000:]}"
+    found = trends(watch.rows, warm=warm)
+    story = summary(found, dict(user.counts))
+    logger.info("%.0f minutes\n%s", MINUTES, story)
+    assert "Traceback" not in service.log.read_text()
+    assert all(each.flat for each in found), story
+
+
+TIMES = np.arange(0, 6000, 30.0)
+
+
+def noise(scale: float) -> np.ndarray[Any, Any]:
+    """What runs just now: an eighth of the samples is far off."""
+    random = np.random.default_rng(0)
+    return scale * (random.uniform(-0.1, 0.1, len(TIMES)) + 3 * (random.uniform(size=len(TIMES)) < 0.125))
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "flat"),
+    [
+        pytest.param("worker MiB", 600 + noise(100), True, id="memory that goes up and down"),
+        pytest.param("worker MiB", 600 + noise(100) + TIMES / 60, False, id="memory that grows by a MiB a minute"),
+        pytest.param("worker handles", 30 + noise(5), True, id="handles of what is open just now"),
+        pytest.param("worker handles", 30 + noise(5) + TIMES // 600, False, id="a handle left behind in ten minutes"),
+        pytest.param("lasting files", 900 - TIMES / 10, True, id="files that become fewer"),
+    ],
+)
+def test_what_grows_is_told_from_what_varies(name: str, values: Any, flat: bool) -> None:
+    assert trend(name, TIMES, values).flat is flat
+
+
+def test_a_soak_that_is_too_short_is_not_believed() -> None:
+    rows = [{"seconds": 30.0 * number, "API MiB": 100.0} for number in range(LEAST_SAMPLES)]
+    assert [each.flat for each in trends(rows, warm=0)] == [True]
+    with pytest.raises(AssertionError, match="tell nothing"):
+        trends(rows, warm=60)
