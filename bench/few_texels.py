@@ -112,7 +112,7 @@ class Curve:
 
 
 CURVES: Final = (
-    Curve("keep", 1, "best texels by target saliency (keep)"),
+    Curve("keep", 1, "best texels, found by trying (keep)"),
     Curve("tau", -1, "the paper's masks (tau)"),
 )
 

@@ -29,7 +29,7 @@ BLACK: Final = ("mobilenet_v1", "mobilenet_v3_large_min")
 """Those that give gradients, and those that only judge."""
 
 TOGETHER: Final = " + "
-SETTINGS: Final = ("epsilon", "steps", "pool", "held_out")
+SETTINGS: Final = ("epsilon", "steps", "pool", "held_out", "diverse")
 
 
 class Row(BaseModel):
@@ -43,6 +43,7 @@ class Row(BaseModel):
     steps: int
     pool: int
     held_out: int
+    diverse: bool
     seed: int
     judge: str
     a_before: float
@@ -85,6 +86,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--pool", type=int, default=120)
     parser.add_argument("--held-out", type=int, default=60)
+    parser.add_argument("--diverse", action="store_true", help="show images at random places, win by all one can")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--csv", type=Path, metavar="FILE", help="read if it is there, and written job by job")
     return parser.parse_args()

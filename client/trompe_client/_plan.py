@@ -78,6 +78,7 @@ class Upload:
 class JobOptions(TypedDict, total=False):
     """Options of a job; those left out take ``JobRequest``'s defaults, where they are explained."""
 
+    diverse: bool
     attack_on: AttackOn
     sun: SunRanges | Mapping[str, Any]
     vertex_budget: float

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, partial
+from typing import Final
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from trompe_server.attack import (
     Step,
     TexelMasks,
     attack,
-    best_texels,
+    few_texels,
     image_gradients,
     movable,
     rank_texels,
@@ -36,6 +37,7 @@ from trompe_server.beyond_job import LightJob, VertexJob
 from trompe_server.calibration_files import calibration_key, pack_calibration, unpack_calibration
 from trompe_server.classifiers.metered import meter_network
 from trompe_server.classifiers.network import NetworkClassifier
+from trompe_server.classifiers.protocol import innermost
 from trompe_server.library import Library
 from trompe_server.meter import Meter
 from trompe_server.phased_job import CHUNK, PROBE_STREAM, Image8, PhasedJob
@@ -51,6 +53,9 @@ from trompe_shared.object3d import encode_png
 __all__ = ["AttackJob", "open_pipeline"]
 
 logger = logging.getLogger(__name__)
+
+FEW: Final = "few_texels"
+"""The file that says which texels ``keep`` chose: one mask for each texture, in their order."""
 
 
 def open_pipeline(
@@ -68,7 +73,8 @@ def open_pipeline(
     """
     scene = open_scene(spec, library=library, target=target, device=device)
     if meter is not None:
-        for each in {id(each): each for each in (*scene.members, scene.classifier, *scene.judges)}.values():
+        everything = map(innermost, (*scene.members, scene.classifier, *scene.judges))
+        for each in {id(each): each for each in everything}.values():
             if isinstance(each, NetworkClassifier):
                 meter_network(each.network, meter)
     if spec.attack_on == "light":
@@ -152,6 +158,8 @@ class AttackJob(PhasedJob):
 
     def _attack(self, chunk: int, on_progress: OnProgress) -> PhaseReport:
         before = self.files.load_state(chunk, step=chunk * CHUNK) if chunk else start(self._textures)
+        if self.spec.keep is not None and not chunk:
+            self._choose(self.spec.keep, on_progress)
         steps = min(CHUNK, self.spec.steps - before.step)
         last, taken, asked = (
             self._progress("attack", (before.step + steps) / self.spec.steps),
@@ -190,7 +198,7 @@ class AttackJob(PhasedJob):
             state,
             self._textures,
             self._surrogate,
-            scene.members,
+            scene.shown,
             goal=scene.goal,
             budget=self.budget,
             steps=steps,
@@ -277,9 +285,26 @@ class AttackJob(PhasedJob):
     def _movable(self) -> TexelMasks:
         within = list(self.scene.within)
         if self.spec.keep is not None:
-            gradients = image_gradients(self.files.load(VIEWS_BEFORE)["own"], self.scene.members, goal=self.scene.goal)
-            within.append(best_texels(rank_texels(self._surrogate, self._textures, gradients), self.spec.keep))
+            known = self.files.load(FEW)
+            within.append({name: torch.from_numpy(known[str(k)]) for k, name in enumerate(self._textures)})
         return movable(self._surrogate, self.budget, self._masks, within=within)
+
+    def _choose(self, keep: float, on_progress: OnProgress) -> None:
+        """Find the share ``keep`` of all texels, once for all steps."""
+        scene = self.scene
+        gradients = image_gradients(self.files.load(VIEWS_BEFORE)["own"], scene.members, goal=scene.goal)
+        few = few_texels(
+            *(keep, self._textures, self._surrogate, scene.shown, gradients),
+            goal=scene.goal,
+            budget=self.budget,
+            within=scene.within,
+            masks=self._masks,
+            views_per_step=self.spec.n_views_per_step,
+            backgrounds=self._backgrounds,
+            seed=self.spec.seed,
+            on_step=lambda _: on_progress(self._progress("attack", 0.0)),
+        )
+        self.files.save(FEW, **{str(k): few[name].cpu().numpy() for k, name in enumerate(self._textures)})
 
 
 def _numpy(scores: Mapping[str, torch.Tensor]) -> dict[str, NDArray[np.float32]]:

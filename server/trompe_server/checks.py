@@ -9,7 +9,7 @@ from typing import Protocol
 from trompe_shared.api import JobSpec
 from trompe_shared.errors import ClassifierError, SpecError
 
-__all__ = ["Classes", "check_mask_size", "check_saliency", "check_same_classes", "check_vertices"]
+__all__ = ["Classes", "check_diverse", "check_mask_size", "check_saliency", "check_same_classes", "check_vertices"]
 
 
 class Classes(Protocol):
@@ -29,6 +29,15 @@ def check_saliency(spec: JobSpec, classifier: str) -> None:
     """Refuse options that need saliency for a classifier (its name) that gives no gradients."""
     if spec.tau is not None or spec.keep is not None:
         raise SpecError(f"tau and keep need saliency, and {classifier!r} gives no gradients: leave them out.")
+
+
+def check_diverse(spec: JobSpec, classifier: str) -> None:
+    """Refuse to show images at random places to a classifier (its name) that gives no gradients."""
+    if spec.diverse:
+        raise SpecError(
+            f"diverse needs gradients, and {classifier!r} gives none: leave it out, or attack a .pt2 file and name "
+            "this one as a judge."
+        )
 
 
 def check_vertices(spec: JobSpec, classifier: str) -> None:

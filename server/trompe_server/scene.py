@@ -18,9 +18,11 @@ from trompe_server.attack import (
     material_texels,
     painted_texels,
 )
-from trompe_server.checks import check_saliency, check_vertices
+from trompe_server.attack.goal import SAFE_MARGIN
+from trompe_server.checks import check_diverse, check_saliency, check_vertices
 from trompe_server.classifiers import (
     Classifier,
+    DiverseClassifier,
     ScoreBasedClassifier,
     WhiteBoxClassifier,
     as_ensemble,
@@ -38,6 +40,9 @@ from trompe_shared.shipped import shipped_objects
 
 __all__ = ["Scene", "open_scene"]
 
+FAR: Final = 1000.0
+"""A safe margin that no view reaches: all are won by as much as possible."""
+
 SAILENV: Final = "sailenv"
 DEFAULT_ELEVATION: Final = (0.0, 50.0)
 LEAST_QUERIES: Final = 2
@@ -49,10 +54,11 @@ class Scene:
     """What a job works on.
 
     classifier: the first of those that are attacked, by which the result is judged. members: all of them, as the attack
-    needs them. goal: what they should say. within: masks of the texels that may change. views: what is attacked;
-    ``held_out`` ones are only judged. backdrops: the pictures that views name, (H, W, 3). original: the file that the
-    object came as, and its name; ``None`` where that is ``obj``. device: where torch computes. lights_tried_on: the
-    views by which an attack on the light looks for it; none of them is judged.
+    needs them; ``diversity``: the seed by which its steps show them images at random places, if at all. goal: what they
+    should say. within: masks of the texels that may change. views: what is attacked; ``held_out`` ones are only judged.
+    backdrops: the pictures that views name, (H, W, 3). original: the file that the object came as, and its name;
+    ``None`` where that is ``obj``. device: where torch computes. lights_tried_on: the views by which an attack on the
+    light looks for it; none of them is judged.
     """
 
     obj: Object3D
@@ -69,6 +75,7 @@ class Scene:
     original: tuple[bytes, str] | None = None
     device: str = "cpu"
     lights_tried_on: tuple[View, ...] = ()
+    diversity: int | None = None
 
     @property
     def label(self) -> int:
@@ -91,6 +98,13 @@ class Scene:
         for name, number in names.items():
             pictures[number] = self.backdrops[name] if isinstance(name, str) else name
         return Backgrounds(torch.from_numpy(pictures), own)
+
+    @property
+    def shown(self) -> tuple[WhiteBoxClassifier, ...]:
+        """What the steps of an attack show their images to: the members, at random places where that is asked for."""
+        if self.diversity is None:
+            return self.members
+        return tuple(DiverseClassifier(member, self.diversity) for member in self.members)
 
     @property
     def white_box(self) -> bool:
@@ -135,6 +149,7 @@ def open_scene(spec: JobSpec, *, library: Library, target: TargetRenderer, devic
         None if info.format == SAILENV else library.original(spec.object),
         device,
         drawn(spec.n_views_per_step, LIGHT_STREAM) if spec.attack_on == "light" else (),
+        spec.seed if spec.diverse else None,
     )
 
 
@@ -143,7 +158,7 @@ def _goal(spec: JobSpec, classifier: Classifier) -> Goal:
         return resolve_label(label, classifier.classes, classifier.n_classes)
 
     target = None if spec.target_label is None else index(spec.target_label)
-    goal = Goal(index(spec.label), target, spec.top_k, spec.loss)
+    goal = Goal(index(spec.label), target, spec.top_k, spec.loss, FAR if spec.diverse else SAFE_MARGIN)
     goal.check(classifier.n_classes)
     return goal
 
@@ -166,6 +181,7 @@ def _by_scores(spec: JobSpec, classifier: Classifier) -> WhiteBoxClassifier:
             "judge (--judge), or let gradients be estimated from scores (--queries 10)."
         )
     check_saliency(spec, classifier.name)
+    check_diverse(spec, classifier.name)
     behind = colour_of(spec.background[0]) if len(spec.background) == 1 else None
     background = None if behind is None else torch.tensor(behind)[:, None, None] / 255
     return score_based(classifier, seed=spec.seed, queries=queries, sigma=spec.epsilon, background=background)

@@ -170,7 +170,7 @@ VIEWS_PER_PLACE: Final = 12
 
 _TEXTURE_ONLY: Final = (
     *("epsilon", "tau", "keep", "materials", "masks", "epsilon_view", "loss", "optimiser", "restarts", "queries"),
-    "surrogate",
+    *("surrogate", "diverse"),
 )
 _OPTIONS_OF: Final[dict[str, tuple[str, ...]]] = {
     "texture": _TEXTURE_ONLY,
@@ -200,6 +200,11 @@ class JobSpec(_Schema):
         default_factory=list, description="classifiers that are attacked together with it, for transfer to others"
     )
     judges: list[str] = Field(default_factory=list, description="other classifiers that judge the result")
+    diverse: bool = Field(
+        False,
+        description="for transfer to other classifiers: show images scaled, shifted and mirrored at random, and win "
+        "each view by as much as possible. Never ends before all steps are taken",
+    )
     attack_on: AttackOn = Field(
         "texture",
         description="what may change: the object's texture, where its main light stands, or (slightly) its vertices",
@@ -216,7 +221,9 @@ class JobSpec(_Schema):
         None, description="saliency threshold; null attacks all texels"
     )
     keep: Annotated[float, Field(gt=0, le=1)] | None = Field(
-        None, description="attack only this share of the texels, those with the most saliency; null attacks all"
+        None,
+        description="attack only this share of the texels, those with which two short attacks get furthest; null "
+        "attacks all",
     )
     materials: list[str] = Field(default_factory=list, description="attack only these materials' textures")
     masks: dict[str, str] = Field(
@@ -239,7 +246,8 @@ class JobSpec(_Schema):
     surrogate: SurrogateModel = "auto"
     steps: Annotated[int, Field(ge=1, le=10_000)] = Field(
         90,
-        description="at most so many; the attack on a texture ends sooner where all views are safely won. "
+        description="at most so many; the attack on a texture ends sooner where all views are safely won, unless it is "
+        "diverse. "
         "Of light: places that are tried",
     )
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
@@ -536,7 +544,10 @@ class Result(_Schema):
     texture_variation: float | None = Field(
         None, description="mean |difference| of the change between neighbouring texels, [0, 1] units"
     )
-    evaluations: int | None = Field(None, description="images that the attack showed each classifier it attacked")
+    evaluations: int | None = Field(
+        None,
+        description="images that the attack showed each classifier it attacked; those by which keep chose do not count",
+    )
     queries: int | None = Field(None, description="scores asked of a classifier that gives no gradients")
     fidelity: dict[str, float] = Field(
         default_factory=dict, description="surrogate against target; see docs/glossary.md"

@@ -77,7 +77,7 @@ def test_every_option_reaches_the_job(server, tmp_path):
     options = """--epsilon .1 --alpha .02 --tau .2 --surrogate curve --steps 9 --seed 4 --distance 2 --elevation -5 30
         --background #112233 --background black --classifier tiny --label 7 --judge torchvision:vgg16 --judge net
         --keep .3 --material clay --material glaze --epsilon-view .04 --target 2 --loss dlr --optimiser adam
-        --restarts 3 --queries 8 --pool 50 --range roll -10 10 --range ambient 0.2 0.6 --held-out 12"""
+        --restarts 3 --queries 8 --pool 50 --range roll -10 10 --range ambient 0.2 0.6 --held-out 12 --diverse"""
     words = [*options.split(), "--ensemble", member, "--ensemble", "hub:owner/nets.pt", "--mask", f"a.png={mask}"]
     done = trompe("attack", "mug", *words, "--server", server.url, "--out", tmp_path)
     assert done.exit_code == 0, done.output
@@ -108,6 +108,7 @@ def test_every_option_reaches_the_job(server, tmp_path):
         pool=50,
         ranges=ViewRanges(roll=(-10, 10), ambient=(0.2, 0.6)),
         held_out=12,
+        diverse=True,
     )
 
 

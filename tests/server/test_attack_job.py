@@ -19,7 +19,8 @@ from trompe_server.attack import Budget, Goal, attack, load_state, saliency_mask
 from trompe_server.attack_job import AttackJob, open_pipeline
 from trompe_server.errors import NotFoundError
 from trompe_server.library import Library
-from trompe_server.pipeline import PhaseReport
+from trompe_server.meter import Meter
+from trompe_server.pipeline import DamagedFileError, PhaseReport
 from trompe_server.scene import Scene, open_scene
 from trompe_server.surrogate import SamplingModel, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_server.target import BackdropTarget, FakeTarget, SailenvTarget, TargetRenderer
@@ -247,6 +248,54 @@ def test_an_attack_that_has_won_all_views_safely_takes_no_further_steps(
     taken = [progress.step for progress in once.progress if progress.step is not None]
     assert taken == list(range(1, result.steps + 1))
     assert anew.artifacts.lasting() == once.artifacts.lasting()
+
+
+@pytest.mark.parametrize("options", [{"diverse": True}, {"keep": 0.03}], ids=str)
+def test_options_of_the_search_change_the_texture_and_survive_restarts(
+    finished: Run, library: Library, options: dict[str, Any]
+) -> None:
+    spec = SPEC.model_copy(update=options)
+    once, anew = run(spec, library), run(spec, library, new=True)
+    assert anew.artifacts.lasting() == once.artifacts.lasting()
+    assert once.reports["judge"].state is JobState.succeeded
+    result, plain = once.artifacts.result(), finished.artifacts.result()
+    assert result.steps == plain.steps == 6
+    assert once.artifacts.files["adversarial.zip"] != finished.artifacts.files["adversarial.zip"]
+    assert result.texels_altered is not None
+    assert result.texels_altered <= options.get("keep", 1.0) + 1e-6
+    assert once.artifacts.files["saliency.npz"] == finished.artifacts.files["saliency.npz"]
+
+
+def test_few_texels_are_chosen_once_and_again_where_their_file_is_damaged(library: Library) -> None:
+    spec, artifacts = SPEC.model_copy(update={"keep": 0.03}), MemoryArtifacts()
+
+    def phase(name: str) -> None:
+        open_pipeline(spec, library=library, artifacts=artifacts, target=FakeTarget()).run(name, told.append)
+
+    told = list[Progress]()
+    phase("prepare")
+    phase("calibrate")
+    told.clear()
+    phase("attack-000")
+    assert [progress.step for progress in told] == [None] * 8 + [1, 2, 3, 4, 5]
+    chosen = artifacts.files["few_texels.npz"]
+    artifacts.files["few_texels.npz"] = chosen[:-40]
+    with pytest.raises(DamagedFileError, match="few_texels"):
+        phase("attack-001")
+    phase("attack-000")
+    assert artifacts.files["few_texels.npz"] == chosen
+
+
+def test_a_meter_sees_networks_behind_wrappers(library: Library) -> None:
+    meter = Meter()
+    spec = QUICK.model_copy(update={"diverse": True})
+    job = open_pipeline(spec, library=library, artifacts=MemoryArtifacts(), target=FakeTarget(), meter=meter)
+    for name in job.phases()[:-1]:
+        meter.take()
+        job.run(name, lambda _: None)
+    taken = meter.take()
+    assert taken["classifier_images"] == 2 * 4
+    assert taken["classifier_seconds"] > 0
 
 
 class Counting(FakeTarget):
@@ -571,7 +620,9 @@ class Liar(FakeTarget):
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"tau": 0.05}, {"keep": 0.2}, {"restarts": 1, "optimiser": "auto"}, {"pool": 12}], ids=str
+    "options",
+    [{}, {"tau": 0.05}, {"keep": 0.2}, {"diverse": True}, {"restarts": 1, "optimiser": "auto"}, {"pool": 12}],
+    ids=str,
 )
 def test_what_the_result_is_judged_on_cannot_influence_the_texture(library: Library, options: dict[str, Any]) -> None:
     spec = SPEC.model_copy(update=options)

@@ -614,6 +614,14 @@ def test_a_search_that_ends_early_can_be_cut_anywhere(square: Object3D, surrogat
     assert [step.step for step in seen] == list(range(len(seen)))
 
 
+def test_a_goal_whose_margin_is_out_of_reach_takes_all_steps_with_that(square: Object3D, surrogate: Surrogate) -> None:
+    seen: list[Step] = []
+    state = won_run(square, surrogate, steps=40, goal=Goal(LABEL, safe=1000.0), on_step=seen.append)
+    assert [step.step for step in seen] == list(range(40))
+    assert all(90 < step.loss < 110 and step.fooled == 1 for step in seen)
+    assert float(state.memory["search.safe"]) == 1000.0
+
+
 def test_a_method_that_compares_losses_keeps_to_one_margin(square: Object3D, surrogate: Surrogate) -> None:
     seen: list[Step] = []
     won_run(square, surrogate, steps=30, optimiser="auto", on_step=seen.append)

@@ -110,6 +110,8 @@ CLASSES = sorted({shipped.label for shipped in shipped_objects().values()})
         {"optimiser": "auto", "loss": "dlr"},
         {"loss": "cross_entropy", "top_k": 2},
         {"ensemble": ["tiny"]},
+        {"ensemble": ["tiny"], "diverse": True},
+        {"diverse": True, "restarts": 1},
     ],
     ids=str,
 )
@@ -184,6 +186,12 @@ def test_saliency_of_a_classifier_that_only_gives_scores_is_refused(
 ) -> None:
     with pytest.raises(SpecError, match="need saliency, and 'net' gives no gradients"):
         attacked(library, tmp_path / "job", classifier="net", queries=6, **options)
+
+
+@pytest.mark.usefixtures("opaque")
+def test_random_places_are_refused_for_a_classifier_that_only_gives_scores(library: Library, tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match="diverse needs gradients, and 'net' gives none"):
+        attacked(library, tmp_path / "job", classifier="net", queries=6, diverse=True)
 
 
 def test_an_ensemble_needs_gradients(library: Library, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -374,7 +374,7 @@ def test_vertices_are_not_moved_without_gradients(library: Library, monkeypatch:
     [
         *({"epsilon": 0.1}, {"alpha": 0.001}, {"tau": 0.1}, {"keep": 0.5}, {"materials": ["wood"]}),
         *({"masks": {"a.png": "b"}}, {"epsilon_view": 0.1}, {"loss": "dlr"}, {"optimiser": "pgd"}, {"restarts": 1}),
-        *({"queries": 2}, {"surrogate": "curve"}),
+        *({"queries": 2}, {"surrogate": "curve"}, {"diverse": True}),
     ],
     ids=lambda option: next(iter(option)),
 )

@@ -96,7 +96,7 @@ GRID: Final = ("azimuths", "elevations")
     help="Largest change of a pixel of a view, 0..1 (the paper's view constraint). Default: no limit.",
 )
 @_change("--tau", type=float, metavar="T", help="Saliency threshold, 0..1. Default: attack all texels.")
-@_change("--keep", type=float, metavar="SHARE", help="Attack this share of the texels, the most salient. Default: all.")
+@_change("--keep", type=float, metavar="SHARE", help="Attack this share of the texels, the best ones. Default: all.")
 @_change(
     "--material", "materials", multiple=True, metavar="NAME", help="Attack this material only. Default: all of them. *"
 )
@@ -135,6 +135,12 @@ GRID: Final = ("azimuths", "elevations")
     type=int,
     metavar="N",
     help=f"Further runs, which share the steps. Default: {_default('restarts')}.",
+)
+@_search(
+    "--diverse",
+    is_flag=True,
+    help="For transfer to other classifiers: show images scaled, shifted and mirrored, and win by as much as possible; "
+    "takes all steps.",
 )
 @_search(
     "--queries",

@@ -3,7 +3,7 @@
 import re
 from typing import TypeVar
 
-from trompe_server.checks import check_mask_size, check_saliency, check_same_classes, check_vertices
+from trompe_server.checks import check_diverse, check_mask_size, check_saliency, check_same_classes, check_vertices
 from trompe_server.labels import resolve_label
 from trompe_server.library import Library
 from trompe_shared.api import ClassifierInfo, JobSpec, ObjectInfo
@@ -67,6 +67,7 @@ def _check_gradients(spec: JobSpec, classifier: ClassifierInfo) -> None:
             "its scores (queries=10 asks it about ten images for each gradient)."
         )
     check_saliency(spec, classifier.name)
+    check_diverse(spec, classifier.name)
 
 
 def _check_materials(spec: JobSpec, obj: ObjectInfo) -> None:

@@ -4,9 +4,10 @@ A run begins at the unpainted textures or at random, and takes its share of the 
 that goes back and forth, the change with the highest loss over all of the attack's own views in the surrogate wins;
 nothing else is looked at.
 
-The margin from which a view counts as safely won is small at first, so that the gradient is that of the views still to
-be won. It rises with each step that finds nearly all of its views fooled, for what is won by more is won on unseen
-views too, and falls with each that does not. Where it has risen to the top, the search is over.
+The margin from which a view counts as safely won is the goal's at first. It is small by default, so that the gradient
+is that of the views still to be won. It rises with each step that finds nearly all of its views fooled, for what is won
+by more is won on unseen views too, and falls with each that does not. Where it has risen to the top, the search is
+over.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +20,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from trompe_server.attack.backgrounds import Backgrounds
-from trompe_server.attack.goal import SAFE_MARGIN
 from trompe_server.attack.objective import Look, Objective
 from trompe_server.attack.optimiser import OPTIMISERS, Box, OptimiserName, Pace, Point
 from trompe_server.attack.view_budget import ViewBudget
@@ -42,7 +42,7 @@ NEARLY_ALL: Final = 0.99
 """Share of a step's views that must be fooled for the safe margin to rise."""
 
 SAFE_ENOUGH: Final = 6.0
-"""The safe margin at which the search is over."""
+"""The safe margin at which the search is over. A goal whose own is larger takes all steps, with that."""
 
 WAKES, SHOWN, SAFE = "search.wakes", "search.shown", "search.safe"
 BEST, BEST_LOSS = "search.best", "search.best_loss"
@@ -111,7 +111,7 @@ class Search:
 
     def over(self, point: Point) -> bool:
         """Whether all is won so safely that there is nothing left to do."""
-        return self._safe(point) > SAFE_ENOUGH
+        return self._safe(point) > SAFE_ENOUGH > self.objective.goal.safe
 
     def begin(self, point: Point, step: int) -> Point:
         """The point that ``step`` starts from: a random one where it is the first of a run that begins so."""
@@ -139,14 +139,14 @@ class Search:
         return look, replace(point, memory={**point.memory, **known})
 
     def _safe(self, point: Point) -> float:
-        return float(point.memory.get(SAFE, SAFE_MARGIN))
+        return float(point.memory.get(SAFE, self.objective.goal.safe))
 
     def _safe_after(self, look: Look, point: Point) -> float:
-        """The safe margin after a look; other losses have none."""
-        if self.objective.goal.loss != "margin" or OPTIMISERS[self.optimiser].compares:
-            return SAFE_MARGIN
-        safe = self._safe(point)
-        return safe * RISE if look.fooled >= NEARLY_ALL else max(SAFE_MARGIN, safe / RISE)
+        """The safe margin after a look; other losses have none, and one out of reach from the start stays there."""
+        goal, safe = self.objective.goal, self._safe(point)
+        if goal.loss != "margin" or goal.safe > SAFE_ENOUGH or OPTIMISERS[self.optimiser].compares:
+            return goal.safe
+        return safe * RISE if look.fooled >= NEARLY_ALL else max(goal.safe, safe / RISE)
 
     def _asked(self, point: Point, step: int) -> Objective:
         """The objective with the safe margin, and the backgrounds, of a step."""

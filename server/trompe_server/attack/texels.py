@@ -16,7 +16,7 @@ from trompe_server.surrogate import Surrogate
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D
 
-__all__ = ["TexelMasks", "best_texels", "material_texels", "movable", "painted_texels", "rank_texels"]
+__all__ = ["TexelMasks", "best_texels", "collect", "material_texels", "movable", "painted_texels", "rank_texels"]
 
 TexelMasks = Mapping[str, Bool[Tensor, "H W"]]
 
@@ -95,10 +95,17 @@ def rank_texels(
 ) -> Mapping[str, Float[Tensor, "H W"]]:
     """How much each texel matters: what the ``maps`` of all views say of the pixels, accumulated where a texel shows.
 
-    A pixel's value goes to the texels that it reads, by weight and by how strongly the pixel answers to them. ``maps``
-    are saliencies, or ``image_gradients``: with their signs, so that a texel that views would pull to and fro counts
-    little. That is the better ranking.
+    ``maps`` are saliencies, or ``image_gradients``: with their signs, so that a texel that views would pull to and fro
+    counts little. That is the better ranking.
     """
+    return {name: pull.abs().sum(2) for name, pull in collect(surrogate, textures, maps).items()}
+
+
+def collect(
+    surrogate: Surrogate, textures: Textures, maps: Float[Tensor, "views H W"] | Float[Tensor, "views H W 3"]
+) -> Mapping[str, Float[Tensor, "H W 3"]]:
+    """What ``maps`` say of the pixels of all views, carried back: a pixel's value goes to the texels that it reads, by
+    weight and by how strongly the pixel answers to them."""
     leaves = {name: texture.clone().requires_grad_() for name, texture in textures.items()}
     texels = surrogate.texels(leaves)
     collected = texels.detach().requires_grad_()
@@ -107,8 +114,7 @@ def rank_texels(
         weights = maps[views.start : views.stop].to(images)
         weights = weights[:, None] if maps.ndim == 3 else weights.permute(0, 3, 1, 2)
         images.backward(weights.expand_as(images))  # type: ignore[no-untyped-call]
-    scores = torch.autograd.grad(texels, list(leaves.values()), collected.grad)
-    return {name: score.abs().sum(2) for name, score in zip(leaves, scores, strict=True)}
+    return dict(zip(leaves, torch.autograd.grad(texels, list(leaves.values()), collected.grad), strict=True))
 
 
 def best_texels(scores: Mapping[str, Float[Tensor, "H W"]], keep: float) -> TexelMasks:

@@ -1,5 +1,6 @@
 """Image classifiers: those that give gradients, those that only judge, and what makes the latter attackable too."""
 
+from trompe_server.classifiers.diverse import DiverseClassifier
 from trompe_server.classifiers.ensemble import as_ensemble, resized
 from trompe_server.classifiers.fake import fake_classifier
 from trompe_server.classifiers.network import NetworkClassifier
@@ -9,6 +10,7 @@ from trompe_server.classifiers.score_based import ScoreBasedClassifier, score_ba
 
 __all__ = [
     "Classifier",
+    "DiverseClassifier",
     "NetworkClassifier",
     "ScoreBasedClassifier",
     "ScoringClassifier",

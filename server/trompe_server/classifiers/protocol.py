@@ -20,6 +20,7 @@ __all__ = [
     "check_classes",
     "fit_images",
     "in_batches",
+    "innermost",
     "refuse_probabilities",
     "resize",
 ]
@@ -142,3 +143,10 @@ class Wrapper:
     def predict(self, images: Images) -> Logits:
         """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size, resized once, to the inner size."""
         return self.inner.predict(images)
+
+
+def innermost(classifier: Classifier) -> Classifier:
+    """The classifier without its wrappers."""
+    while isinstance(classifier, Wrapper):
+        classifier = classifier.inner
+    return classifier

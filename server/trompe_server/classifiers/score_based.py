@@ -10,7 +10,6 @@ where to go than one at the image itself, and is not drowned by the kinks of a n
 """
 
 from dataclasses import dataclass, field
-from hashlib import blake2b
 from typing import Any
 
 import torch
@@ -20,6 +19,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from trompe_server.classifiers.drawing import generator_for
 from trompe_server.classifiers.protocol import Classifier, ScoringClassifier, Wrapper
 from trompe_shared.errors import ClassifierError, SpecError
 
@@ -70,7 +70,7 @@ class ScoreBasedClassifier(Wrapper):
 
     def _patterns(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "pairs 3 H W"]:
         """Smooth noise on the object's pixels, drawn by the seed and the image's own bits."""
-        generator = torch.Generator().manual_seed(_digest(image, self.seed))
+        generator = generator_for(image, self.seed)
         height, width = (min(self.cells, side) for side in image.shape[1:])
         coarse = torch.randn((self.queries_per_gradient // 2, 3, height, width), generator=generator)
         smooth = F.interpolate(coarse, image.shape[1:], mode="bilinear").to(image)
@@ -101,12 +101,6 @@ class _Asked(Function):
 def _differs(image: Float[Tensor, "3 H W"], background: Float[Tensor, "3 #H #W"]) -> Bool[Tensor, "H W"]:
     """Where the image shows something else than the background, by more than what resizing leaves of rounding."""
     return (image - background).abs().amax(0) > 0.25 / 255
-
-
-def _digest(image: Tensor, seed: int) -> int:
-    """63 bits that depend on every bit of the image and on the seed."""
-    key = seed.to_bytes(8, "little", signed=True)
-    return int.from_bytes(blake2b(image.cpu().numpy().tobytes(), digest_size=8, key=key).digest(), "little") >> 1
 
 
 def score_based(

@@ -83,6 +83,7 @@ def test_a_light_is_looked_for_with_a_classifier_without_gradients(stocked):
         pytest.param({"classifier": "judge"}, 422, "gives no gradients", id="black box"),
         pytest.param({"classifier": "judge", "queries": 4, "tau": 0.1}, 422, "need saliency", id="its tau"),
         pytest.param({"classifier": "judge", "queries": 4, "keep": 0.1}, 422, "need saliency", id="its saliency"),
+        pytest.param({"classifier": "judge", "queries": 4, "diverse": True}, 422, "diverse needs", id="its places"),
         pytest.param({"classifier": "judge", "attack_on": "vertices"}, 422, "along gradients", id="its vertices"),
         pytest.param({"attack_on": "light", "tau": 0.1}, 422, "tau belong to another kind", id="texels of a light"),
         pytest.param({"ensemble": ["judge"]}, 422, "not in the ensemble", id="black box in the ensemble"),
