@@ -392,8 +392,9 @@ def test_a_document_says_what_is_not_measured_yet_and_refuses_figures_that_do_no
         fill(document)
 
 
-def test_the_projects_own_document_is_in_step_with_its_data() -> None:
-    assert out_of_step(Path(__file__).parents[2] / "docs" / "experiments.md") == []
+@pytest.mark.parametrize("document", ["README.md", "docs/experiments.md"])
+def test_the_projects_own_documents_are_in_step_with_their_data(document: str) -> None:
+    assert out_of_step(Path(__file__).parents[2] / document) == []
 
 
 def test_an_experiment_without_rows_is_told(tmp_path: Path) -> None:
