@@ -20,6 +20,7 @@ from trompe_server.attack.metrics import (
     max_view_change,
     mean_texel_change,
     predicted_classes,
+    reach_warning,
     share_beyond,
     softmax,
     texels_altered,
@@ -62,6 +63,9 @@ POOR_VIEW: Final = 3.0 / 255
 NAMED_VIEWS: Final = 5
 LARGE_GAP: Final = 0.1
 """A transfer gap that is told."""
+
+MORE_VIEWS: Final = 240
+"""A pool that reaches unseen views, for most objects."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +158,7 @@ def _plain(name: str) -> str:
 
 def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
     spec, scene = evidence.spec, evidence.scene
-    target = _accuracy(evidence, "own")
+    target, held_out = _accuracy(evidence, "own"), _accuracy(evidence, "held_out") if scene.held_out else None
     surrogate = _surrogate_accuracy(evidence)
     painted, after = evidence.repainted, evidence.logits_after or {}
     budget = {} if spec.attack_on == "texture" else {"epsilon": 0.0, "alpha": 0.0}
@@ -170,7 +174,7 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
         image_size=scene.size,
         surrogate=surrogate,
         target=target,
-        held_out=_accuracy(evidence, "held_out") if scene.held_out else None,
+        held_out=held_out,
         transfer_gap=transfer_gap(surrogate, target),
         judges=[_judgement(judge, evidence) for judge in scene.judges],
         **(_calibration_fields(evidence) if evidence.beyond is None else evidence.beyond.figures),
@@ -180,7 +184,7 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
         goal_reached=_goal_reached(evidence),
         evaluations=evidence.spent.evaluations,
         queries=evidence.spent.queries,
-        warnings=[*warnings, *_warnings(evidence, target, surrogate)],
+        warnings=[*warnings, *_warnings(evidence, target, held_out, surrogate)],
         seconds={name: round(seconds, 3) for name, seconds in evidence.seconds.items()},
         versions={name: version(name) for name in ("trompe", "torch", "numpy", "pyrender", "onnxruntime")},
         views=view_predictions(scene.views, evidence.logits_before["own"], after.get("own"), scene.label),
@@ -264,7 +268,7 @@ def _view_changes(evidence: Evidence) -> dict[str, Any]:
     return changes | ({} if seen is None else asdict(seen))
 
 
-def _warnings(evidence: Evidence, target: Accuracy, surrogate: Accuracy | None) -> list[str]:
+def _warnings(evidence: Evidence, target: Accuracy, held_out: Accuracy | None, surrogate: Accuracy | None) -> list[str]:
     found = [warning] if target.a_before > 0 and (warning := drop_warning(target)) else []
     calibration = evidence.calibration
     if calibration is not None and calibration.model != "diffuse" and not calibration.fidelity.good_enough:
@@ -274,7 +278,25 @@ def _warnings(evidence: Evidence, target: Accuracy, surrogate: Accuracy | None) 
             f"(at most {MAX_ERROR * 255:.1f}), "
             f"{mean['explained']:.0%} of a random repaint's effect explained (at least {MIN_EXPLAINED:.0%})."
         )
-    return found + _promises(evidence, target, surrogate) + _poor_views(evidence)
+    found += _promises(evidence, target, surrogate)
+    if evidence.after is not None:
+        found += _reach(evidence.spec, target, held_out)
+    return found + _poor_views(evidence)
+
+
+def _reach(spec: JobSpec, target: Accuracy, held_out: Accuracy | None) -> list[str]:
+    """What to know of an attack that fooled few views, or few but its own."""
+    more = "--views-per-step" if spec.attack_on == "light" else f"--pool {max(MORE_VIEWS, 2 * spec.n_views)}"
+    wider = f"Attack more views ({more}, and more --steps)."
+    warning = reach_warning(target, held_out, stronger=_REMEDIES[spec.attack_on], wider=wider)
+    return [warning] if warning else []
+
+
+_REMEDIES: Final[Mapping[str, str]] = {
+    "texture": "Try a larger --epsilon or more --steps, or let more texels change (a smaller --tau, a larger --keep).",
+    "light": "Try wider ranges (--sun) or more places (--steps).",
+    "vertices": "Try a larger --vertex-budget or more --steps.",
+}
 
 
 def _promises(evidence: Evidence, target: Accuracy, surrogate: Accuracy | None) -> list[str]:

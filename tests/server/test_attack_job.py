@@ -575,9 +575,19 @@ class PatchyTarget(FakeTarget):
 
 def test_views_on_which_the_surrogate_is_far_off_are_named(library: Library) -> None:
     spec = SPEC.model_copy(update={"steps": 1})
-    (warning,) = [w for w in run(spec, library, target=PatchyTarget()).artifacts.result().warnings if "views" in w]
+    warnings = run(spec, library, target=PatchyTarget()).artifacts.result().warnings
+    (warning,) = [found for found in warnings if "off by more" in found]
     view = open_scene(spec, library=library, target=FakeTarget()).views[1].camera
     assert f"1 (azimuth {view.azimuth:.0f}, elevation {view.elevation:.0f})" in warning
+
+
+def test_an_attack_that_came_to_little_says_so_and_what_to_try(library: Library) -> None:
+    spec = SPEC.model_copy(update={"epsilon": 1 / 255, "alpha": 1 / 255, "steps": 1})
+    result = run(spec, library).artifacts.result()
+    assert result.target.a_drop == 0
+    assert [
+        warning for warning in result.warnings if "came to little: A_drop 0.00" in warning and "--epsilon" in warning
+    ]
 
 
 def test_views_draw_their_backgrounds_from_several(tmp_path: Path, photo: Image8) -> None:

@@ -17,6 +17,7 @@ from trompe_server.attack.metrics import (
     max_view_change,
     mean_texel_change,
     predicted_classes,
+    reach_warning,
     share_beyond,
     softmax,
     texels_altered,
@@ -294,3 +295,31 @@ def test_a_change_of_epsilon_itself_is_not_beyond_it(level: int) -> None:
     pixels = np.ones((1, 1, 1), bool)
     assert share_beyond(before, after, pixels, epsilon=level / 255) == (0.0, 0.0)
     assert share_beyond(before, after, pixels, epsilon=(level - 0.01) / 255) == (1.0, 1.0)
+
+
+def share(before: int, after: int) -> Accuracy:
+    """Of ten views."""
+    return judged([(k < before, k < after) for k in range(10)])
+
+
+@pytest.mark.parametrize(
+    ("own", "held_out", "words"),
+    [
+        pytest.param((10, 8), (10, 10), "came to little: A_drop 0.20 on its own views. stronger", id="little"),
+        pytest.param((10, 0), (10, 3), "A_drop 1.00 on the attack's own, 0.70 on held-out ones. wider", id="own alone"),
+    ],
+)
+def test_an_attack_that_reaches_few_views_is_told(own: tuple[int, int], held_out: tuple[int, int], words: str) -> None:
+    found = reach_warning(share(*own), share(*held_out), stronger="stronger", wider="wider")
+    assert found is not None
+    assert words in found
+
+
+@pytest.mark.parametrize(
+    ("own", "held_out"), [((10, 0), (10, 2)), ((10, 7), (10, 6)), ((0, 0), (10, 10)), ((9, 0), None)]
+)
+def test_an_attack_that_reaches_its_views_and_others_is_not_warned_of(
+    own: tuple[int, int], held_out: tuple[int, int] | None
+) -> None:
+    others = share(*held_out) if held_out else None
+    assert reach_warning(share(*own), others, stronger="stronger", wider="wider") is None

@@ -22,6 +22,7 @@ __all__ = [
     "max_view_change",
     "mean_texel_change",
     "predicted_classes",
+    "reach_warning",
     "share_beyond",
     "softmax",
     "texels_altered",
@@ -41,6 +42,12 @@ Z: Final = NormalDist().inv_cdf(0.975)
 RESAMPLES: Final = 4000
 FEW_RECOGNISED: Final = 0.3
 """An ``a_before`` below this is worth a warning: few views are left for ``a_drop`` to rest on."""
+
+LITTLE: Final = 0.3
+"""An ``a_drop`` below this is worth one too."""
+
+LARGE_LOSS: Final = 0.2
+"""So is an ``a_drop`` of held-out views that is less than the own views' by more than this."""
 
 
 def softmax(logits: Logits) -> NDArray[np.float64]:
@@ -118,6 +125,19 @@ def drop_warning(found: Accuracy) -> str | None:
     return (
         f"Only {found.a_before:.0%} of the views were recognised before the attack: "
         f"A_drop rests on {recognised} of {found.views} views."
+    )
+
+
+def reach_warning(target: Accuracy, held_out: Accuracy | None, *, stronger: str, wider: str) -> str | None:
+    """What a reader must know of an attack that fooled few views (and ``stronger`` says what to do), or few but its own
+    (``wider`` does)."""
+    own, other = target.a_drop, held_out.a_drop if held_out else None
+    if own is not None and own < LITTLE:
+        return f"The attack came to little: A_drop {own:.2f} on its own views. {stronger}"
+    if own is None or other is None or own - other <= LARGE_LOSS:
+        return None
+    return (
+        f"It holds less from other views: A_drop {own:.2f} on the attack's own, {other:.2f} on held-out ones. {wider}"
     )
 
 
