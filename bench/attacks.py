@@ -1,7 +1,7 @@
 """Whole attacks on the paper's objects: surrogate and target before and after, by epsilon, colour model, tau and seed.
 
-TROMPE_ASSETS=... python -m bench.attacks --csv docs/bench/attacks.csv
-                  python -m bench.attacks --plain --objects all --epsilon 0.05 0.02 --csv docs/bench/attacks_grid.csv
+TROMPE_ASSETS=... python -m bench.attacks [--csv FILE]
+                  python -m bench.attacks --plain --objects all --epsilon 0.05 0.02
                   python -m bench.attacks --plain --objects all --pool 480 --held-out 200 --mixed
 """
 
