@@ -77,7 +77,7 @@ def behaviours(rows: Sequence[ResultRow]) -> list[Behaviour]:
 
 def _behaviour(case: str, rows: Sequence[ResultRow]) -> Behaviour:
     said = [words for row in rows for words in (*row.warnings.split(" | "), row.error) if words]
-    often = sorted(set(said), key=lambda words: -said.count(words))
+    often = sorted(dict.fromkeys(said), key=lambda words: -said.count(words))  # ties as they came
     return Behaviour(
         case,
         len(rows),
