@@ -14,6 +14,7 @@ from pathlib import Path
 
 from bench._common import running_renderer
 from bench._jobs import Paper
+from trompe_server.experiments.groups import figure_words
 from trompe_shared.api import Accuracy, Result
 
 OBJECTS = ("toilet_paper", "lamp_floor", "remote_controller", "plunger")
@@ -81,25 +82,21 @@ def _options() -> argparse.Namespace:
 
 def _row(name: str, result: Result, seconds: float) -> list[str]:
     own, held_out = result.target, result.held_out
-    pairs = [_number(value) for views in (result.surrogate, own, held_out) for value in _pair(views)]
+    pairs = [figure_words(value) for views in (result.surrogate, own, held_out) for value in _pair(views)]
     head = [name, result.surrogate_model, str(result.tau or "-"), f"{result.epsilon:g}", str(result.steps)]
     phases = [f"{result.seconds.get(phase, 0.0):.1f}" for phase in ("prepare", "calibrate", "attack", "judge")]
     return [
         *head,
         *(str(result.seed), str(result.probe_renders)),
-        *(*pairs[:4], _number(own.a_drop)),
-        *(*pairs[4:], _number(held_out.a_drop if held_out else None)),
-        *(_number(value, 3) for value in (result.texels_altered, result.ssim, result.delta_e)),
+        *(*pairs[:4], figure_words(own.a_drop)),
+        *(*pairs[4:], figure_words(held_out.a_drop if held_out else None)),
+        *(figure_words(value, 3) for value in (result.texels_altered, result.ssim, result.delta_e)),
         *(str(result.evaluations or 0), *phases, f"{seconds:.1f}"),
     ]
 
 
 def _pair(accuracy: Accuracy | None) -> tuple[float | None, float | None]:
     return (None, None) if accuracy is None else (accuracy.a_before, accuracy.a_after)
-
-
-def _number(value: float | None, digits: int = 2) -> str:
-    return "n.a." if value is None else f"{value:.{digits}f}"
 
 
 if __name__ == "__main__":

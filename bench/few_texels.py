@@ -25,6 +25,7 @@ from pydantic import BaseModel, ConfigDict
 
 from bench._common import markdown_table, running_renderer
 from bench._jobs import Paper, Rows
+from trompe_server.experiments.groups import average, figure_words
 from trompe_server.target import SailenvTarget
 from trompe_shared.errors import SpecError
 
@@ -181,7 +182,7 @@ def _run(paper: Paper, target: SailenvTarget, key: dict[str, Any]) -> Row:
         seconds=round(time.perf_counter() - started, 1),
     )
     print(
-        f"{row.object}, {row.way} {row.setting:g}, seed {row.seed}: N {row.n:.2%}, A_drop {_two(row.a_drop)}",
+        f"{row.object}, {row.way} {row.setting:g}, seed {row.seed}: N {row.n:.2%}, A_drop {figure_words(row.a_drop)}",
         flush=True,
     )
     return row
@@ -198,7 +199,7 @@ def summary(rows: Sequence[Row]) -> str:
         lines.append(
             [
                 name,
-                _two(fmean(before)) if before else "n.a.",
+                figure_words(average(before)),
                 *(f"{share:.2%}" if share is not None else _best(mine, way) for way, share in fewest.items()),
                 f"{theirs / ours:.1f}" if ours and theirs else "-",
             ]
@@ -216,10 +217,6 @@ def _best(rows: Sequence[Row], way: Way) -> str:
     """What is said where no setting was enough."""
     drops = [row.a_drop for row in rows if row.way == way and row.a_drop is not None]
     return f"not reached (at most {max(drops):.2f})" if drops else "n.a."
-
-
-def _two(value: float | None) -> str:
-    return "n.a." if value is None else f"{value:.2f}"
 
 
 def _rounded(setting: float) -> float:

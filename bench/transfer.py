@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict
 from bench._common import markdown_table, running_renderer
 from bench._jobs import Paper, Rows
 from trompe_server.attack.metrics import FEW_RECOGNISED
+from trompe_server.experiments.groups import figure_words
 from trompe_server.reports import TransferMatrix
 from trompe_server.target import SailenvTarget
 from trompe_shared.api import Accuracy, Result
@@ -116,7 +117,7 @@ def _judged(paper: Paper, target: SailenvTarget, table: Rows[Row], key: dict[str
     ]
     known = {row.judge for row in found}
     rows = [table.add(row) for row in fresh if row.judge not in known] + found
-    said = ", ".join(f"{row.judge} {_two(row.held_out_a_drop)}" for row in rows)
+    said = ", ".join(f"{row.judge} {figure_words(row.held_out_a_drop)}" for row in rows)
     print(f"{key['object']}, seed {key['seed']}, {key['attacked']}: {said}", flush=True)
     return rows
 
@@ -165,7 +166,7 @@ def left_out(rows: Sequence[Row], views: str) -> str:
     if figures:
         figures["mean"] = [fmean(column) for column in zip(*figures.values(), strict=True)]
     head = ["victim", "singles without it, mean", "best single", "ensemble without it", "ensemble / singles"]
-    lines = [[victim, *map(_two, found), _ratio(found[2], found[0])] for victim, found in figures.items()]
+    lines = [[victim, *map(figure_words, found), _ratio(found[2], found[0])] for victim, found in figures.items()]
     return markdown_table(head, lines)
 
 
@@ -184,10 +185,6 @@ def _drops(rows: Sequence[Row], views: str, attacked: str, judge: str) -> list[f
 
 def _ratio(value: float, by: float) -> str:
     return f"{value / by:.1f}" if by > 0 else "-"
-
-
-def _two(value: float | None) -> str:
-    return "n.a." if value is None else f"{value:.2f}"
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ Pillow can read some 40 formats, some by starting other programs. A file is what
 import io
 import json
 import struct
-import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +22,7 @@ from trompe_server.target import SailenvTarget
 from trompe_server.target.sailenv import _picture
 from trompe_shared.errors import ObjectError, ProtocolError, RendererError, SpecError, TrompeError
 from trompe_shared.geometry import Camera, View
-from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files
+from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files, pack_zip
 from trompe_shared.opacity import opacity_of
 
 SIDE = 8
@@ -80,14 +79,6 @@ def archive(**pictures: bytes) -> dict[str, bytes]:
     return {"t.obj": OBJ, "t_mat_def.json": table} | {f"{name}.png": data for name, data in maps.items()}
 
 
-def zipped(files: dict[str, bytes]) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as out:
-        for name, data in files.items():
-            out.writestr(name, data)
-    return buffer.getvalue()
-
-
 def smuggled(**pictures: bytes) -> Object3D:
     """An object that was read while its files were good, as if somebody had exchanged them since."""
     return replace(object_from_files(archive()), files=archive(**pictures))
@@ -111,18 +102,18 @@ def from_gltf(data: bytes) -> None:
         "bufferViews": [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 24}],
         "buffers": [{"byteLength": len(triangle), "uri": "t.bin"}],
     }
-    read_object(zipped({"t.gltf": json.dumps(document).encode(), "t.bin": triangle, "t.png": data}), name="t.zip")
+    read_object(pack_zip({"t.gltf": json.dumps(document).encode(), "t.bin": triangle, "t.png": data}), name="t.zip")
 
 
 def from_mtl(data: bytes) -> None:
     files = {"t.obj": OBJ, "t.mtl": b"newmtl m\nmap_Kd albedo.png\n", "albedo.png": data}
-    read_object(zipped(files), name="t.zip")
+    read_object(pack_zip(files), name="t.zip")
 
 
 DOORS: dict[str, tuple[type[TrompeError], Callable[[bytes], object]]] = {
-    "an albedo map": (ObjectError, lambda data: load_object(zipped(archive(albedo=data)))),
-    "a normal map": (ObjectError, lambda data: load_object(zipped(archive(normal=data)))),
-    "a metallic map": (ObjectError, lambda data: load_object(zipped(archive(metallic=data)))),
+    "an albedo map": (ObjectError, lambda data: load_object(pack_zip(archive(albedo=data)))),
+    "a normal map": (ObjectError, lambda data: load_object(pack_zip(archive(normal=data)))),
+    "a metallic map": (ObjectError, lambda data: load_object(pack_zip(archive(metallic=data)))),
     "a texture of an MTL": (ObjectError, from_mtl),
     "a texture of a glTF": (ObjectError, from_gltf),
     "what alpha is read from": (ObjectError, opacity_of),

@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import json
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from memory_files import MemoryArtifacts
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -24,7 +24,7 @@ from trompe_server.pipeline import DamagedFileError, PhaseReport
 from trompe_server.scene import Scene, open_scene
 from trompe_server.surrogate import SamplingModel, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_server.target import BackdropTarget, FakeTarget, SailenvTarget, TargetRenderer
-from trompe_shared.api import ClassifierInfo, JobSpec, JobState, Progress, Result
+from trompe_shared.api import ClassifierInfo, JobSpec, JobState, Progress
 from trompe_shared.errors import ClassifierError, LabelError
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, encode_png, load_object
@@ -58,34 +58,6 @@ PICTURES = {
 MODELS = {"adversarial.zip", "adversarial.glb"}
 IMAGES = {"views_before.npz", "views_after.npz"}
 Image8 = NDArray[np.uint8]
-
-
-class MemoryArtifacts:
-    """A job's files in a dictionary."""
-
-    def __init__(self) -> None:
-        self.files: dict[str, bytes] = {}
-
-    def read(self, name: str) -> bytes:
-        if name not in self.files:
-            raise FileNotFoundError(name)
-        return self.files[name]
-
-    def write(self, name: str, data: bytes) -> None:
-        self.files[name] = data
-
-    def exists(self, name: str) -> bool:
-        return name in self.files
-
-    def result(self) -> Result:
-        return Result.model_validate_json(self.files["result.json"])
-
-    def lasting(self) -> dict[str, bytes]:
-        """All files, without what a clock wrote into them."""
-        untimed = {name: data for name, data in self.files.items() if not name.startswith("seconds-")}
-        result = json.loads(untimed.pop("result.json", b"{}"))
-        result.pop("seconds", None)
-        return untimed | {"result.json": json.dumps(result).encode()}
 
 
 class DarkTarget(FakeTarget):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
+from memory_files import MemoryArtifacts
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from trompe_server.array_files import unpack_arrays
 from trompe_server.attack.beyond import load_light
 from trompe_server.attack_job import open_pipeline
 from trompe_server.classifiers import load_classifier
@@ -21,7 +21,7 @@ from trompe_server.pages.present import JobRow, command, job_row, present
 from trompe_server.pipeline import VIEWS_AFTER, VIEWS_BEFORE, PhaseReport
 from trompe_server.scene import open_scene
 from trompe_server.target import FakeTarget, TargetRenderer
-from trompe_shared.api import Job, JobSpec, JobState, Progress, Result
+from trompe_shared.api import Job, JobSpec, JobState, Progress
 from trompe_shared.errors import SpecError
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, load_object
@@ -40,35 +40,6 @@ LIGHT = JobSpec.model_validate({**COMMON, "attack_on": "light", "steps": 12, "vi
 VERTICES = JobSpec.model_validate({**COMMON, "attack_on": "vertices", "steps": 7, "vertex_budget": 0.03})
 BOTH = pytest.mark.parametrize("spec", [LIGHT, VERTICES], ids=["light", "vertices"])
 Image8 = NDArray[np.uint8]
-
-
-class Files:
-    """A job's files in a dictionary."""
-
-    def __init__(self) -> None:
-        self.files: dict[str, bytes] = {}
-
-    def read(self, name: str) -> bytes:
-        if name not in self.files:
-            raise FileNotFoundError(name)
-        return self.files[name]
-
-    def write(self, name: str, data: bytes) -> None:
-        self.files[name] = data
-
-    def exists(self, name: str) -> bool:
-        return name in self.files
-
-    def result(self) -> Result:
-        return Result.model_validate_json(self.read("result.json"))
-
-    def images(self, name: str) -> dict[str, Image8]:
-        return unpack_arrays(self.read(f"{name}.npz"))
-
-    def lasting(self) -> dict[str, Any]:
-        """All files, without what a clock wrote into them."""
-        untimed = {name: data for name, data in self.files.items() if not name.startswith("seconds-")}
-        return untimed | {"result.json": self.result().model_copy(update={"seconds": {}})}
 
 
 class Noting:
@@ -100,7 +71,7 @@ class Whole:
     """A job that was run to its end."""
 
     def __init__(self, spec: JobSpec, library: Library, *, new: bool = False, times: int = 1) -> None:
-        self.files, self.progress = Files(), list[Progress]()
+        self.files, self.progress = MemoryArtifacts(), list[Progress]()
         self.reports, self.asked = dict[str, PhaseReport](), dict[str, list[View]]()
         target = Noting()
 
@@ -185,7 +156,7 @@ def test_no_view_that_is_judged_is_looked_at_by_the_search_for_a_light(light: Wh
 def test_what_the_target_shows_in_judged_views_cannot_influence_the_light(light: Whole, library: Library) -> None:
     scene = open_scene(LIGHT, library=library, target=FakeTarget())
     target = Noting({view.camera for view in (*scene.views, *scene.held_out)})
-    files = Files()
+    files = MemoryArtifacts()
     job = open_pipeline(LIGHT, library=library, artifacts=files, target=target)
     for phase in job.phases():
         if phase.startswith("attack"):

@@ -10,7 +10,6 @@ import os
 import random
 import shutil
 import time
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,7 +25,7 @@ from soak import LEAST_SAMPLES, Watch, soaking, summary, trend, trends
 from trompe_client import BadRequest, Client, JobCancelled
 from trompe_client._job import JobHandle
 from trompe_server.formats.gltf_write import write_glb
-from trompe_shared.object3d import load_object
+from trompe_shared.object3d import load_object, pack_zip
 from trompe_shared.shipped import ShippedObject, shipped_objects
 
 logger = logging.getLogger(__name__)
@@ -38,14 +37,6 @@ GRID = {"pool": 0, "azimuths": 3, "elevations": 2, "held_out": 4, "steps": 10}
 POOL = {"pool": 12, "views_per_step": 6, "held_out": 4, "steps": 10}
 
 
-def zipped(files: dict[str, bytes]) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return buffer.getvalue()
-
-
 def hostile_files() -> dict[str, bytes]:
     """What has to be refused, by file name."""
     picture = io.BytesIO()
@@ -53,10 +44,10 @@ def hostile_files() -> dict[str, bytes]:
     mesh = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
     table = b'{"m": {"albedo": "t.png"}}'
     return {
-        "bomb.zip": zipped({"t.obj": mesh, "t.bin": bytes(80 * 2**20)}),
-        "picture.zip": zipped({"t.obj": mesh, "t_mat_def.json": table, "t.png": picture.getvalue()}),
+        "bomb.zip": pack_zip({"t.obj": mesh, "t.bin": bytes(80 * 2**20)}),
+        "picture.zip": pack_zip({"t.obj": mesh, "t_mat_def.json": table, "t.png": picture.getvalue()}),
         "noise.glb": b"glTF" + random.Random(0).randbytes(100_000),
-        "path.zip": zipped({"t.obj": mesh, "../../t.png": b""}),
+        "path.zip": pack_zip({"t.obj": mesh, "../../t.png": b""}),
     }
 
 

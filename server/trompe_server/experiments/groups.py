@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from trompe_shared.experiment_table import ResultRow
 
-__all__ = ["average", "deviation", "grouped", "known", "tau_words"]
+__all__ = ["average", "deviation", "figure_words", "grouped", "known", "tau_words"]
 
 K = TypeVar("K", bound=Hashable)
 R = TypeVar("R")
@@ -34,6 +34,11 @@ def average(values: Iterable[float | None]) -> float | None:
 def deviation(values: Sequence[float]) -> float:
     """Their standard deviation; 0 for one."""
     return stdev(values) if len(values) > 1 else 0.0
+
+
+def figure_words(value: float | None, digits: int = 2) -> str:
+    """A figure as tables have it."""
+    return "n.a." if value is None else f"{value:.{digits}f}"
 
 
 def tau_words(tau: float | None) -> str:

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogFormatter
 
 from trompe_server.experiments.front import front_of
-from trompe_server.experiments.groups import average, deviation, grouped, known
+from trompe_server.experiments.groups import average, deviation, figure_words, grouped, known
 from trompe_server.experiments.style import GREY, INK, MARKERS, PALETTE, Drawing, drawing
 from trompe_shared.experiment_table import ResultRow
 
@@ -202,7 +202,7 @@ def pareto_markdown(rows: Sequence[ResultRow]) -> str:
         front = [words for words, names in fronts.items() if place in names]
         name = f"**{point.name}**" if front else point.name
         cells = [f"{point.cost:.3g}", f"{images[place]:.0f}" if place in images else "n.a."]
-        cells += [_gain(point), _cell(point.target), _cell(point.gap), ", ".join(front)]
+        cells += [_gain(point), figure_words(point.target), figure_words(point.gap), ", ".join(front)]
         lines.append(f"| {point.series} | {name} | {' | '.join(cells)} | {point.jobs} |")
     return _presets_markdown(by_time) + "\n".join(lines) + "\n"
 
@@ -239,7 +239,3 @@ def _against(other: Configuration, point: Configuration) -> str:
 
 def _gain(point: Configuration) -> str:
     return f"{point.gain:.2f} ± {point.spread:.2f}" if point.spread else f"{point.gain:.2f}"
-
-
-def _cell(value: float | None) -> str:
-    return "n.a." if value is None else f"{value:.2f}"

@@ -7,7 +7,7 @@ from typing import Any, Final
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from trompe_server.experiments.groups import average, deviation, grouped, known
+from trompe_server.experiments.groups import average, deviation, figure_words, grouped, known
 from trompe_server.experiments.style import BLUE, GREEN, GREY, INK, RED, Drawing, drawing
 from trompe_shared.experiment_table import ResultRow
 
@@ -178,6 +178,4 @@ def stability_markdown(rows: Sequence[ResultRow]) -> str:
 
 
 def _cell(value: float | None, interval: tuple[float, float] | None = None) -> str:
-    if value is None:
-        return "n.a."
-    return f"{value:.2f}" + (f" [{interval[0]:.2f}, {interval[1]:.2f}]" if interval else "")
+    return figure_words(value) + (f" [{interval[0]:.2f}, {interval[1]:.2f}]" if interval else "")

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from trompe_server.experiments.groups import average, grouped, tau_words
+from trompe_server.experiments.groups import average, figure_words, grouped, tau_words
 from trompe_server.experiments.style import GREY, MARKERS, PALETTE, Drawing, drawing
 from trompe_server.experiments.table_one import RECOGNISED
 from trompe_shared.experiment_table import ResultRow
@@ -58,7 +58,7 @@ def surrogates_markdown(rows: Sequence[ResultRow]) -> str:
         counting = [row for row in group if (row.target_a_before or 0) >= RECOGNISED]
         for object_, some in grouped(group, lambda row: row.object).items():
             before = average(row.target_a_before for row in some)
-            lines.append(_line(object_, "n.a." if before is None else f"{before:.2f}", some, names))
+            lines.append(_line(object_, figure_words(before), some, names))
         lines.append(_line(f"**mean** of those with A_before ≥ {RECOGNISED:g}", "", counting, names))
         parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"
@@ -70,13 +70,9 @@ def _line(title: str, before: str, rows: Sequence[ResultRow], names: Sequence[st
         mine = [row for row in rows if row.surrogate == name]
         promised, kept = average(row.surrogate_a_drop for row in mine), average(row.target_a_drop for row in mine)
         altered = average(row.texels_altered for row in mine)
-        cells += [_share(promised), f"**{_share(kept)}**", "n.a." if altered is None else f"{altered:.1%}"]
+        cells += [figure_words(promised), f"**{figure_words(kept)}**", "n.a." if altered is None else f"{altered:.1%}"]
     return "| " + " | ".join(cells) + " |"
 
 
 def _by_tau(rows: Sequence[ResultRow]) -> dict[float | None, list[ResultRow]]:
     return grouped(sorted(rows, key=lambda row: row.tau or -1.0), lambda row: row.tau)
-
-
-def _share(value: float | None) -> str:
-    return "n.a." if value is None else f"{value:.2f}"

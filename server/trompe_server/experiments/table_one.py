@@ -18,7 +18,7 @@ from typing import Final
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from trompe_server.experiments.groups import average, grouped
+from trompe_server.experiments.groups import average, figure_words, grouped
 from trompe_server.experiments.style import BLUE, GREEN, GREY, INK, Drawing, drawing
 from trompe_shared.experiment_table import ResultRow
 
@@ -138,7 +138,7 @@ def _markdown(cells: Sequence[Cell], *, with_paper: bool) -> str:
     lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * (len(head) - 1)]
     for object_, row in grouped(cells, lambda cell: cell.object).items():
         by_epsilon = {cell.epsilon: cell for cell in row}
-        figures = [_number(row[0].a_before)]
+        figures = [figure_words(row[0].a_before)]
         for epsilon in epsilons:
             figures += _figures(by_epsilon.get(epsilon), with_paper=epsilon in told)
         lines.append(f"| {object_} | " + " | ".join(figures) + " |")
@@ -150,9 +150,9 @@ def _markdown(cells: Sequence[Cell], *, with_paper: bool) -> str:
 def _figures(cell: Cell | None, *, with_paper: bool) -> list[str]:
     if cell is None:
         return [""] * (4 if with_paper else 2)
-    own = [_number(cell.surrogate), f"**{_number(cell.target)}**"]
+    own = [figure_words(cell.surrogate), f"**{figure_words(cell.target)}**"]
     theirs = (cell.paper.surrogate_a_drop, cell.paper.target_a_drop) if cell.paper else (None, None)
-    return own + ([_number(value) for value in theirs] if with_paper else [])
+    return own + ([figure_words(value) for value in theirs] if with_paper else [])
 
 
 def _means(cells: Sequence[Cell], epsilon: float, *, with_paper: bool) -> list[str]:
@@ -162,11 +162,7 @@ def _means(cells: Sequence[Cell], epsilon: float, *, with_paper: bool) -> list[s
     means = [average(cell.surrogate for cell in own), average(cell.target for cell in own)]
     if with_paper:
         means += [average(p.surrogate_a_drop for p in paper), average(p.target_a_drop for p in paper)]
-    return [f"**{_number(value)}**" for value in means]
-
-
-def _number(value: float | None) -> str:
-    return "n.a." if value is None else f"{value:.2f}"
+    return [f"**{figure_words(value)}**" for value in means]
 
 
 def table_one_chart(rows: Sequence[ResultRow]) -> Drawing:
