@@ -19,6 +19,7 @@ from trompe_server.experiments.commands import main
 from trompe_server.experiments.documents import fill, out_of_step
 from trompe_server.experiments.figures import FIGURES, Data, figures_of, histogram_rows, read_data
 from trompe_server.experiments.histograms import prediction_histograms
+from trompe_server.experiments.paper_means import paper_means_markdown
 from trompe_server.experiments.pareto import Configuration, configurations, pareto_front, pareto_markdown
 from trompe_server.experiments.parquet import write_parquet
 from trompe_server.experiments.report import write_report
@@ -269,6 +270,26 @@ def test_a_table_sets_surrogates_beside_each_other_by_tau_and_means_count_what_w
     assert surrogates_markdown(hardly).count("| n.a. | **n.a.** | n.a. | n.a. | **n.a.** | n.a. |") == 2
 
 
+def test_the_grid_at_a_glance_averages_what_was_recognised_and_sets_the_papers_means_beside_it() -> None:
+    rows = [
+        row(key="a", target_a_drop=1.0, texels_altered=0.5, transfer_gap=-0.02),
+        row(key="b", object="plunger", target_a_drop=0.5, texels_altered=0.3, transfer_gap=0.04),
+        row(key="c", object="toilet", target_a_before=0.1, target_a_drop=0.0, texels_altered=0.9, transfer_gap=0.9),
+        row(key="d", tau=0.2, target_a_drop=0.4, texels_altered=0.1, transfer_gap=0.0),
+        row(key="e", epsilon=0.02, target_a_drop=0.25, texels_altered=0.5, transfer_gap=None),
+        row(key="f", classifier="squeezenet1_1", target_a_drop=0.75, texels_altered=0.2, transfer_gap=0.0),
+    ]
+    head, _, *lines = paper_means_markdown(rows).splitlines()
+    assert head.endswith("| ε 0.02 | ε 0.05 | paper's |")
+    assert lines == [
+        "| mobilenet_v2 | all texels | 2 | 0.030 | **0.25** (50%) | **0.75** (40%) | 0.59 (27%) |",
+        "| mobilenet_v2 | saliency, τ 0.2 | 1 | 0.000 |  | **0.40** (10%) | 0.27 (5%) |",
+        "| squeezenet1_1 | all texels | 1 | 0.000 |  | **0.75** (20%) |  |",
+        "| inception_v3 | all texels |  |  |  |  | 0.31 (30%) |",
+        "| inception_v3 | saliency, τ 0.2 |  |  |  |  | 0.13 (5%) |",
+    ]
+
+
 def test_a_budget_that_the_paper_has_not_got_has_no_columns_of_the_paper() -> None:
     head, *_ = table_one_markdown([row(), row(epsilon=0.01)]).splitlines()[2:]
     columns = ["object", "A_before", "surrogate, ε 0.01", "target", "surrogate, ε 0.05", "target", "paper: surrogate"]
@@ -348,6 +369,14 @@ def test_the_stamp_does_not_depend_on_the_id_of_a_job() -> None:
     assert stamp_of([row(seconds=1)]) != stamp_of([row(seconds=2)])
 
 
+def test_a_column_that_came_after_a_file_was_written_does_not_change_its_stamp() -> None:
+    class Later(ResultRow):
+        gloss: float | None = None
+
+    assert stamp_of([Later.model_validate(ROW)]) == stamp_of([row()])
+    assert stamp_of([Later.model_validate(ROW | {"gloss": 0.5})]) != stamp_of([row()])
+
+
 def test_histograms_need_predictions() -> None:
     with pytest.raises(SpecError, match="no predictions of the target views"):
         prediction_histograms([row()], [])
@@ -411,3 +440,6 @@ def test_parquet_holds_the_same_numbers(tmp_path: Path) -> None:
     assert table.column("epsilon").to_pylist() == [each.epsilon for each in grid_rows()]
     assert table.column("tau").to_pylist() == [each.tau for each in grid_rows()]
     assert table.column("object").to_pylist()[0] == "candle"
+    assert table.column("diverse").to_pylist() == [None] * len(grid_rows())
+    write_table(folder / RESULTS, [row(diverse=True), row(diverse=False)])
+    assert parquet.read_table(write_parquet(folder)).column("diverse").to_pylist() == [True, False]

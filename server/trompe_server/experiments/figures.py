@@ -6,6 +6,7 @@ from pathlib import Path
 
 from trompe_server.experiments.groups import grouped
 from trompe_server.experiments.histograms import prediction_histograms
+from trompe_server.experiments.paper_means import paper_means_markdown
 from trompe_server.experiments.pareto import pareto_markdown, speed_accuracy_chart
 from trompe_server.experiments.scatter import texels_scatter
 from trompe_server.experiments.stability_chart import stability_chart, stability_markdown
@@ -90,6 +91,7 @@ FIGURES: dict[str, Kind] = {
         "A_drop against the share of texels altered",
         lambda data: _one_setting(data) and _values(data, "tau") > 1,
         lambda data: texels_scatter(data.results),
+        lambda data: paper_means_markdown(data.rows),
     ),
     "surrogates": Kind(
         "What the surrogate promises, and what the target keeps",
