@@ -158,8 +158,8 @@ class AttackJob(PhasedJob):
 
     def _attack(self, chunk: int, on_progress: OnProgress) -> PhaseReport:
         before = self.files.load_state(chunk, step=chunk * CHUNK) if chunk else start(self._textures)
-        if self.spec.keep is not None and not chunk:
-            self._choose(self.spec.keep, on_progress)
+        if not chunk:
+            self._choose(on_progress)
         steps = min(CHUNK, self.spec.steps - before.step)
         last, taken, asked = (
             self._progress("attack", (before.step + steps) / self.spec.steps),
@@ -289,8 +289,16 @@ class AttackJob(PhasedJob):
             within.append({name: torch.from_numpy(known[str(k)]) for k, name in enumerate(self._textures)})
         return movable(self._surrogate, self.budget, self._masks, within=within)
 
-    def _choose(self, keep: float, on_progress: OnProgress) -> None:
-        """Find the share ``keep`` of all texels, once for all steps."""
+    def _choose(self, on_progress: OnProgress) -> None:
+        """Find the few texels, once for all steps, and note how many images it took to choose them, the pixels and the
+        backgrounds: each view once for its saliency, and once for what it is taken for in front of its own background.
+        """
+        spec, looks = self.spec, (self.spec.tau is not None) + (self._backgrounds is not None)
+        few = 0 if spec.keep is None else self._choose_texels(spec.keep, on_progress)
+        self.files.note_shown_before(looks * len(self.scene.views) + few)
+
+    def _choose_texels(self, keep: float, on_progress: OnProgress) -> int:
+        """Find and keep the share ``keep`` of all texels; gives how many images it took."""
         scene = self.scene
         gradients = image_gradients(self.files.load(VIEWS_BEFORE)["own"], scene.members, goal=scene.goal)
         few = few_texels(
@@ -304,7 +312,8 @@ class AttackJob(PhasedJob):
             seed=self.spec.seed,
             on_step=lambda _: on_progress(self._progress("attack", 0.0)),
         )
-        self.files.save(FEW, **{str(k): few[name].cpu().numpy() for k, name in enumerate(self._textures)})
+        self.files.save(FEW, **{str(k): few.masks[name].cpu().numpy() for k, name in enumerate(self._textures)})
+        return len(gradients) + few.evaluations
 
 
 def _numpy(scores: Mapping[str, torch.Tensor]) -> dict[str, NDArray[np.float32]]:

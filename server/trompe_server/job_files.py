@@ -30,7 +30,8 @@ State = TypeVar("State", bound=HasStep)
 
 @dataclass(frozen=True)
 class Spent:
-    """Steps of an attack, images it showed to each classifier, scores it asked for; ``None`` where there were none."""
+    """Steps of an attack, images it showed to each classifier (those before its first step too), scores it asked for;
+    ``None`` where there were none."""
 
     steps: int
     evaluations: int | None
@@ -117,8 +118,12 @@ class JobFiles:
                 seconds[kind] = seconds.get(kind, 0.0) + took
         return seconds
 
+    def note_shown_before(self, evaluations: int) -> None:
+        """Keep how many images were shown before the first step."""
+        self._write("shown-before", evaluations)
+
     def note_spent(self, chunk: int, *, steps: int, evaluations: int, queries: int) -> None:
-        """Keep how many steps a chunk took and scores it asked for, and all images that were shown until then."""
+        """Keep how many steps a chunk took and scores it asked for, and all images its and earlier steps showed."""
         self._write(f"spent-{chunk:03d}", {"steps": steps, "evaluations": evaluations, "queries": queries})
 
     def spent(self) -> Spent:
@@ -126,7 +131,7 @@ class JobFiles:
         found = (self._read(f"spent-{chunk:03d}") for chunk in range(self.chunks))
         spent = [each for each in found if each is not None]
         queries = sum(each["queries"] for each in spent)
-        evaluations = spent[-1]["evaluations"] if spent else None
+        evaluations = spent[-1]["evaluations"] + (self._read("shown-before") or 0) if spent else None
         return Spent(sum(each["steps"] for each in spent), evaluations, queries or None)
 
     def _seal(self, name: str, data: bytes) -> None:

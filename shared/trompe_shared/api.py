@@ -546,7 +546,8 @@ class Result(_Schema):
     )
     evaluations: int | None = Field(
         None,
-        description="images that the attack showed each classifier it attacked; those by which keep chose do not count",
+        description="images that the attack showed each classifier it attacked, those by which it chose pixels (tau), "
+        "texels (keep) and backgrounds too",
     )
     queries: int | None = Field(None, description="scores asked of a classifier that gives no gradients")
     fidelity: dict[str, float] = Field(

@@ -4,10 +4,12 @@
 """
 
 import csv
+import hashlib
+import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -20,6 +22,7 @@ __all__ = [
     "PredictionRow",
     "ResultRow",
     "RowId",
+    "job_key",
     "prediction_rows",
     "read_table",
     "write_table",
@@ -50,11 +53,27 @@ class RowId(_Row):
     configuration: str = ""
 
 
+KEY_VERSION: Final = 1
+"""To be raised by hand when a default, or what an option does, changes: what was measured before counts no more."""
+
+
+def job_key(experiment: str, spec: JobSpec, *more: str) -> str:
+    """The key of a job of an experiment, and of what ``more`` tells it apart by.
+
+    Only what differs from the defaults counts. An option that a later version adds changes no key as long as nobody
+    asks for it, and so the folder of an experiment goes on under that version; see ``KEY_VERSION``.
+    """
+    asked = spec.model_dump(mode="json", exclude_defaults=True)
+    text = json.dumps([KEY_VERSION, asked, *more], sort_keys=True)
+    return f"{experiment}-{hashlib.sha256(text.encode()).hexdigest()[:24]}"
+
+
 class ResultRow(RowId):
     """One job: what was asked, what came out, what it cost. A cell is empty (``None``) where there is nothing to say.
 
     Shares and colour differences as in ``Result``; ``_low`` and ``_high`` are the ends of 95 % intervals; ``_s`` are
     seconds. ``surrogate`` and ``steps`` are what was asked for; ``surrogate_model``, ``steps_taken`` what came of it.
+    Files of earlier versions may lack columns; the fields of these are then unset.
     """
 
     job: str = ""
@@ -63,6 +82,8 @@ class ResultRow(RowId):
     label: str
     classifier: str
     ensemble: str = ""
+    diverse: bool | None = None
+    attack_on: str = ""
     epsilon: float
     alpha: float
     tau: float | None = None
@@ -74,6 +95,7 @@ class ResultRow(RowId):
     restarts: int
     seed: int
     pool: int
+    views_per_step: int | None = None
     background: str
     device: str = "cpu"
     threads: int | None = None
@@ -124,6 +146,7 @@ class ResultRow(RowId):
             "label": str(spec.label),
             "ensemble": SEPARATOR.join(spec.ensemble),
             "background": SEPARATOR.join(spec.background),
+            "views_per_step": spec.n_views_per_step,
         }
         return cls.model_validate(place.model_dump() | asked | named | {"state": state} | more)
 
@@ -152,8 +175,8 @@ class ResultRow(RowId):
 
 
 _ASKED = (
-    *("object", "classifier", "epsilon", "alpha", "tau", "keep", "loss", "optimiser", "surrogate"),
-    *("steps", "restarts", "seed", "pool"),
+    *("object", "classifier", "diverse", "attack_on", "epsilon", "alpha", "tau", "keep", "loss", "optimiser"),
+    *("surrogate", "steps", "restarts", "seed", "pool"),
 )
 _FOUND = (
     *("surrogate_model", "transfer_gap", "texels_altered", "mean_texel_change", "max_view_change"),

@@ -9,10 +9,57 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trompe_client.experiments import Experiment, Plan, load_experiment, plan_experiment, shipped_experiments
+from trompe_client.experiments import Experiment, Plan, load_experiment, plan, plan_experiment, shipped_experiments
+from trompe_shared.api import JobRequest, JobSpec
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
+from trompe_shared.experiment_table import KEY_VERSION, job_key
 from trompe_shared.presets import PRESETS
 from trompe_shared.shipped import shipped_objects
+
+DEFAULTS: dict[str, Any] = {
+    "classifier": "tiny",
+    "ensemble": [],
+    "judges": [],
+    "diverse": False,
+    "attack_on": "texture",
+    "sun": {"azimuth": [-180, 180], "elevation": [15, 88], "intensity": None, "ambient": None},
+    "vertex_budget": 0.02,
+    "epsilon": 0.05,
+    "alpha": 0.01,
+    "tau": None,
+    "keep": None,
+    "materials": [],
+    "masks": {},
+    "epsilon_view": None,
+    "target_label": None,
+    "top_k": 1,
+    "loss": "margin",
+    "optimiser": "nesterov",
+    "restarts": 0,
+    "queries": None,
+    "surrogate": "auto",
+    "steps": 90,
+    "seed": 0,
+    "distance": None,
+    "elevation": None,
+    "background": ["white"],
+    "azimuths": 6,
+    "elevations": 10,
+    "pool": 240,
+    "views_per_step": None,
+    "held_out": 60,
+    "ranges": {
+        "azimuth": [0, 360],
+        "distance_factor": [0.9, 1.1],
+        "roll": [0, 0],
+        "light_azimuth": [-70, 70],
+        "light_elevation": [35, 88],
+        "intensity": [1.25, 1.25],
+        "ambient": [0.5, 0.5],
+        "light_colours": [[255, 255, 255], [255, 255, 255]],
+    },
+}
+"""What jobs of ``KEY_VERSION`` do where a file is silent; options that came later without a new version are missing."""
 
 MINIMAL: dict[str, Any] = {"name": "small", "objects": {"mug": {}}}
 
@@ -80,6 +127,40 @@ def test_keys_are_the_same_at_every_run_and_others_for_other_options() -> None:
     assert [row.key for row in first.rows] == [row.key for row in second.rows]
     assert planned(base={"steps": 8}).rows[0].key != first.rows[0].key
     assert planned(name="other").rows[0].key.startswith("other-")
+
+
+class LaterRequest(JobRequest):
+    """A job request of a version that has one option more."""
+
+    gloss: float = 0.5
+
+    def spec(self) -> JobSpec:
+        return LaterRequest.model_validate(self.model_dump(exclude={"labels", "priority"}))
+
+
+def test_keys_stay_when_a_later_version_adds_an_option_until_somebody_asks_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = {"base": {"steps": 7, "ranges": {"roll": [-5, 5]}}, "grid": {"epsilon": [0.02, 0.1], "diverse": [True]}}
+    before = [row.key for row in planned(**asked).rows]
+    monkeypatch.setattr(plan, "JobRequest", LaterRequest)
+    assert [row.key for row in planned(**asked).rows] == before
+    glossy = [job_key("small", LaterRequest(object="mug", label="mug", gloss=gloss)) for gloss in (0.5, 0.6)]
+    assert glossy[0] == job_key("small", JobRequest(object="mug", label="mug")) != glossy[1]
+
+
+def test_keys_do_not_depend_on_whether_a_default_is_spelled_out() -> None:
+    assert planned(base={"epsilon": 0.05, "alpha": 0.01, "background": "white"}).rows[0].key == planned().rows[0].key
+
+
+def test_keys_are_those_of_the_version_before_unless_what_they_stand_for_was_said_to_have_changed() -> None:
+    """A default that changes makes the same file another job: raise ``KEY_VERSION``, and write the new ones here."""
+
+    def known(then: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+        return {name: known(old, now[name]) if isinstance(old, dict) else now[name] for name, old in then.items()}
+
+    defaults = JobSpec(object="mug", label="mug").model_dump(mode="json")
+    assert (KEY_VERSION, known(DEFAULTS, defaults)) == (1, DEFAULTS)
 
 
 def test_several_grids_are_series_and_what_they_share_is_one_job() -> None:
@@ -151,7 +232,7 @@ def test_files_are_named_by_their_bytes_and_then_by_what_the_server_called_them(
     assert stored.labels == {"experiment": "small"}
 
 
-@pytest.mark.parametrize("name", ["paper", "quick", "speed_accuracy", "stability", "surrogates"])
+@pytest.mark.parametrize("name", ["paper", "quick", "speed_accuracy", "stability"])
 def test_what_comes_with_trompe_can_be_planned(name: str, assets: Path) -> None:
     assert name in shipped_experiments()
     experiment = load_experiment(name)

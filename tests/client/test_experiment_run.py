@@ -1,5 +1,6 @@
 """Running an experiment: everything is submitted once, what comes out is kept, and it can be stopped at any time."""
 
+import csv
 import json
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -192,6 +193,27 @@ def test_each_job_is_submitted_and_its_row_written(service: FakeService, tmp_pat
     assert not outcome.failed
 
 
+def test_rows_say_what_was_attacked_by_how_many_views_a_step_and_whether_images_were_diverse(
+    service: FakeService, tmp_path: Path
+) -> None:
+    cases = {
+        "plain": {},
+        "diverse": {"diverse": True},
+        "few": {"views_per_step": 7},
+        "grid": {"pool": 0},
+        "light": {"attack_on": "light"},
+    }
+    ran(plan_of(objects={"mug": {}}, grid={}, cases=cases), service, tmp_path)
+    rows = read_table(tmp_path / RESULTS, ResultRow)
+    assert [(row.case, row.attack_on, row.diverse, row.views_per_step) for row in rows] == [
+        ("plain", "texture", False, 40),
+        ("diverse", "texture", True, 40),
+        ("few", "texture", False, 7),
+        ("grid", "texture", False, 60),
+        ("light", "light", False, 12),
+    ]
+
+
 def test_predictions_and_the_named_artifacts_are_kept(service: FakeService, tmp_path: Path) -> None:
     ran(plan_of(), service, tmp_path)
     key = next(iter(plan_of().jobs()))
@@ -305,6 +327,28 @@ def test_the_commands_show_and_compare_folders(service: FakeService, tmp_path: P
     assert "0 of 4 larger by 0.1 or more, 0 smaller; on average +0.000" in both.output
 
 
+def test_a_table_without_the_columns_of_later_versions_is_shown_and_compared(
+    service: FakeService, tmp_path: Path
+) -> None:
+    ran(plan_of(), service, tmp_path / "new")
+    (tmp_path / "old").mkdir()
+    with (
+        (tmp_path / "new" / RESULTS).open(newline="") as new,
+        (tmp_path / "old" / RESULTS).open("w", newline="") as old,
+    ):
+        rows = csv.DictReader(new)
+        columns = [name for name in rows.fieldnames or [] if name not in {"diverse", "attack_on", "views_per_step"}]
+        writer = csv.DictWriter(old, columns, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    first = read_results(tmp_path / "old")[0]
+    assert (first.target_a_drop, first.diverse, first.attack_on, first.views_per_step) == (0.2, None, "", None)
+    shown = CliRunner().invoke(experiment, ["show", str(tmp_path / "old")])
+    assert "0.50 [0.25, 1.00]" in shown.output
+    both = CliRunner().invoke(experiment, ["compare", str(tmp_path / "old"), str(tmp_path / "new")])
+    assert "0 of 4 larger by 0.1 or more, 0 smaller; on average +0.000" in both.output
+
+
 def test_a_dry_run_says_how_many_jobs_there_are_and_asks_nobody() -> None:
     told = CliRunner().invoke(experiment, ["run", "quick", "--dry-run", "--server", "http://127.0.0.1:1"])
     assert told.exit_code == 0, told.output
@@ -318,7 +362,6 @@ def test_the_shipped_files_are_listed() -> None:
         "quick",
         "speed_accuracy",
         "stability",
-        "surrogates",
     ]
 
 

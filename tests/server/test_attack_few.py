@@ -6,6 +6,7 @@ import torch
 
 from trompe_server.attack import (
     Budget,
+    FewTexels,
     Goal,
     TexelMasks,
     attack,
@@ -31,6 +32,10 @@ def gradients_of(surrogate: Surrogate) -> torch.Tensor:
 
 
 def found(obj: Object3D, surrogate: Surrogate, keep: float, within: tuple[TexelMasks, ...] = ()) -> TexelMasks:
+    return chosen(obj, surrogate, keep, within).masks
+
+
+def chosen(obj: Object3D, surrogate: Surrogate, keep: float, within: tuple[TexelMasks, ...] = ()) -> FewTexels:
     return few_texels(
         *(keep, textures_of(obj), surrogate, fake_classifier(), gradients_of(surrogate)),
         goal=Goal(LABEL),
@@ -95,7 +100,7 @@ def test_only_pixels_of_the_masks_have_a_say_in_what_is_found(square: Object3D, 
     loud[:, :, 16:] *= 1000
     options = {"goal": Goal(LABEL), "budget": BUDGET, "masks": masks}
     one, other = (
-        few_texels(*(0.05, textures_of(square), square_surrogate, fake_classifier(), gradients), **options)
+        few_texels(*(0.05, textures_of(square), square_surrogate, fake_classifier(), gradients), **options).masks
         for gradients in (gradients_of(square_surrogate), loud)
     )
     assert all(torch.equal(one[name], other[name]) for name in one)

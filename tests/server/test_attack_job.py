@@ -270,6 +270,32 @@ def test_a_meter_sees_networks_behind_wrappers(library: Library) -> None:
     assert taken["classifier_seconds"] > 0
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"tau": 0.05},
+        {"keep": 0.1},
+        {"tau": 0.05, "keep": 0.1},
+        {"diverse": True},
+        {"pool": 12, "background": ["white", "black"], "keep": 0.1},
+    ],
+    ids=str,
+)
+def test_all_images_that_the_search_showed_the_classifier_are_counted(
+    library: Library, options: dict[str, Any]
+) -> None:
+    meter, artifacts, shown = Meter(), MemoryArtifacts(), 0.0
+    spec = QUICK.model_copy(update={"steps": 6} | options)
+    job = open_pipeline(spec, library=library, artifacts=artifacts, target=FakeTarget(), meter=meter)
+    for name in job.phases():
+        meter.take()
+        job.run(name, lambda _: None)
+        shown += meter.take()["classifier_images"] if name.startswith("attack") else 0
+    saliency = spec.n_views if spec.tau is not None else 0  # was made beforehand, for the report as well
+    assert artifacts.result().evaluations == shown + saliency
+
+
 class Counting(FakeTarget):
     """Counts the images it is asked for."""
 

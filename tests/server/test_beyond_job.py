@@ -17,6 +17,7 @@ from trompe_server.attack_job import open_pipeline
 from trompe_server.classifiers import load_classifier
 from trompe_server.formats import read_object
 from trompe_server.library import Library
+from trompe_server.meter import Meter
 from trompe_server.pages.present import JobRow, command, job_row, present
 from trompe_server.pipeline import VIEWS_AFTER, VIEWS_BEFORE, PhaseReport
 from trompe_server.scene import open_scene
@@ -254,6 +255,17 @@ def test_a_job_that_is_cut_off_between_chunks_or_repeats_one_ends_with_the_same_
     whole: Whole = request.getfixturevalue(spec.attack_on)
     again = Whole(spec, library, new=True, times=2)
     assert again.files.lasting() == whole.files.lasting()
+
+
+@BOTH
+def test_all_images_that_the_search_showed_the_classifier_are_counted(spec: JobSpec, library: Library) -> None:
+    meter, files, shown = Meter(), MemoryArtifacts(), 0.0
+    job = open_pipeline(spec, library=library, artifacts=files, target=Noting(), meter=meter)
+    for name in job.phases():
+        meter.take()
+        job.run(name, lambda _: None)
+        shown += meter.take()["classifier_images"] if name.startswith("attack") else 0
+    assert files.result().evaluations == shown
 
 
 @BOTH

@@ -17,7 +17,7 @@ from PIL import Image
 
 from trompe_server.experiments.commands import main
 from trompe_server.experiments.documents import fill, out_of_step
-from trompe_server.experiments.figures import FIGURES, Data, figures_of, histogram_rows, read_data
+from trompe_server.experiments.figures import FIGURES, Data, figures_of, histogram_rows, plain_rows, read_data
 from trompe_server.experiments.histograms import prediction_histograms
 from trompe_server.experiments.paper_means import paper_means_markdown
 from trompe_server.experiments.pareto import Configuration, configurations, pareto_front, pareto_markdown
@@ -290,6 +290,16 @@ def test_the_grid_at_a_glance_averages_what_was_recognised_and_sets_the_papers_m
     ]
 
 
+def test_jobs_that_not_every_surrogate_has_are_in_no_comparison_and_one_surrogate_alone_is_in_the_other_figures(
+    tmp_path: Path,
+) -> None:
+    alone = row(key="alone", object="pot", surrogate="diffuse", epsilon=0.1)
+    assert surrogates_markdown([*surrogate_rows(), alone]) == surrogates_markdown(surrogate_rows())
+    data = read_data(written(tmp_path / "some", [*surrogate_rows(), alone]))
+    assert {each.surrogate for each in data.rows} == {"diffuse", "calibrated"}
+    assert {each.surrogate for each in (*data.grid, *plain_rows(data))} == {"diffuse"}
+
+
 def test_a_budget_that_the_paper_has_not_got_has_no_columns_of_the_paper() -> None:
     head, *_ = table_one_markdown([row(), row(epsilon=0.01)]).splitlines()[2:]
     columns = ["object", "A_before", "surrogate, ε 0.01", "target", "surrogate, ε 0.05", "target", "paper: surrogate"]
@@ -324,7 +334,7 @@ def written(folder: Path, rows: Sequence[ResultRow]) -> Path:
         pytest.param(grid_rows(), ["table_one", "scatter", "histograms"], id="grid"),
         pytest.param(series_rows(), ["speed_accuracy", "evaluations_accuracy"], id="series"),
         pytest.param(stability_rows(), ["stability"], id="cases"),
-        pytest.param(surrogate_rows(), ["surrogates"], id="surrogates"),
+        pytest.param(surrogate_rows(), ["table_one", "scatter", "surrogates", "histograms"], id="surrogates"),
         pytest.param(
             [*grid_rows(), row(key="small", series="small", epsilon=0.01, alpha=0.004, configuration="epsilon 0.01")],
             ["table_one", "scatter", "histograms"],

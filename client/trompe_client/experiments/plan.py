@@ -21,7 +21,7 @@ from trompe_client._plan import (
 from trompe_client.experiments.design import AssetsFolder, Experiment, expanded
 from trompe_shared.api import JobRequest
 from trompe_shared.errors import ObjectError, SpecError
-from trompe_shared.experiment_table import RowId
+from trompe_shared.experiment_table import RowId, job_key
 from trompe_shared.presets import PRESETS
 from trompe_shared.shipped import shipped_objects
 
@@ -65,7 +65,7 @@ class Row:
 
     @property
     def key(self) -> str:
-        """The idempotency key."""
+        """The idempotency key; see ``job_key``."""
         return self.place.key
 
     def stored(self, ids: Mapping[str, str]) -> JobRequest:
@@ -143,7 +143,7 @@ def _row(place: RowId, name: str, fields: Fields, files: "_Files") -> Row:
             f"{'.'.join(map(str, e['loc']))}: {e['msg']}" if e["loc"] else e["msg"] for e in error.errors()
         )
         raise SpecError(f"The job {name}, {place.configuration or 'base'}, cannot be: {wrong}.") from error
-    key = f"{place.experiment}-{_sha256(request.spec().model_dump_json().encode())[:24]}"
+    key = job_key(place.experiment, request.spec())
     return Row(place.model_copy(update={"key": key}), name, request, uploads)
 
 

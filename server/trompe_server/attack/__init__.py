@@ -3,7 +3,7 @@
 from trompe_server.attack.attack import Step, attack
 from trompe_server.attack.backgrounds import Backgrounds
 from trompe_server.attack.budget import Budget
-from trompe_server.attack.few import few_texels
+from trompe_server.attack.few import FewTexels, few_texels
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.saliency import image_gradients, saliency, saliency_masks
 from trompe_server.attack.state import AttackState, load_state, save_state, start
@@ -14,6 +14,7 @@ __all__ = [
     "AttackState",
     "Backgrounds",
     "Budget",
+    "FewTexels",
     "Goal",
     "Step",
     "TexelMasks",

@@ -6,7 +6,7 @@ the best few shows which views they do not win, and the gradient of those is add
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
@@ -17,13 +17,13 @@ from trompe_server.attack.attack import Step, attack
 from trompe_server.attack.backgrounds import Backgrounds
 from trompe_server.attack.budget import Budget
 from trompe_server.attack.goal import Goal
-from trompe_server.attack.objective import Objective, Textures, members_of
+from trompe_server.attack.objective import Look, Objective, Textures, members_of
 from trompe_server.attack.state import start
 from trompe_server.attack.texels import TexelMasks, best_texels, collect, movable
 from trompe_server.classifiers import WhiteBoxClassifier
 from trompe_server.surrogate import Surrogate
 
-__all__ = ["few_texels"]
+__all__ = ["FewTexels", "few_texels"]
 
 ROUNDS: Final = 2
 """Short attacks."""
@@ -32,6 +32,14 @@ STEPS: Final = 4
 """Steps of each, so long that they use up the budget."""
 
 Pull = Mapping[str, Float[Tensor, "H W 3"]]
+
+
+@dataclass(frozen=True)
+class FewTexels:
+    """The texels, as ``masks``, and how many images each classifier was shown by the short attacks that found them."""
+
+    masks: TexelMasks
+    evaluations: int
 
 
 def few_texels(
@@ -49,7 +57,7 @@ def few_texels(
     backgrounds: Backgrounds | None = None,
     seed: int = 0,
     on_step: Callable[[Step], None] = lambda _: None,
-) -> TexelMasks:
+) -> FewTexels:
     """The share ``keep``, in (0, 1], of all texels with which an attack gets furthest, of those ``within`` masks.
 
     ``gradients``: ``image_gradients`` of the target's images of the unpainted object. All else is as in ``attack``;
@@ -59,7 +67,13 @@ def few_texels(
     objective = Objective(textures, surrogate, members_of(classifier, goal), goal, masks)
     if masks is not None:
         gradients = gradients * masks[..., None].to(gradients)
-    total = _scaled(collect(surrogate, textures, gradients))
+    total, shown = _scaled(collect(surrogate, textures, gradients)), 0
+    taken: list[Step] = []
+
+    def told(step: Step) -> None:
+        taken.append(step)
+        on_step(step)
+
     for _ in range(ROUNDS):
         tried = attack(
             *(start(textures), textures, surrogate, classifier),
@@ -71,19 +85,20 @@ def few_texels(
             views_per_step=views_per_step,
             backgrounds=backgrounds,
             seed=seed,
-            on_step=on_step,
+            on_step=told,
         )
-        pull = _scaled(_pull(objective, tried.deltas))
+        look = _look(objective, tried.deltas)
+        pull = _scaled(objective.split(look.gradient))
         total = {name: total[name] + pull[name] for name in total}
-    return _best(total, keep, within)
+        shown += taken[-1].evaluations + look.images
+    return FewTexels(_best(total, keep, within), shown)
 
 
-def _pull(objective: Objective, deltas: Textures) -> Pull:
-    """The gradient of all views by all texels at a change; zero where every view is safely won."""
+def _look(objective: Objective, deltas: Textures) -> Look:
+    """All views at a change, and their gradient by all texels; zero where every view is safely won."""
     surrogate = objective.surrogate
     awake = torch.ones(surrogate.n_views, dtype=torch.bool, device=objective.source.device)
-    look = objective.look(objective.join(deltas), range(len(surrogate.batches)), awake)
-    return objective.split(look.gradient)
+    return objective.look(objective.join(deltas), range(len(surrogate.batches)), awake)
 
 
 def _scaled(pull: Pull) -> Pull:

@@ -41,7 +41,12 @@ class Data:
     @property
     def results(self) -> list[ResultRow]:
         """The rows that came to an ``A_drop``."""
-        return [row for row in self.rows if row.target_a_drop is not None]
+        return _done(self.rows)
+
+    @property
+    def grid(self) -> list[ResultRow]:
+        """The rows of the surrogate that the experiment asks for first; others are there to be set beside it."""
+        return [row for row in self.rows if row.surrogate == self.rows[0].surrogate]
 
 
 def read_data(folder: Path) -> Data:
@@ -63,6 +68,11 @@ class Kind:
     table: Callable[[Data], str] | None = None
 
 
+def _done(rows: Sequence[ResultRow]) -> list[ResultRow]:
+    """Those that came to an ``A_drop``."""
+    return [row for row in rows if row.target_a_drop is not None]
+
+
 def _values(data: Data, column: str) -> int:
     return len({getattr(row, column) for row in data.results})
 
@@ -75,7 +85,7 @@ def histogram_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
 
 def plain_rows(data: Data) -> list[ResultRow]:
     """The rows without saliency at the budget that comes nearest to the paper's 0.05."""
-    rows = [row for row in data.results if row.tau is None]
+    rows = [row for row in _done(data.grid) if row.tau is None]
     nearest = min((row.epsilon for row in rows), key=lambda epsilon: abs(epsilon - 0.05), default=0.0)
     return [row for row in rows if row.epsilon == nearest]
 
@@ -83,24 +93,19 @@ def plain_rows(data: Data) -> list[ResultRow]:
 FIGURES: dict[str, Kind] = {
     "table_one": Kind(
         "A_drop per object, classifier and epsilon (the paper's Table I)",
-        lambda data: _one_setting(data) and any(row.tau is None for row in data.results),
-        lambda data: table_one_chart(data.results),
-        lambda data: table_one_markdown(data.rows),
+        lambda data: _one_setting(data) and any(row.tau is None for row in _done(data.grid)),
+        lambda data: table_one_chart(_done(data.grid)),
+        lambda data: table_one_markdown(data.grid),
     ),
     "scatter": Kind(
         "A_drop against the share of texels altered",
         lambda data: _one_setting(data) and _values(data, "tau") > 1,
-        lambda data: texels_scatter(data.results),
-        lambda data: paper_means_markdown(data.rows),
+        lambda data: texels_scatter(_done(data.grid)),
+        lambda data: paper_means_markdown(data.grid),
     ),
     "surrogates": Kind(
         "What the surrogate promises, and what the target keeps",
-        lambda data: (
-            not _cases(data)
-            and _values(data, "configuration") > 1
-            and _values(data, "series") == 1
-            and len(surrogates_of(data.results)) > 1
-        ),
+        lambda data: _one_setting(data) and len(surrogates_of(data.results)) > 1,
         lambda data: surrogates_chart(data.results),
         lambda data: surrogates_markdown(data.results),
     ),
@@ -130,8 +135,10 @@ FIGURES: dict[str, Kind] = {
 
 
 def _one_setting(data: Data) -> bool:
-    """Whether the rows differ by what the paper's table tells apart, and by seeds, alone."""
-    places = grouped(data.results, lambda row: (row.object, row.classifier, row.epsilon, row.tau, row.seed))
+    """Whether the rows differ by what the paper's table tells apart, by surrogates and by seeds alone."""
+    places = grouped(
+        data.results, lambda row: (row.object, row.classifier, row.epsilon, row.tau, row.surrogate, row.seed)
+    )
     return not _cases(data) and all(len(rows) == 1 for rows in places.values())
 
 

@@ -16,7 +16,7 @@ def write_parquet(folder: Path) -> Path:
     except ModuleNotFoundError as error:
         raise SpecError(f"Parquet needs pyarrow: pip install 'trompe[report]' ({error}).") from error
     rows = [row.model_dump() for row in read_table(folder / RESULTS, ResultRow)]
-    kinds = {"int": arrow.int64(), "float": arrow.float64()}
+    kinds = {"bool": arrow.bool_(), "int": arrow.int64(), "float": arrow.float64()}
     fields = [
         (name, next((kind for word, kind in kinds.items() if word in str(field.annotation)), arrow.string()))
         for name, field in ResultRow.model_fields.items()

@@ -69,8 +69,8 @@ def drawing(*, size: tuple[float, float], panels: tuple[int, int] = (1, 1), **op
 
 
 def stamp_of(rows: Sequence[BaseModel]) -> str:
-    """What names the data of a figure: a hash of its rows, job ids aside."""
+    """What names the data of a figure: a hash of its rows, job ids and columns that their file lacks aside."""
     digest = hashlib.sha256()
     for row in rows:
-        digest.update(row.model_dump_json(exclude={"job"}).encode())
+        digest.update(row.model_dump_json(exclude={"job"}, exclude_unset=True).encode())
     return f"data {digest.hexdigest()[:16]}"

@@ -3,7 +3,6 @@
 A suite can be stopped and started again: its rows are written as they come, and what is there is not run again.
 """
 
-import hashlib
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,7 +20,7 @@ from trompe_server.experiments.in_process import Change, Done, MakeSurrogate, ru
 from trompe_server.target import TargetRenderer
 from trompe_shared.api import JobSpec, JobState
 from trompe_shared.errors import TrompeError
-from trompe_shared.experiment_table import RESULTS, ResultRow, RowId, read_table, write_table
+from trompe_shared.experiment_table import RESULTS, ResultRow, RowId, job_key, read_table, write_table
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
@@ -84,8 +83,7 @@ def plan_jobs(
         for seed in seeds:
             fields = {**options, **case.options, "object": name, "label": shipped_objects()[name].label, "seed": seed}
             spec = JobSpec.model_validate(fields)
-            asked = f"{same or place.configuration} {spec.model_dump_json()}"
-            key = f"{place.experiment}-{hashlib.sha256(asked.encode()).hexdigest()[:24]}"
+            key = job_key(place.experiment, spec, same or place.configuration)
             found.append(Planned(place.model_copy(update={"key": key}), case, spec))
     return found
 
