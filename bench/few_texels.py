@@ -3,10 +3,11 @@
 TROMPE_ASSETS=... python -m bench.few_texels --csv docs/bench/few_texels.csv --chart docs/bench/few_texels.svg
                   python -m bench.few_texels --classifier squeezenet1_1 --csv docs/bench/few_texels.csv
 
-Two ways to choose texels, each a curve of A_drop against the share altered, on the paper's 60 views: the best texels by
-accumulated target saliency (``keep``), and the paper's masks of pixels (``tau``). A curve begins where most texels may
-change, ends once A_drop is below 0.3, and is then refined between its last point that drops enough and the next. What
-the CSV file has already is not run again.
+Two ways to choose texels, each a curve of A_drop against the share altered, on the paper's views: those that ``keep``
+finds by trying (ranked by the gradient of the target's images, to which two short attacks on the best few add that of
+the views they do not win), and the paper's masks of pixels (``tau``). A curve begins where most texels may change, ends
+once A_drop is below 0.3, and is then refined between its last point that drops enough and the next. What the CSV file
+has already is not run again.
 """
 
 import argparse

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from trompe_server.target import SailenvTarget
 from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files
 from trompe_shared.shipped import shipped_objects
+
+sys.path.append(str(Path(__file__).parent))  # of what lies beside this file, for all tests
 
 Surface = tuple[ArrayLike, ArrayLike, NDArray[np.uint8]]
 """Corners (F, 3, 3) in metres, their texture coordinates (F, 3, 2), and the texture (H, W, 3) they are painted with."""

@@ -5,17 +5,23 @@ Pillow can read some 40 formats, some by starting other programs. A file is what
 
 import io
 import json
+import shutil
 import struct
+import subprocess
+import tempfile
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from small_models import OBJ, gltf_files, with_picture_inside
 
 from trompe_server.formats import read_object
+from trompe_server.formats.fbx_tree import Tree, parse_tree
 from trompe_server.formats.gltf_write import write_glb
 from trompe_server.library import Library
 from trompe_server.target import SailenvTarget
@@ -27,7 +33,7 @@ from trompe_shared.opacity import opacity_of
 
 SIDE = 8
 GOOD = encode_png(np.zeros((SIDE, SIDE, 3), np.uint8))
-OBJ = b"mtllib t.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+MTL = b"newmtl m\nmap_Kd albedo.png\n"
 TABLE = {"m": {"albedo": "albedo.png", "normal": "normal.png", "metallic": "metallic.png"}}
 
 
@@ -85,29 +91,32 @@ def smuggled(**pictures: bytes) -> Object3D:
 
 
 def from_gltf(data: bytes) -> None:
-    triangle = struct.pack("<15f", 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 0, 0)
-    document = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-        "textures": [{"source": 0}],
-        "images": [{"uri": "t.png"}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2"},
-        ],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 24}],
-        "buffers": [{"byteLength": len(triangle), "uri": "t.bin"}],
-    }
-    read_object(pack_zip({"t.gltf": json.dumps(document).encode(), "t.bin": triangle, "t.png": data}), name="t.zip")
+    read_object(pack_zip(gltf_files(data)), name="t.zip")
 
 
 def from_mtl(data: bytes) -> None:
-    files = {"t.obj": OBJ, "t.mtl": b"newmtl m\nmap_Kd albedo.png\n", "albedo.png": data}
-    read_object(pack_zip(files), name="t.zip")
+    read_object(pack_zip({"t.obj": OBJ, "t.mtl": MTL, "albedo.png": data}), name="t.zip")
+
+
+@cache
+def fbx() -> Tree:
+    """The triangle as assimp writes it, without its picture. Written anew, for assimp cannot read its own file."""
+    if shutil.which("assimp") is None:
+        pytest.skip("assimp-utils is not installed")
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "t.obj").write_bytes(OBJ)
+        Path(folder, "t.mtl").write_bytes(MTL)
+        command = ["assimp", "export", "t.obj", "t.fbx", "-ffbx"]
+        subprocess.run(command, cwd=folder, check=True, capture_output=True)
+        return parse_tree(Path(folder, "t.fbx").read_bytes())
+
+
+def from_fbx(data: bytes) -> None:
+    read_object(pack_zip({"t.fbx": fbx().to_bytes(), "albedo.png": data}), name="t.zip")
+
+
+def from_within_fbx(data: bytes) -> None:
+    read_object(with_picture_inside(fbx(), data), name="t.fbx")
 
 
 DOORS: dict[str, tuple[type[TrompeError], Callable[[bytes], object]]] = {
@@ -116,6 +125,8 @@ DOORS: dict[str, tuple[type[TrompeError], Callable[[bytes], object]]] = {
     "a metallic map": (ObjectError, lambda data: load_object(pack_zip(archive(metallic=data)))),
     "a texture of an MTL": (ObjectError, from_mtl),
     "a texture of a glTF": (ObjectError, from_gltf),
+    "a texture beside an FBX": (ObjectError, from_fbx),
+    "a texture inside an FBX": (ObjectError, from_within_fbx),
     "what alpha is read from": (ObjectError, opacity_of),
     "what is painted over": (
         ObjectError,

@@ -15,15 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from small_models import OBJ, PICTURE, glb, gltf_buffer, gltf_files, gltf_json
 
 from trompe_server.formats import import_file, read_object
 from trompe_shared.errors import ObjectError
-from trompe_shared.object3d import encode_png, pack_zip
+from trompe_shared.object3d import pack_zip
 
-Json = dict[str, Any]
-
-PICTURE = encode_png(np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3))
-OBJ = b"mtllib t.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
 MTL = b"newmtl m\nKd 1 1 1\nmap_Kd t.png\n"
 MAT_DEF = b'{"m": {"albedo": "t.png", "normal": null, "metallic": null}}'
 STL_TEXT = (
@@ -46,46 +43,6 @@ FBX = (
 def obj_files(**changes: bytes) -> dict[str, bytes]:
     """The files of a textured triangle, some replaced; ``__`` stands for a dot."""
     return {"t.obj": OBJ, "t.mtl": MTL, "t.png": PICTURE} | {k.replace("__", "."): v for k, v in changes.items()}
-
-
-def gltf_json() -> Json:
-    """A textured triangle: positions, texture coordinates and the picture in one buffer."""
-    data = gltf_buffer()
-    return {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-        "textures": [{"source": 0}],
-        "images": [{"bufferView": 2, "mimeType": "image/png"}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2"},
-        ],
-        "bufferViews": [
-            {"buffer": 0, "byteLength": 36},
-            {"buffer": 0, "byteOffset": 36, "byteLength": 24},
-            {"buffer": 0, "byteOffset": 60, "byteLength": len(PICTURE)},
-        ],
-        "buffers": [{"byteLength": len(data)}],
-    }
-
-
-def gltf_buffer() -> bytes:
-    """What ``gltf_json`` describes."""
-    return struct.pack("<15f", 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 0, 0) + PICTURE
-
-
-def glb(document: Json | bytes, data: bytes | None = None) -> bytes:
-    """A GLB of JSON and one buffer."""
-    text = document if isinstance(document, bytes) else json.dumps(document).encode()
-    body = b""
-    for kind, chunk, filler in ((b"JSON", text, b" "), (b"BIN\0", gltf_buffer() if data is None else data, b"\0")):
-        chunk += filler * (-len(chunk) % 4)
-        body += struct.pack("<I", len(chunk)) + kind + chunk
-    return b"glTF" + struct.pack("<II", 2, 12 + len(body)) + body
 
 
 def stl_binary() -> bytes:
@@ -111,23 +68,13 @@ def valid_files() -> dict[str, bytes]:
         "t-obj.zip": pack_zip(obj_files()),
         "t-sailenv.zip": pack_zip({"t.obj": OBJ, "t_mat_def.json": MAT_DEF, "t.png": PICTURE}),
         "t.glb": glb(gltf_json()),
-        "t-gltf.zip": pack_zip(external_gltf()),
+        "t-gltf.zip": pack_zip(gltf_files()),
         "t-text.ply": PLY,
         "t.ply": ply_binary(),
         "t-text.stl": STL_TEXT,
         "t.stl": stl_binary(),
         "t.obj": OBJ.replace(b"mtllib t.mtl\n", b""),
     }
-
-
-def external_gltf(**changes: Any) -> dict[str, bytes]:
-    """The triangle with its buffer and its picture in files of their own; ``changes`` to the JSON."""
-    document = gltf_json() | {
-        "images": [{"uri": "tex/t.png"}],
-        "buffers": [{"byteLength": len(gltf_buffer()), "uri": "t.bin"}],
-        **changes,
-    }
-    return {"t.gltf": json.dumps(document).encode(), "t.bin": gltf_buffer(), "tex/t.png": PICTURE}
 
 
 def zipped(files: Mapping[str, bytes]) -> bytes:
@@ -298,7 +245,7 @@ def changed(**changes: Any) -> bytes:
 
 
 def external(**changes: Any) -> bytes:
-    return zipped(external_gltf(**changes))
+    return zipped(gltf_files(**changes))
 
 
 def accessor(**changes: Any) -> bytes:

@@ -3,7 +3,6 @@
 import os
 import shutil
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +10,11 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_models import with_picture_inside
 
 from trompe_server.formats import FORMATS, import_file, read_object, repaint_file, repaint_limited, write_glb
 from trompe_server.formats.fbx import unit
-from trompe_server.formats.fbx_tree import MAGIC, Node, Tree, parse_tree
+from trompe_server.formats.fbx_tree import MAGIC, parse_tree
 from trompe_server.formats.pictures import cutout_alpha, encode_srgb, linear_rgb, shrink, tinted
 from trompe_server.formats.unwrap import unwrap
 from trompe_server.target import SailenvTarget
@@ -354,23 +354,10 @@ def test_a_picture_inside_an_fbx_is_painted_there(assets: Path) -> None:
     picture = (assets / "fbx" / "Cube_AlbedoTransparency.png").read_bytes()
     tree = parse_tree(plain)
     assert tree.to_bytes() == plain
-    data = embedded(tree, picture)
+    data = with_picture_inside(tree, picture)
     assert parse_tree(data).pictures() == {"Cube_AlbedoTransparency.png": picture}
     _, out = comes_back(data, "cube.fbx")
     assert parse_tree(out).with_pictures({"Cube_AlbedoTransparency.png": None}).to_bytes() == plain
-
-
-def embedded(tree: Tree, picture: bytes) -> bytes:
-    """The file with ``picture`` in its only video."""
-    content = Node(b"Content", 1, b"R" + len(picture).to_bytes(4, "little") + picture, None)
-
-    def filled(node: Node) -> Node:
-        children = node.children or ()
-        if node.name == b"Video":
-            return replace(node, children=(*children, content))
-        return replace(node, children=tuple(map(filled, children))) if node.name == b"Objects" else node
-
-    return replace(tree, nodes=tuple(map(filled, tree.nodes))).to_bytes()
 
 
 @pytest.mark.parametrize("cut", [30, 60, 200])

@@ -1,0 +1,82 @@
+"""A textured triangle in the formats that it takes more than a line to write."""
+
+import json
+import struct
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from trompe_server.formats.fbx_tree import Node, Tree
+from trompe_shared.object3d import encode_png
+
+Json = dict[str, Any]
+
+PICTURE = encode_png(np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3))
+OBJ = b"mtllib t.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+CORNERS = struct.pack("<15f", 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 0, 0)
+"""Positions, then texture coordinates."""
+
+
+def gltf_json() -> Json:
+    """The triangle as glTF: positions, texture coordinates and the picture in one buffer, ``gltf_buffer``."""
+    return {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        "textures": [{"source": 0}],
+        "images": [{"bufferView": 2, "mimeType": "image/png"}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 36},
+            {"buffer": 0, "byteOffset": 36, "byteLength": 24},
+            {"buffer": 0, "byteOffset": 60, "byteLength": len(PICTURE)},
+        ],
+        "buffers": [{"byteLength": len(gltf_buffer())}],
+    }
+
+
+def gltf_buffer() -> bytes:
+    """What ``gltf_json`` describes."""
+    return CORNERS + PICTURE
+
+
+def gltf_files(picture: bytes = PICTURE, **changes: Any) -> dict[str, bytes]:
+    """The triangle as glTF with its buffer and its picture in files of their own; ``changes`` to the JSON."""
+    document = gltf_json()
+    document |= {
+        "images": [{"uri": "tex/t.png"}],
+        "bufferViews": document["bufferViews"][:2],
+        "buffers": [{"byteLength": len(CORNERS), "uri": "t.bin"}],
+        **changes,
+    }
+    return {"t.gltf": json.dumps(document).encode(), "t.bin": CORNERS, "tex/t.png": picture}
+
+
+def glb(document: Json | bytes, data: bytes | None = None) -> bytes:
+    """A GLB of JSON and one buffer, by default ``gltf_buffer``."""
+    text = document if isinstance(document, bytes) else json.dumps(document).encode()
+    body = b""
+    for kind, chunk, filler in ((b"JSON", text, b" "), (b"BIN\0", gltf_buffer() if data is None else data, b"\0")):
+        chunk += filler * (-len(chunk) % 4)
+        body += struct.pack("<I", len(chunk)) + kind + chunk
+    return b"glTF" + struct.pack("<II", 2, 12 + len(body)) + body
+
+
+def with_picture_inside(fbx: Tree, picture: bytes) -> bytes:
+    """The FBX file with ``picture`` in its only video."""
+    content = Node(b"Content", 1, b"R" + len(picture).to_bytes(4, "little") + picture, None)
+
+    def filled(node: Node) -> Node:
+        children = node.children or ()
+        if node.name == b"Video":
+            return replace(node, children=(*children, content))
+        return replace(node, children=tuple(map(filled, children))) if node.name == b"Objects" else node
+
+    return replace(fbx, nodes=tuple(map(filled, fbx.nodes))).to_bytes()
