@@ -193,6 +193,18 @@ def test_each_job_is_submitted_and_its_row_written(service: FakeService, tmp_pat
     assert not outcome.failed
 
 
+def test_what_the_server_has_done_before_is_fetched_before_anything_is_waited_for(
+    service: FakeService, tmp_path: Path
+) -> None:
+    ran(plan_of(grid={"epsilon": [0.05]}), service, tmp_path / "before")
+    service.by_key = {key: service.job(job.id) for key, job in service.by_key.items()}
+    service.goes_away_after = service.looks
+    with pytest.raises(ServerUnreachable):
+        ran(plan_of(), service, tmp_path / "now")
+    rows = read_table(tmp_path / "now" / RESULTS, ResultRow)
+    assert [(row.object, row.epsilon) for row in rows] == [("mug", 0.05), ("chair", 0.05)]
+
+
 def test_rows_say_what_was_attacked_by_how_many_views_a_step_and_whether_images_were_diverse(
     service: FakeService, tmp_path: Path
 ) -> None:

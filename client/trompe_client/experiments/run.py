@@ -118,9 +118,14 @@ def _follow(
             for name, file in row.uploads.items():
                 if name not in ids:
                     ids[name] = service.store(file)
-            waiting[row.key] = row, service.submit(row.stored(ids), _submission_key(row, known.get(row.key)))
+            job = service.submit(row.stored(ids), _submission_key(row, known.get(row.key)))
         except APIError as error:
             yield row, _Fetched(Finished(REFUSED, "", str(error)), None, {})
+            continue
+        if job.state.final:
+            yield row, _fetch(row, job, service, plan.experiment.artifacts)
+        else:
+            waiting[row.key] = row, job
     while waiting:
         for key in list(waiting)[:LOOK_AT]:
             row, before = waiting[key]
