@@ -178,6 +178,7 @@ def table_one_chart(rows: Sequence[ResultRow]) -> Drawing:
         for axes, (classifier, epsilon) in zip(
             made.panels, [(c, e) for c in classifiers for e in epsilons], strict=True
         ):
+            axes.set_visible((classifier, epsilon) in panels)
             for cell in panels.get((classifier, epsilon), []):
                 _draw_line(axes, objects.index(cell.object), cell)
             axes.set_title(f"{classifier}, ε = {epsilon:g}")
@@ -185,8 +186,12 @@ def table_one_chart(rows: Sequence[ResultRow]) -> Drawing:
             axes.axvline(0, color=GREY, lw=0.8)
         made.panels[0].set_ylim(len(objects) - 0.5, -0.5)
         made.panels[0].set_xlim(right=1.06)
-        for axes in made.axes[-1]:
-            axes.set_xlabel("A_drop (share)")
+        for row in made.axes:
+            next(axes for axes in row if axes.get_visible()).tick_params(labelleft=True)
+        for column in zip(*made.axes, strict=True):
+            lowest = next(axes for axes in reversed(column) if axes.get_visible())
+            lowest.tick_params(labelbottom=True)
+            lowest.set_xlabel("A_drop (share)")
         _legend(made, paper=any(cell.paper for cell in cells))
     return made
 
