@@ -14,7 +14,7 @@ from torch import Tensor
 
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate import pyramid as module
-from trompe_server.surrogate.pyramid import mip_layout, read_texels
+from trompe_server.surrogate.pyramid import mip_chains, mip_layout, read_texels
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, View
 from trompe_shared.object3d import Object3D, encode_png, object_from_files
 
@@ -100,7 +100,7 @@ def test_the_pyramid_is_the_texture_averaged_again_and_again(height: int, width:
     textures = [noise(height, width) / 255, noise(2, 3, seed=1) / 255]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "BAND_TEXELS", band)
-        flat = read_texels([torch.from_numpy(t) for t in textures], layout, every_texel(layout)).numpy()
+        flat = read_texels([torch.from_numpy(t) for t in textures], mip_chains(layout, every_texel(layout))).numpy()
     assert len(flat) == layout.total
     for level, sizes, starts in zip(textures, layout.sizes, layout.starts, strict=True):
         expected = level
@@ -116,15 +116,17 @@ def test_texels_of_the_pyramid_pass_their_gradient_back_to_all_they_are_averages
     height: int, width: int, band: int, share: float
 ) -> None:
     layout, random = mip_layout([(height, width), (3, 2)]), torch.Generator().manual_seed(height)
-    reads = [level[torch.rand(len(level), generator=random) < share] for level in every_texel(layout)]
+    levels = [level[torch.randperm(len(level), generator=random)] for level in every_texel(layout)]
+    reads = [level[: round(share * len(level))] for level in levels]
     textures = [torch.rand(*sizes[0], 3, generator=random).requires_grad_() for sizes in layout.sizes]
     changes = [torch.rand(texture.shape, generator=random) for texture in textures]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "BAND_TEXELS", band)
-        texels = read_texels(textures, layout, reads)
+        chains = mip_chains(layout, reads)
+        texels = read_texels(textures, chains)
         weights = torch.rand(texels.shape, generator=random)
         gradients = torch.autograd.grad(texels, textures, weights)
-        moved = read_texels(changes, layout, reads)  # the pyramid is linear
+        moved = read_texels(changes, chains)  # the pyramid is linear
     told = sum(float((gradient * change).sum()) for gradient, change in zip(gradients, changes, strict=True))
     assert told == pytest.approx(float((moved * weights).sum()), rel=1e-4, abs=1e-5)
 
@@ -133,7 +135,8 @@ def test_levels_rounded_to_8_bits_are_rounded_after_columns_and_again_after_rows
     texture = torch.tensor([[0, 1], [0, 0]])[..., None].expand(2, 2, 3) / 255
     layout = mip_layout([(2, 2)])
     exact, rounded = (
-        read_texels([texture], layout, every_texel(layout), rounded=choice)[-1, 0] for choice in (False, True)
+        read_texels([texture], mip_chains(layout, every_texel(layout)), rounded=choice)[-1, 0]
+        for choice in (False, True)
     )
     assert float(exact) * 255 == pytest.approx(0.25)
     assert float(rounded) * 255 == pytest.approx(1.0)

@@ -37,7 +37,11 @@ class Budget:
 
     def project(self, delta: Float[Tensor, "*texels 3"], texture: Float[Tensor, "*texels 3"]) -> Tensor:
         """The nearest change that keeps ``|delta| <= epsilon`` and ``0 <= texture + delta <= 1``."""
-        return delta.clamp(-self.epsilon, self.epsilon).add_(texture).clamp_(0, 1).sub_(texture)
+        return self._project_(delta.clone(), texture)
+
+    def _project_(self, delta: Float[Tensor, "*texels 3"], texture: Float[Tensor, "*texels 3"]) -> Tensor:
+        """``project``, in place."""
+        return delta.clamp_(-self.epsilon, self.epsilon).add_(texture).clamp_(0, 1).sub_(texture)
 
     def ascend(
         self,
@@ -48,7 +52,7 @@ class Budget:
         scale: float = 1.0,
     ) -> Tensor:
         """One projected step of ``scale * alpha`` along the sign of ``direction``; texels where it is zero stay."""
-        return self.project(direction.sign().mul_(scale * self.alpha).add_(delta), texture)
+        return self._project_(direction.sign().mul_(scale * self.alpha).add_(delta), texture)
 
     def quantise(self, delta: Float[Tensor, "H W 3"], texture: UInt8[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
         """The 8-bit texture that is saved: ``texture + delta`` rounded, never further than epsilon off."""

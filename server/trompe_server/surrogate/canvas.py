@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import FunctionCtx
 
-from trompe_server.surrogate.pyramid import MipChain, MipLayout, Reads, mip_chains, round_level_
+from trompe_server.surrogate.pyramid import MipChain, round_level_
 from trompe_server.surrogate.shading import decode
 
 __all__ = ["Canvas", "canvas_of"]
@@ -28,8 +28,7 @@ to the levels that are made whole."""
 def canvas_of(
     textures: Sequence[Float[Tensor, "H W 3"]],
     moving: Sequence[Bool[Tensor, "H W"]],
-    layout: MipLayout,
-    reads: Reads,
+    chains: Sequence[MipChain],
     *,
     linear: bool,
     rounded: bool,
@@ -39,7 +38,7 @@ def canvas_of(
     ``linear``: averaged in linear light, not as they are. Other arguments as for ``read_texels``.
     """
     sheets, source, texels = [], [], []
-    for texture, mask, chain in zip(textures, moving, mip_chains(layout, reads), strict=True):
+    for texture, mask, chain in zip(textures, moving, chains, strict=True):
         tiles = _Tiles.of(chain, mask)
         source.append(texture.flatten(0, 1).index_select(0, tiles.order))
         texture = decode(texture) if linear else texture

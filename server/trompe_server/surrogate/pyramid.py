@@ -17,7 +17,7 @@ from torch.autograd.function import FunctionCtx
 __all__ = ["MipChain", "MipLayout", "Reads", "mip_chains", "mip_layout", "read_texels", "round_level_"]
 
 Reads = Sequence[Int[Tensor, " _"]]
-"""Of each mip level in the layout's order, texels (row * width + column), ascending."""
+"""Of each mip level in the layout's order, texels (row * width + column), in the order in which they are wanted."""
 
 BAND_TEXELS = 2**18
 """Levels with more texels than this are made in bands of about as many."""
@@ -50,13 +50,13 @@ def mip_layout(sizes: Sequence[tuple[int, int]]) -> MipLayout:
 
 
 def read_texels(
-    textures: Sequence[Float[Tensor, "H W channels"]], layout: MipLayout, reads: Reads, *, rounded: bool = False
+    textures: Sequence[Float[Tensor, "H W channels"]], chains: Sequence["MipChain"], *, rounded: bool = False
 ) -> Float[Tensor, "texels channels"]:
-    """The texels ``reads`` of the mip levels of ``textures`` (row 0 on top), box filtered. Differentiable.
+    """What ``chains`` read of the mip levels of ``textures`` (row 0 on top), box filtered. Differentiable.
 
     With ``rounded`` levels are rounded to 8 bits as they are made; the gradient passes as if they were not.
     """
-    texels: Tensor = _ReadTexels.apply(layout, reads, rounded, *textures)  # type: ignore[no-untyped-call]
+    texels: Tensor = _ReadTexels.apply(chains, rounded, *textures)  # type: ignore[no-untyped-call]
     return texels
 
 
@@ -64,18 +64,17 @@ class _ReadTexels(Function):
     """``read_texels``, with the gradient's way back."""
 
     @staticmethod
-    def forward(ctx: FunctionCtx, layout: MipLayout, reads: Reads, rounded: bool, *textures: Tensor) -> Tensor:
-        chains = mip_chains(layout, reads)
+    def forward(ctx: FunctionCtx, chains: Sequence["MipChain"], rounded: bool, *textures: Tensor) -> Tensor:
         ctx.chains = chains  # type: ignore[attr-defined]
         pairs = zip(chains, textures, strict=True)
         return torch.cat([part for chain, texture in pairs for part in chain.read(texture, rounded=rounded)])
 
     @staticmethod
     def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        chains: list[MipChain] = ctx.chains  # type: ignore[attr-defined]
+        chains: Sequence[MipChain] = ctx.chains  # type: ignore[attr-defined]
         counts = [len(level) for chain in chains for level in chain.reads]
         parts = iter(torch.split(gradient, counts))
-        return (None, None, None, *(chain.spread([next(parts) for _ in chain.sizes]) for chain in chains))
+        return (None, None, *(chain.spread([next(parts) for _ in chain.sizes]) for chain in chains))
 
 
 def mip_chains(layout: MipLayout, reads: Reads) -> list["MipChain"]:
@@ -97,42 +96,45 @@ class MipChain:
         small = (k for k, (h, w) in enumerate(self.sizes) if h * w <= BAND_TEXELS or h % 2 or w % 2)
         return next(small, len(self.sizes) - 1)
 
-    def bands(self) -> Iterator[list[tuple[slice, slice]]]:
-        """For each band and each banded level: its rows, and which of the level's reads lie in them."""
+    @cached_property
+    def by_row(self) -> list[tuple[Int[Tensor, " _"], Int[Tensor, " _"]]]:
+        """The reads of each banded level, ascending, and which of them each is."""
+        return [(order.values, order.indices) for order in (level.sort() for level in self.reads[: self.banded])]
+
+    def bands(self) -> Iterator[list["_Strip"]]:
+        """For each band the strips of all banded levels."""
         banded, (height, width) = self.banded, self.sizes[0]
         tall = max(1, BAND_TEXELS // width >> banded)
         starts = range(0, height >> banded, tall)
         edges = [
             torch.searchsorted(level, torch.tensor([(s << banded >> k) * w for s in starts], device=level.device))
-            for k, (level, (_, w)) in enumerate(zip(self.reads[:banded], self.sizes, strict=False))
+            for k, ((level, _), (_, w)) in enumerate(zip(self.by_row, self.sizes, strict=False))
         ]
         places = [[*edge.tolist(), len(level)] for edge, level in zip(edges, self.reads, strict=False)]
         for number, start in enumerate(starts):
             stop = min(start + tall, height >> banded)
-            yield [
-                (slice(start << banded >> k, stop << banded >> k), slice(place[number], place[number + 1]))
-                for k, place in enumerate(places)
-            ]
+            rows = [slice(start << banded >> k, stop << banded >> k) for k in range(banded)]
+            yield [self._strip(k, rows[k], slice(*place[number : number + 2])) for k, place in enumerate(places)]
 
-    def within(self, level: int, rows: slice, places: slice) -> Int[Tensor, " _"]:
-        """Those of a level's reads, counted from the first texel of ``rows``."""
-        return self.reads[level][places].sub(rows.start * self.sizes[level][1])
+    def _strip(self, level: int, rows: slice, places: slice) -> "_Strip":
+        texels, which = self.by_row[level]
+        return _Strip(rows, which[places], texels[places].sub(rows.start * self.sizes[level][1]))
 
     def read(self, texture: Float[Tensor, "H W channels"], *, rounded: bool) -> list[Float[Tensor, "_ channels"]]:
-        """What is read of each level, level by level (of the large ones band by band)."""
+        """What is read of each level (of the large ones band by band)."""
         banded, channels = self.banded, texture.shape[2]
-        found: list[list[Tensor]] = [[] for _ in self.sizes]
+        found = [texture.new_empty(len(reads), channels) for reads in self.reads[:banded]]
         level = texture.new_empty(*self.sizes[banded], channels) if banded else texture
         for band in self.bands() if banded else ():
-            part = texture[band[0][0]]
-            for k, (rows, places) in enumerate(band):
-                found[k].append(part.reshape(-1, channels).index_select(0, self.within(k, rows, places)))
+            part = texture[band[0].rows]
+            for strip, reads in zip(band, found, strict=True):
+                reads.index_copy_(0, strip.which, part.reshape(-1, channels).index_select(0, strip.texels))
                 part = _halved(part, rounded=rounded)
-            level[rows.start // 2 : rows.stop // 2] = part
+            level[strip.rows.start // 2 : strip.rows.stop // 2] = part
         for k in range(banded, len(self.sizes)):
-            found[k].append(level.reshape(-1, channels).index_select(0, self.reads[k]))
+            found.append(level.reshape(-1, channels).index_select(0, self.reads[k]))
             level = _halved(level, rounded=rounded)
-        return [part for parts in found for part in parts]
+        return found
 
     def spread(self, gradients: Sequence[Float[Tensor, "_ channels"]]) -> Float[Tensor, "H W channels"]:
         """The transpose of ``read``: what the texture gets from what was read of each level."""
@@ -145,14 +147,22 @@ class MipChain:
             return total
         whole = total.new_empty(*self.sizes[0], channels)
         for band in self.bands():
-            rows = band[-1][0]
+            rows = band[-1].rows
             part = total[rows.start // 2 : rows.stop // 2]
-            for k in reversed(range(banded)):
-                rows, places = band[k]
-                size = (rows.stop - rows.start, self.sizes[k][1])
-                part = _doubled(part, size, out=whole[rows] if k == 0 else None)
-                part.view(-1, channels).index_add_(0, self.within(k, rows, places), gradients[k][places])
+            for k, strip in reversed(list(enumerate(band))):
+                size = (strip.rows.stop - strip.rows.start, self.sizes[k][1])
+                part = _doubled(part, size, out=whole[strip.rows] if k == 0 else None)
+                part.view(-1, channels).index_add_(0, strip.texels, gradients[k].index_select(0, strip.which))
         return whole
+
+
+@dataclass(frozen=True)
+class _Strip:
+    """What a band has of one level: its rows, which of the level's reads lie in them, and at which of their texels."""
+
+    rows: slice
+    which: Int[Tensor, " _"]
+    texels: Int[Tensor, " _"]
 
 
 def _halved(level: Float[Tensor, "H W channels"], *, rounded: bool) -> Float[Tensor, "h w channels"]:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from trompe_server.surrogate.pyramid import MipLayout, mip_layout, read_texels
+from trompe_server.surrogate.pyramid import MipLayout, mip_chains, mip_layout, read_texels
 from trompe_server.surrogate.rasterize import (
     CENTRE,
     MSAA4,
@@ -394,7 +394,7 @@ class AlphaTest:
         layout = mip_layout([(len(alpha), alpha.shape[1]) for alpha in mesh.opacities.values()])
         everything = [torch.arange(h * w, device=mesh.texture.device) for sizes in layout.sizes for h, w in sizes]
         planes = [alpha[..., None] for alpha in mesh.opacities.values()]
-        alpha = read_texels(planes, layout, everything, rounded=model.mips == "rounded")
+        alpha = read_texels(planes, mip_chains(layout, everything), rounded=model.mips == "rounded")
         return cls(mesh, model, layout, alpha[:, 0])
 
     def drawn(

@@ -6,10 +6,11 @@ texels = surrogate.texels(textures)
 images = surrogate.render(texels, batch=0)  # of the views surrogate.batches[0]; differentiable in the textures
 """
 
+import itertools
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Final
 
 import numpy as np
@@ -22,7 +23,7 @@ from torch.autograd.function import FunctionCtx
 from torch.nn.functional import softshrink
 
 from trompe_server.surrogate.canvas import Canvas, canvas_of
-from trompe_server.surrogate.pyramid import MipLayout, mip_layout, read_texels
+from trompe_server.surrogate.pyramid import MipChain, MipLayout, mip_chains, mip_layout, read_texels
 from trompe_server.surrogate.rasterize import Mesh, mesh_of, project, rasterize
 from trompe_server.surrogate.sampling import AlphaTest, Gather, SamplingModel, Taps, fragments_of, taps_of
 from trompe_server.surrogate.shading import CurveShading, DiffuseShading, Shading, decode, encode, fit_curve, lambert
@@ -74,8 +75,9 @@ class ViewBatch:
 class Geometry:
     """All views of one object under one sampling hypothesis. ``size`` is (H, W).
 
-    reads: of each mip level in the layout's order, the texels that some view reads, ascending. These alone, one level
-    after the other, are what the operators know as ``texels``.
+    reads: of each mip level in the layout's order, the texels that some view reads, in the order in which views first
+    do: what lies side by side in an image does so in memory. These alone, one level after the other, are what the
+    operators know as ``texels``.
     """
 
     textures: tuple[str, ...]
@@ -87,7 +89,12 @@ class Geometry:
 
     def texels(self, textures: Sequence[Float[Tensor, "H W 3"]], *, rounded: bool = False) -> Float[Tensor, "texels 3"]:
         """The texels that some view reads of the mip levels of ``textures``. Differentiable."""
-        return read_texels(textures, self.layout, self.reads, rounded=rounded)
+        return read_texels(textures, self.chains, rounded=rounded)
+
+    @cached_property
+    def chains(self) -> list[MipChain]:
+        """The mip levels of each texture, with what is read of them."""
+        return mip_chains(self.layout, self.reads)
 
     @property
     def device(self) -> torch.device:
@@ -113,15 +120,31 @@ def prepare_geometry(
     layout = mip_layout([obj.textures[name].shape[:2] for name in mesh.textures])
     test = AlphaTest.of(mesh, sampling)
     prepared = [_prepare_view(mesh, layout, test, view, size, sampling) for view in views]
-    read = torch.zeros(layout.total, dtype=torch.bool, device=device)
-    for view in prepared:
-        read[view.taps.index] = True
-    place = read.cumsum(0, dtype=torch.int32) - 1
-    by_level = torch.split(read, [h * w for sizes in layout.sizes for h, w in sizes])
-    reads = tuple(level.nonzero()[:, 0] for level in by_level)
+    reads = _in_order_of_reading([view.taps.index for view in prepared], layout)
+    starts = itertools.chain.from_iterable(layout.starts)
+    texels = torch.cat([level + start for level, start in zip(reads, starts, strict=True)])
+    place = torch.empty(layout.total, dtype=torch.int32, device=device)
+    place[texels] = torch.arange(len(texels), dtype=torch.int32, device=device)
     numbers = [range(first, min(first + BATCH, len(views))) for first in range(0, len(views), BATCH)]
-    batches = tuple(_joined(some, prepared[some.start : some.stop], place, size) for some in numbers)
+    batches = tuple(_joined(some, prepared[some.start : some.stop], place, len(texels), size) for some in numbers)
     return Geometry(mesh.textures, layout, reads, sampling, size, batches)
+
+
+NEVER: Final = torch.iinfo(torch.int64).max
+
+
+def _in_order_of_reading(taps: Sequence[Int[Tensor, " taps"]], layout: MipLayout) -> tuple[Int[Tensor, " _"], ...]:
+    """Of each mip level the texels that the ``taps`` of some view read, those first that are read first."""
+    first, count = torch.full((layout.total,), NEVER, device=taps[0].device), 0
+    for index in taps:
+        number = torch.arange(count, count + len(index), device=index.device)
+        first.scatter_reduce_(0, index.long(), number, "amin")
+        count += len(index)
+    reads = []
+    for level in torch.split(first, [h * w for sizes in layout.sizes for h, w in sizes]):
+        read = (level < NEVER).nonzero()[:, 0]
+        reads.append(read[level[read].argsort()])
+    return tuple(reads)
 
 
 @dataclass(frozen=True)
@@ -156,8 +179,11 @@ def _prepare_view(
     return _View(visibility.pixel, taps, coverage, shade / coverage.clamp(min=1e-6))
 
 
-def _joined(numbers: range, views: Sequence[_View], place: Int[Tensor, " texels"], size: tuple[int, int]) -> ViewBatch:
-    """``views``, which are those of ``numbers``, as one operator that finds texel ``t`` at ``place[t]``."""
+def _joined(
+    numbers: range, views: Sequence[_View], place: Int[Tensor, " texels"], n_texels: int, size: tuple[int, int]
+) -> ViewBatch:
+    """``views``, which are those of ``numbers``, as one operator that finds texel ``t`` of those read, of which there
+    are ``n_texels``, at ``place[t]``."""
     counts = tuple(len(view.pixel) for view in views)
     taps = Taps(
         torch.cat([view.taps.entry + sum(counts[:k]) for k, view in enumerate(views)]),
@@ -168,7 +194,7 @@ def _joined(numbers: range, views: Sequence[_View], place: Int[Tensor, " texels"
         numbers,
         torch.cat([view.pixel + k * size[0] * size[1] for k, view in enumerate(views)]),
         counts,
-        Gather.of(taps, sum(counts), int(place[-1]) + 1),
+        Gather.of(taps, sum(counts), n_texels),
         torch.cat([view.coverage for view in views]),
         torch.cat([view.shade for view in views]),
     )
@@ -191,7 +217,7 @@ class _RenderViews(Function):
     ) -> Float[Tensor, "batch 3 H W"]:
         some = surrogate.geometry.batches[batch]
         colours, slopes = surrogate.colours(texels.detach(), batch)
-        images = surrogate.base[some.views.start : some.views.stop].div(255)
+        images = surrogate.base[some.views.start : some.views.stop].float().div_(255)
         images.view(-1, 3).index_copy_(0, some.pixel, colours)
         if masks is not None:
             slopes = slopes * some.of(masks)[:, None]
@@ -260,7 +286,7 @@ class Surrogate:
         whole, masks = ([table[name] for name in geometry.textures] for table in (textures, moving))
         if not (self._last_canvas and self._last_canvas[0].fits(whole, masks)):
             rounded = geometry.sampling.mips == "rounded" and not linear
-            canvas = canvas_of(whole, masks, geometry.layout, geometry.reads, linear=linear, rounded=rounded)
+            canvas = canvas_of(whole, masks, geometry.chains, linear=linear, rounded=rounded)
             self._last_canvas[:] = [_Painted(whole, masks, canvas)]
         return self._last_canvas[0].canvas
 
