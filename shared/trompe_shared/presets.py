@@ -27,6 +27,6 @@ PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
     {
         "fast": _preset("a first look: few random views, few steps", pool=60, steps=25, held_out=30),
         "balanced": _preset("holds from unseen places too", pool=240, steps=90, held_out=60),
-        "best": _preset("for the strongest object, whatever it takes", pool=480, steps=300, held_out=200),
+        "best": _preset("for the strongest object, whatever it takes", pool=960, steps=300, held_out=200),
     }
 )
