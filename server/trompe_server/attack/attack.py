@@ -37,8 +37,8 @@ class Step:
     """What one step saw where it took its gradient, before it moved.
 
     loss: mean over its views. fooled: share of them on whose surrogate images every classifier is fooled. evaluations:
-    images that each classifier has been shown so far, forward and backward. A view that was safely won at its last
-    look rests for some steps and counts as won.
+    images that each classifier has been shown so far, with those by which runs are compared where one ends. A view that
+    was safely won at its last look rests for some steps and counts as won.
     """
 
     step: int
@@ -100,8 +100,8 @@ def attack(
         if search.over(point):
             break
         look, point = search.look(search.begin(point, step), step)
-        on_step(Step(step, look.loss, look.fooled, search.shown(point)))
         point = search.move(point, look, step)
+        on_step(Step(step, look.loss, look.fooled, search.shown(point)))
     return AttackState(state.step + steps, objective.split(point.delta), _split(objective, point.memory))
 
 

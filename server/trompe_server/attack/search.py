@@ -185,10 +185,12 @@ class Search:
         if len(found) == 1 and not self.schedule.restarts:
             return point
         losses = [self.objective.loss(delta) for delta in found]
+        shown = self.shown(point) + len(losses) * self.objective.surrogate.n_views
         if BEST in point.memory:
             found, losses = [point.memory[BEST], *found], [float(point.memory[BEST_LOSS]), *losses]
         loss, best = max(zip(losses, found, strict=True), key=lambda pair: pair[0])
-        kept = {**_mine(point.memory), BEST: best, BEST_LOSS: torch.tensor(loss, dtype=torch.float64)}
+        told = {BEST: best, BEST_LOSS: torch.tensor(loss, dtype=torch.float64), SHOWN: torch.tensor(shown)}
+        kept = {**_mine(point.memory), **told}
         return Point(best, kept) if step + 1 == self.schedule.total else Point(point.delta, kept)
 
 
