@@ -3,9 +3,9 @@
 python -m bench.augmentation [--csv docs/experiments/augmentation/results.csv] [--epsilon 0.05] [--steps 250]
 
 *Variants*: every shipped object is attacked once through the network as it is, and the network is tuned on pictures of
-the variants and of the objects as they are, as one would with `trompe experiment export-variants`. It learns these
-paints, and others fool it as before. *On the fly*: the paint is never finished. Each object has several, and every step
-of the training, on the surrogate's images, is a step of the attack on each of them too.
+the variants and of the objects as they are, as one would with `trompe experiment export-variants`. *On the fly*: the
+paint is never finished. Each object has several, and every step of the training, on the surrogate's images, is a step
+of the attack on each of them too.
 
 Judged in the target on views that no training picture was taken from: clean objects; variants that were made against
 the shipped network (kept apart from training); and variants that are made anew against the network itself, which is
