@@ -1,9 +1,7 @@
 """Fixtures for the tests of the server."""
 
 import io
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +11,6 @@ from PIL import Image
 from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, pack_zip
-
-sys.path.append(str(Path(__file__).parent))  # of what lies beside this file, for the tests as well
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl paint\nf 1/1 2/2 3/3\n"
 
