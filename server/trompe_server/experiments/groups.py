@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from trompe_shared.experiment_table import ResultRow
 
-__all__ = ["average", "deviation", "figure_words", "grouped", "known", "tau_words"]
+__all__ = ["average", "by_tau", "deviation", "figure_words", "grouped", "known", "tau_words"]
 
 K = TypeVar("K", bound=Hashable)
 R = TypeVar("R")
@@ -18,6 +18,11 @@ def grouped(rows: Iterable[R], key: Callable[[R], K]) -> dict[K, list[R]]:
     for row in rows:
         groups.setdefault(key(row), []).append(row)
     return groups
+
+
+def by_tau(rows: Iterable[ResultRow]) -> dict[float | None, list[ResultRow]]:
+    """Rows by threshold, ascending, those without saliency first."""
+    return grouped(sorted(rows, key=lambda row: row.tau or -1.0), lambda row: row.tau)
 
 
 def known(rows: Iterable[ResultRow], figure: str) -> list[float]:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from trompe_server.experiments.groups import average, figure_words, grouped, tau_words
+from trompe_server.experiments.groups import average, by_tau, figure_words, grouped, tau_words
 from trompe_server.experiments.table_one import RECOGNISED, PaperCell, paper_numbers
 from trompe_shared.experiment_table import ResultRow
 
@@ -23,11 +23,9 @@ def paper_means_markdown(rows: Sequence[ResultRow]) -> str:
         head += [f"ε {epsilon:g}", *(["paper's"] * (epsilon in told))]
     lines = ["| " + " | ".join(head) + " |", "|---|---|" + "---:|" * (len(head) - 2)]
     for classifier, group in grouped(counting, lambda row: row.classifier).items():
-        for tau in sorted({row.tau for row in group}, key=lambda tau: tau or -1.0):
-            lines.append(_line(classifier, tau, [row for row in group if row.tau == tau], epsilons, told))
+        lines += [_line(classifier, tau, some, epsilons, told) for tau, some in by_tau(group).items()]
     if not any(row.classifier == OTHERS_ONLY for row in counting):
-        for tau in sorted({row.tau for row in counting}, key=lambda tau: tau or -1.0):
-            lines.append(_line(OTHERS_ONLY, tau, [], epsilons, told))
+        lines += [_line(OTHERS_ONLY, tau, [], epsilons, told) for tau in by_tau(counting)]
     return "\n".join(lines) + "\n"
 
 

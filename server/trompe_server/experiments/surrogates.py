@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from trompe_server.experiments.groups import average, figure_words, grouped, tau_words
+from trompe_server.experiments.groups import average, by_tau, figure_words, grouped, tau_words
 from trompe_server.experiments.style import GREY, MARKERS, PALETTE, Drawing, drawing
 from trompe_server.experiments.table_one import RECOGNISED
 from trompe_shared.experiment_table import ResultRow
@@ -17,7 +17,7 @@ def surrogates_of(rows: Sequence[ResultRow]) -> list[str]:
 
 def surrogates_chart(rows: Sequence[ResultRow]) -> Drawing:
     """A panel for each tau: a dot for each object and surrogate, promised against kept. On the line nothing is lost."""
-    panels, names = _by_tau(_asked_of_all(rows)), surrogates_of(rows)
+    panels, names = by_tau(_asked_of_all(rows)), surrogates_of(rows)
     with drawing(size=(1.2 + 3.2 * len(panels), 3.9), panels=(1, len(panels)), sharex=True, sharey=True) as made:
         for axes, (tau, group) in zip(made.panels, panels.items(), strict=True):
             axes.plot([0, 1], [0, 1], color=GREY, lw=0.8, zorder=1)
@@ -53,7 +53,7 @@ def surrogates_markdown(rows: Sequence[ResultRow]) -> str:
     names = surrogates_of(rows)
     head = ["object", "A_before", *(word for name in names for word in (f"{name}: promised", "kept", "texels altered"))]
     parts = []
-    for tau, group in _by_tau(_asked_of_all(rows)).items():
+    for tau, group in by_tau(_asked_of_all(rows)).items():
         lines = [f"**{tau_words(tau)}**", "", "| " + " | ".join(head) + " |", "|---|" + "---:|" * (len(head) - 1)]
         counting = [row for row in group if (row.target_a_before or 0) >= RECOGNISED]
         for object_, some in grouped(group, lambda row: row.object).items():
@@ -78,7 +78,3 @@ def _asked_of_all(rows: Sequence[ResultRow]) -> list[ResultRow]:
     """The rows of those jobs that every surrogate has."""
     jobs = grouped(rows, lambda row: (row.object, row.classifier, row.epsilon, row.tau, row.seed))
     return [row for some in jobs.values() if len(surrogates_of(some)) == len(surrogates_of(rows)) for row in some]
-
-
-def _by_tau(rows: Sequence[ResultRow]) -> dict[float | None, list[ResultRow]]:
-    return grouped(sorted(rows, key=lambda row: row.tau or -1.0), lambda row: row.tau)
