@@ -84,7 +84,8 @@ def result_of(request: JobRequest) -> Result:
 
 
 class FakeService:
-    """Jobs that run when they are looked at; those of ``failing`` objects fail, ``refused`` ones are not taken."""
+    """Jobs that run when they are looked at; those of ``failing`` objects fail, ``refused`` ones are not taken, and
+    the jobs ``waiting`` stay so."""
 
     def __init__(self) -> None:
         self.by_key: dict[str, Job] = {}
@@ -92,6 +93,7 @@ class FakeService:
         self.uploads: list[File] = []
         self.failing: set[str] = set()
         self.refused: set[str] = set()
+        self.waiting: set[str] = set()
         self.goes_away_after: int | None = None
         self.looks = 0
         self.ids = count(1)
@@ -113,6 +115,8 @@ class FakeService:
         if self.goes_away_after is not None and self.looks > self.goes_away_after:
             raise ServerUnreachable("gone")
         found = next(each for each in self.by_key.values() if each.id == job)
+        if job in self.waiting:
+            return found
         bad = found.spec.object in self.failing
         state, error = (JobState.failed, "the renderer said no") if bad else (JobState.succeeded, None)
         return found.model_copy(
@@ -203,6 +207,17 @@ def test_what_the_server_has_done_before_is_fetched_before_anything_is_waited_fo
         ran(plan_of(), service, tmp_path / "now")
     rows = read_table(tmp_path / "now" / RESULTS, ResultRow)
     assert [(row.object, row.epsilon) for row in rows] == [("mug", 0.05), ("chair", 0.05)]
+
+
+def test_a_job_is_fetched_when_it_is_done_however_many_submitted_before_it_still_wait(
+    service: FakeService, tmp_path: Path
+) -> None:
+    plan = plan_of(objects={"mug": {}}, grid={"epsilon": [k / 100 for k in range(1, 3 * run.LOOK_AT + 1)]})
+    service.waiting = {f"job-{number}" for number in range(1, len(plan.rows))}  # all but the last
+    service.goes_away_after = 10 * len(plan.rows)
+    with pytest.raises(ServerUnreachable):
+        ran(plan, service, tmp_path)
+    assert [row.epsilon for row in read_table(tmp_path / RESULTS, ResultRow)] == [plan.rows[-1].request.epsilon]
 
 
 def test_rows_say_what_was_attacked_by_how_many_views_a_step_and_whether_images_were_diverse(

@@ -30,7 +30,8 @@ __all__ = ["Finished", "Outcome", "Show", "run_experiment"]
 PAUSE: Final = 1.0
 """Seconds between two looks at the jobs."""
 LOOK_AT: Final = 12
-"""Jobs that are looked at each time: the first of those that wait, since workers take them in this order."""
+"""Waiting jobs that are looked at each time, beside those that run: the next ones in turn, for workers may take them in
+any order."""
 REFUSED: Final = "refused"
 """State of a row that the server did not take."""
 TO_RETRY: Final = {JobState.failed.value, JobState.cancelled.value, REFUSED}
@@ -127,15 +128,22 @@ def _follow(
         else:
             waiting[row.key] = row, job
     while waiting:
-        for key in list(waiting)[:LOOK_AT]:
-            row, before = waiting[key]
+        for key in _next(waiting):
+            row, before = waiting.pop(key)
             job = service.job(before.id)
             show.look(row, job)
             if job.state.final:
-                del waiting[key]
                 yield row, _fetch(row, job, service, plan.experiment.artifacts)
+            else:
+                waiting[key] = row, job  # behind those that were not looked at
         if waiting:
             time.sleep(PAUSE)
+
+
+def _next(waiting: Mapping[str, tuple[Row, Job]]) -> list[str]:
+    """The jobs whose turn it is to be looked at: those that run, and the first few of the others."""
+    running = [key for key, (_, job) in waiting.items() if job.state is JobState.running]
+    return running + [key for key in waiting if key not in running][:LOOK_AT]
 
 
 def _submission_key(row: Row, before: Finished | None) -> str:
