@@ -20,6 +20,10 @@ from trompe_server.settings import Settings
 from trompe_shared.api import JobRequest
 
 JOBS = 120
+TAUS = [None, 0.05, 0.2]
+"""Of the first jobs, which are an experiment."""
+MUG = 5
+"""The mug's class in the shipped classifier."""
 
 
 class Browserless:
@@ -43,8 +47,9 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browserless]:
     prepare_data(settings)
     store, files = JobStore(settings.database_url), open_folder(settings.store_url)
     for seed in range(JOBS):
-        labels = {"sweep": "even" if seed % 2 == 0 else "odd"}
-        store.create(JobRequest.model_validate({"object": "mug", "label": "mug", "seed": seed, "labels": labels}))
+        labels = {"sweep": "even" if seed % 2 == 0 else "odd"} | ({"experiment": "few"} if seed < len(TAUS) else {})
+        options = {"tau": TAUS[seed] if seed < len(TAUS) else None, "seed": seed, "labels": labels}
+        store.create(JobRequest.model_validate({"object": "mug", "label": MUG if seed % 2 == 0 else "mug"} | options))
     library = Library(files.within("library"))
     app = create_app(Services(settings, library, store, files, Tokens(store.engine), list, list))
     yield Browserless(app)
@@ -72,6 +77,19 @@ def test_filters_go_along_to_the_next_page(client: Browserless) -> None:
     (older,) = re.findall(r'<a href="([^"]+)">Older</a>', page)
     rest = client.get(older.replace("&amp;", "&")).text
     assert len(jobs_on(page)) + len(jobs_on(rest)) == JOBS / 2
+
+
+def test_a_class_that_was_asked_for_by_its_number_has_its_name(client: Browserless) -> None:
+    assert set(re.findall(r'<span class="quiet"> as ([^<]+)<', client.get("/jobs").text)) == {"mug"}
+
+
+def test_an_experiment_shows_of_jobs_that_wait_the_options_in_which_they_differ(client: Browserless) -> None:
+    page = client.get("/experiments/few").text
+    columns = re.findall(r'<th scope="col"[^>]*>([^<]+)', page)
+    assert columns == ["Job", "epsilon", "tau", "seed", "A_drop", "held-out A_drop", "seconds", "State"]
+    cells = re.findall(r'<td class="number">([^<]*)', page)
+    lines = [cells[start : start + len(columns) - 2] for start in range(0, len(cells), len(columns) - 2)]
+    assert [line[:3] for line in lines] == [["0.05", "0.2", "2"], ["0.05", "0.05", "1"], ["0.05", "–", "0"]]
 
 
 @pytest.mark.parametrize("query", ["state=gone", "label=nocolon", "cursor=x"])

@@ -285,7 +285,7 @@ def row_of(whole: Whole, spec: JobSpec) -> JobRow:
         created=datetime(2026, 1, 1, tzinfo=UTC),
         artifacts=list(whole.reports["judge"].public),
     )
-    return job_row(job, object="chair", classifier="tiny")
+    return job_row(job, object="chair", classifier="tiny", label="chair")
 
 
 def test_the_page_of_a_light_shows_the_sky_and_says_where_the_light_went(light: Whole) -> None:

@@ -11,6 +11,8 @@ __all__ = ["Chart", "Point", "chart"]
 
 LEFT, RIGHT, TOP, BOTTOM = 60.0, 700.0, 20.0, 310.0
 STEPS: Final = (1, 2, 5)
+MARKS: Final = 16
+"""Eight colours, as discs and as squares."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def chart(points: Sequence[Point], *, measure: str) -> Chart:
                 "job": point.job,
                 "x": x(point.seconds),
                 "y": y(point.drop),
-                "series": objects.index(point.object) % 8,
+                "series": objects.index(point.object) % MARKS,
                 "title": f"{point.object}: A_drop {point.drop:.2f} in {point.seconds:.0f} s",
             }
             for point in points

@@ -1,6 +1,6 @@
 """What the ids in a job stand for, in words."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 
 from trompe_server.errors import NotFoundError
@@ -18,19 +18,30 @@ class Names:
     def __init__(self, library: Library) -> None:
         self._object = cache(lambda reference: _name(lambda: library.object(reference).name, reference))
         self._classifier = cache(lambda reference: _name(lambda: library.classifier(reference).name, reference))
-        self._library = library
+        self._classes = cache(lambda reference: _classes(library, reference))
 
     def row(self, job: Job) -> JobRow:
         """A job in a list."""
-        return job_row(job, object=self._object(job.spec.object), classifier=self._classifier(job.spec.classifier))
+        spec = job.spec
+        return job_row(
+            job,
+            object=self._object(spec.object),
+            classifier=self._classifier(spec.classifier),
+            label=self.classes(spec.classifier)(spec.label) if isinstance(spec.label, int) else spec.label,
+        )
 
     def classes(self, classifier: str) -> ClassNames:
         """What a classifier's classes are called."""
-        try:
-            known = self._library.classifier(classifier).classes
-        except NotFoundError:
-            known = None
-        return lambda index: known[index] if known and index < len(known) else f"class {index}"
+        known = self._classes(classifier)
+        return lambda index: known[index] if index < len(known) else f"class {index}"
+
+
+def _classes(library: Library, reference: str) -> Sequence[str]:
+    """The names of a classifier's classes, none where it is gone or has none."""
+    try:
+        return library.classifier(reference).classes or ()
+    except NotFoundError:
+        return ()
 
 
 def _name(look_up: Callable[[], str], reference: str) -> str:

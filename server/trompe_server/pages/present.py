@@ -8,7 +8,18 @@ from typing import Any, Final
 
 from trompe_shared.api import Accuracy, Job, JobSpec, LightFound, Result, VerticesMoved, ViewPrediction
 
-__all__ = ["TERMS", "ClassNames", "JobRow", "Shown", "command", "differences", "job_row", "present", "viewer_record"]
+__all__ = [
+    "TERMS",
+    "ClassNames",
+    "JobRow",
+    "Shown",
+    "command",
+    "differences",
+    "job_row",
+    "present",
+    "value_text",
+    "viewer_record",
+]
 
 ClassNames = Callable[[int], str]
 
@@ -74,14 +85,14 @@ class JobRow:
         return f"{self.state}-{self.fraction:.3f}-{self.phase}-{self.eta}"
 
 
-def job_row(job: Job, *, object: str, classifier: str) -> JobRow:
+def job_row(job: Job, *, object: str, classifier: str, label: str) -> JobRow:
     """A job, with the names of what its ids stand for."""
     progress, live = job.progress, not job.state.final
     kind = progress.phase.partition("-")[0]
     return JobRow(
         id=job.id,
         object=object,
-        label=str(job.spec.label),
+        label=label,
         classifier=classifier,
         change=_change(job.spec),
         epsilon=f"{job.spec.epsilon:g}" if job.spec.attack_on == "texture" else job.spec.attack_on,
@@ -271,25 +282,27 @@ def command(spec: JobSpec, *, object: str, classifier: str) -> str:
 def differences(left: Result, right: Result) -> list[dict[str, Any]]:
     """What was asked and what came out of two jobs, line by line."""
     specs = [side.spec.model_dump() for side in (left, right)]
-    lines = [{"name": name, "cells": [_text(spec[name]) for spec in specs]} for name in specs[0] if name != "object"]
+    asked = [name for name in specs[0] if name != "object"]
+    lines = [{"name": name, "cells": [value_text(spec[name]) for spec in specs]} for name in asked]
     for field, title in {"target": "target", "held_out": "held-out"}.items():
         judged: list[Accuracy | None] = [getattr(side, field) for side in (left, right)]
         drops = [each.a_drop if each else None for each in judged]
         lines.append({"name": f"A_drop, {title}", "cells": [_share(drop) for drop in drops]})
     for field, name in MEASURES.items():
-        lines.append({"name": name, "cells": [_text(getattr(side, field)) for side in (left, right)]})
+        lines.append({"name": name, "cells": [value_text(getattr(side, field)) for side in (left, right)]})
     seconds = [sum(side.seconds.values()) for side in (left, right)]
     lines.append({"name": "seconds", "cells": [f"{took:.1f}" for took in seconds]})
     return [line | {"differs": line["cells"][0] != line["cells"][1]} for line in lines]
 
 
-def _text(value: Any) -> str:
+def value_text(value: Any) -> str:
+    """An option or a figure in a few characters; a dash where there is none."""
     if value is None or value in ([], {}):
         return "–"
     if isinstance(value, float):
         return f"{value:.3g}"
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_text(each)}" for name, each in value.items())
+        return ", ".join(f"{name} {value_text(each)}" for name, each in value.items())
     if isinstance(value, (list, tuple)):
-        return " ".join(_text(each) for each in value)
+        return " ".join(value_text(each) for each in value)
     return str(value)

@@ -19,6 +19,7 @@ from trompe_server.api.services import Services, ServicesDep
 from trompe_server.database import DatabaseDownError
 from trompe_server.errors import NotFoundError
 from trompe_server.pages.chart import Point, chart
+from trompe_server.pages.experiment import columns_and_lines
 from trompe_server.pages.naming import Names
 from trompe_server.pages.pictures import Kind, ViewSet
 from trompe_server.pages.present import TERMS, JobRow, Shown, differences, present
@@ -188,19 +189,21 @@ def show_experiment(request: Request, services: ServicesDep, name: str, cursor: 
     found = services.store.page(labels={LABEL: name}, limit=500, cursor=cursor)
     if not found.jobs:
         raise NotFoundError(f"There is no experiment {name!r}.")
-    pairs = [(_row(services, job), _result(services, job)) for job in found.jobs]
-    states = [row.state for row, _ in pairs]
+    names = Names(services.library)
+    entries = [(names.row(job), job.spec, _result(services, job)) for job in found.jobs]
+    states = [row.state for row, _, _ in entries]
+    columns, lines = columns_and_lines(entries)
     return page(
         request,
         "experiment.html",
         name=name,
         counts={state: states.count(state) for state in dict.fromkeys(states)},
         chart=chart(
-            [point for row, result in pairs if (point := _point(row, result))],
+            [point for row, _, result in entries if (point := _point(row, result))],
             measure="A_drop in the target, held-out views",
         ),
-        columns=["epsilon", "tau", "seed", "steps", "views", "A_drop", "held-out A_drop", "seconds"],
-        lines=[_line(row, result) for row, result in pairs],
+        columns=columns,
+        lines=lines,
         older=found.next_cursor and f"?{urlencode({'cursor': found.next_cursor})}",
     )
 
@@ -296,13 +299,3 @@ def _point(row: JobRow, result: Result | None) -> Point | None:
     if not result or not judged or judged.a_drop is None:
         return None
     return Point(row.id, row.object, max(sum(result.seconds.values()), 0.1), judged.a_drop)
-
-
-def _line(row: JobRow, result: Result | None) -> dict[str, Any]:
-    cells: list[str] = ["–"] * 8
-    if result is not None:
-        drops = [accuracy.a_drop if accuracy else None for accuracy in (result.target, result.held_out)]
-        values = [result.epsilon, result.tau, result.seed, result.steps, result.target.views, *drops]
-        cells = ["–" if value is None else f"{value:.3g}" for value in values]
-        cells.append(f"{sum(result.seconds.values()):.0f}")
-    return {"job": row.id, "object": row.object, "state": row.state, "cells": cells}

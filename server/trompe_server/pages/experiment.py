@@ -1,0 +1,54 @@
+"""The table of an experiment: a line for each job, with what sets it apart and what came of it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from trompe_server.pages.present import JobRow, value_text
+from trompe_shared.api import JobSpec, Result
+
+__all__ = ["Entry", "Line", "columns_and_lines"]
+
+Entry = tuple[JobRow, JobSpec, Result | None]
+"""A job, what was asked, and what came out."""
+
+OUTCOME: Final = ("A_drop", "held-out A_drop", "seconds")
+
+
+@dataclass(frozen=True)
+class Line:
+    """A job in the table; a cell for each column."""
+
+    job: str
+    object: str
+    state: str
+    cells: Sequence[str]
+
+
+def columns_and_lines(entries: Sequence[Entry]) -> tuple[list[str], list[Line]]:
+    """Columns are epsilon, the other options in which jobs on the same object differ, and what came of them."""
+    asked = [spec.model_dump() | {"classifier": row.classifier, "label": row.label} for row, spec, _ in entries]
+    options = _that_differ([row.object for row, _, _ in entries], asked)
+    lines = [
+        Line(row.id, row.object, row.state, [*(value_text(spec[name]) for name in options), *_outcome(result)])
+        for (row, _, result), spec in zip(entries, asked, strict=True)
+    ]
+    return [*options, *OUTCOME], lines
+
+
+def _that_differ(objects: Sequence[str], asked: Sequence[Mapping[str, Any]]) -> list[str]:
+    first: dict[str, Mapping[str, Any]] = {}
+    differ = {"epsilon"}
+    for name, spec in zip(objects, asked, strict=True):
+        one = first.setdefault(name, spec)
+        differ |= {option for option in spec if option != "object" and spec[option] != one[option]}
+    return [option for option in asked[0] if option in differ]
+
+
+def _outcome(result: Result | None) -> list[str]:
+    nothing = value_text(None)
+    if result is None:
+        return [nothing] * len(OUTCOME)
+    drops = [judged.a_drop if judged else None for judged in (result.target, result.held_out)]
+    told = [nothing if drop is None else f"{drop:.2f}" for drop in drops]
+    return [*told, f"{sum(result.seconds.values()):.0f}"]
