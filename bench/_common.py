@@ -1,4 +1,4 @@
-"""What the benches share: the objects, a renderer to compare with, rounds of timing, tables."""
+"""What the benches share: the objects, a renderer to compare with, rounds of timing."""
 
 import gc
 import json
@@ -32,7 +32,6 @@ __all__ = [
     "bench_objects",
     "in_rounds",
     "machine",
-    "markdown_table",
     "painted_at_random",
     "rescaled",
     "running_renderer",
@@ -186,9 +185,3 @@ def machine() -> str:
         f"{platform.machine()}, {os.cpu_count()} cores ({torch.get_num_threads()} threads used), load {load}; "
         f"Python {platform.python_version()}, torch {torch.__version__}"
     )
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A table with the header's columns."""
-    lines = [list(header), ["---"] * len(header), *([str(cell) for cell in row] for row in rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -22,7 +22,8 @@ from typing import Any
 
 import httpx
 
-from bench._common import machine, markdown_table
+from bench._common import machine
+from trompe_server.markdown import markdown_table
 
 MARKS = {"reads": 0.050, "submits": 0.150}
 """Seconds that 99 of 100 must be answered in."""

@@ -15,6 +15,7 @@ from pathlib import Path
 from bench._common import running_renderer
 from bench._jobs import Paper
 from trompe_server.experiments.groups import figure_words
+from trompe_server.markdown import markdown_row, markdown_table
 from trompe_shared.api import Accuracy, Result
 
 OBJECTS = ("toilet_paper", "lamp_floor", "remote_controller", "plunger")
@@ -37,7 +38,7 @@ def main() -> None:
     """Run every object under every setting and print a row for each."""
     options = _options()
     rows = []
-    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
+    print(markdown_table(COLUMNS, []))
     with tempfile.TemporaryDirectory() as folder, running_renderer() as target:
         paper = Paper(Path(folder), [f"{options.classifier}.pt2"])
         settings = SETTINGS[:1] if options.plain else SETTINGS
@@ -59,7 +60,7 @@ def main() -> None:
             started = time.perf_counter()
             result = paper.run(spec, target)
             rows.append(_row(name, result, time.perf_counter() - started))
-            print("| " + " | ".join(rows[-1]) + " |", flush=True)
+            print(markdown_row(rows[-1]), flush=True)
     if options.csv:
         with options.csv.open("w", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])

@@ -26,12 +26,13 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.optim.lr_scheduler import OneCycleLR
 
-from bench._common import machine, markdown_table
+from bench._common import machine
 from trompe_server.classifiers import NetworkClassifier, WhiteBoxClassifier
 from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, TinyNet, load_tiny
 from trompe_server.experiments.disturbed import renderer
 from trompe_server.experiments.in_process import Change
 from trompe_server.experiments.variants import Variant, clean, make_variants, photographs
+from trompe_server.markdown import markdown_table
 from trompe_server.surrogate import Surrogate, textures_of
 from trompe_server.surrogate.calibration import build_surrogate, calibrate
 from trompe_server.target import TargetRenderer

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bench._common import BenchObject, assets, bench_objects, machine, markdown_table, running_renderer
+from bench._common import BenchObject, assets, bench_objects, machine, running_renderer
 from trompe_server.attack import Goal, ViewDistribution
 from trompe_server.attack.beyond import (
     LightPlace,
@@ -36,6 +36,7 @@ from trompe_server.attack.beyond import (
     shape_of,
 )
 from trompe_server.classifiers import NetworkClassifier, load_classifier
+from trompe_server.markdown import markdown_row, markdown_table
 from trompe_server.surrogate.calibration import calibrate
 from trompe_server.surrogate.shading import ENCODERS, Encoding, decode_as
 from trompe_server.target import SailenvTarget
@@ -251,7 +252,7 @@ def main() -> None:
             stage = staged(entry, target, network, labels[entry.name]["imagenet_class"])  # type: ignore[arg-type]
             for row in attacks(stage, options):
                 rows.append(row)
-                print("| " + " | ".join(row) + " |", flush=True)
+                print(markdown_row(row), flush=True)
     if options.csv is not None:
         with options.csv.open("w", newline="", encoding="utf-8") as file:
             csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])

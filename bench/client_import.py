@@ -21,7 +21,8 @@ import trompe_client
 import trompe_renderer
 import trompe_server
 import trompe_shared
-from bench._common import machine, markdown_table
+from bench._common import machine
+from trompe_server.markdown import markdown_table
 
 CONTENDERS = {
     "python, nothing imported": ["-c", ""],

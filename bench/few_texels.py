@@ -24,9 +24,10 @@ from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from bench._common import markdown_table, running_renderer
+from bench._common import running_renderer
 from bench._jobs import Paper, Rows
 from trompe_server.experiments.groups import average, figure_words
+from trompe_server.markdown import markdown_table
 from trompe_server.target import SailenvTarget
 from trompe_shared.errors import SpecError
 
@@ -239,11 +240,7 @@ def draw(rows: Sequence[Row], file: Path) -> None:
     with drawing(size=size, panels=(down, across), sharex=True, sharey=True) as made:
         for axes, name in zip(made.panels, names, strict=False):
             axes.axhline(ENOUGH, color=GREY, lw=1, ls=":")
-            for curve, look in zip(CURVES, looks, strict=True):
-                for shares, dropped in _lines(rows, name, curve.way):
-                    axes.plot(shares, dropped, ms=4, lw=1.2, clip_on=False, label=curve.label, **look)
-            if all(row.a_drop is None for row in rows if row.object == name):
-                axes.text(0.5, 0.5, "n.a.: not recognised", transform=axes.transAxes, ha="center", fontsize=8)
+            _draw_object(axes, [row for row in rows if row.object == name], looks)
             axes.set(title=name.replace("_", " "), xscale="log", ylim=(min(0.0, *drops), 1.02))
             axes.xaxis.set_major_formatter("{x:g}")
         for axes in made.panels[len(names) :]:
@@ -258,9 +255,18 @@ def draw(rows: Sequence[Row], file: Path) -> None:
     made.save(file.parent, file.stem, stamp=f"data {hashlib.sha256(data.encode()).hexdigest()[:16]}")
 
 
-def _lines(rows: Sequence[Row], name: str, way: Way) -> list[tuple[list[float], list[float]]]:
+def _draw_object(axes: Any, rows: Sequence[Row], looks: Sequence[Any]) -> None:
+    """The lines of one object, each way as its look says; or that it was not recognised."""
+    for curve, look in zip(CURVES, looks, strict=True):
+        for shares, dropped in _lines(rows, curve.way):
+            axes.plot(shares, dropped, ms=4, lw=1.2, clip_on=False, label=curve.label, **look)
+    if all(row.a_drop is None for row in rows):
+        axes.text(0.5, 0.5, "n.a.: not recognised", transform=axes.transAxes, ha="center", fontsize=8)
+
+
+def _lines(rows: Sequence[Row], way: Way) -> list[tuple[list[float], list[float]]]:
     """For each seed, shares altered (%) in rising order and what drops."""
-    known = [row for row in rows if row.object == name and row.way == way and row.n and row.a_drop is not None]
+    known = [row for row in rows if row.way == way and row.n and row.a_drop is not None]
     mine = sorted(known, key=lambda row: row.n)
     by_seed = [[row for row in mine if row.seed == seed] for seed in dict.fromkeys(row.seed for row in mine)]
     return [([100 * row.n for row in some], [row.a_drop or 0.0 for row in some]) for some in by_seed]

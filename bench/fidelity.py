@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench._common import BenchObject, bench_objects, machine, markdown_table, running_renderer
+from bench._common import BenchObject, bench_objects, machine, running_renderer
+from trompe_server.markdown import markdown_row, markdown_table
 from trompe_server.surrogate import SamplingModel
 from trompe_server.surrogate.calibration import (
     Calibration,
@@ -179,7 +180,7 @@ def main() -> None:
             views = entry.views(azimuths=options.azimuths, elevations=options.elevations)
             clock = Clock(target, options.size)
             rows.append(measure(entry, views, clock, model=options.model, seed=options.seed))
-            print("| " + " | ".join(rows[-1].cells()) + " |", flush=True)
+            print(markdown_row(rows[-1].cells()), flush=True)
     print("\n" + marks(rows))
     if options.csv is not None:
         write_csv(options.csv, rows)

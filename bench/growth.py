@@ -22,7 +22,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench._common import BenchObject, bench_objects, machine, markdown_table, painted_at_random
+from bench._common import BenchObject, bench_objects, machine, painted_at_random
+from trompe_server.markdown import markdown_table
 from trompe_server.memory import keep_freed_memory
 from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
 from trompe_server.surrogate.calibration import CURVE_GREYS, Calibration, Fidelity, build_surrogate

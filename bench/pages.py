@@ -18,7 +18,6 @@ import httpx
 import uvicorn
 from fastapi import FastAPI
 
-from bench._common import markdown_table
 from bench.job_list import fill, measured
 from trompe_server.access import Tokens
 from trompe_server.api.services import Services
@@ -27,6 +26,7 @@ from trompe_server.artifacts import open_folder
 from trompe_server.jobs.store import JobStore
 from trompe_server.jobs.worker import prepare_data
 from trompe_server.library import Library
+from trompe_server.markdown import markdown_table
 from trompe_server.settings import Settings
 
 PATHS = ("/", "/jobs", "/jobs?state=failed", "/jobs?cursor=5000", "/jobs/new", "/experiments")

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from bench._common import BenchObject, bench_objects, in_rounds, machine, markdown_table, running_renderer
+from bench._common import BenchObject, bench_objects, in_rounds, machine, running_renderer
 from trompe_renderer.engine import Engine
 from trompe_renderer.model import Library
 from trompe_renderer.options import Quality
@@ -35,6 +35,7 @@ from trompe_renderer.passes import ObjectRenderer
 from trompe_renderer.platform import GL
 from trompe_renderer.scenery import Scenery
 from trompe_renderer.session import Session
+from trompe_server.markdown import markdown_table
 from trompe_server.target import SailenvTarget
 from trompe_server.target import sailenv as client
 from trompe_shared.geometry import View, sailenv_pose

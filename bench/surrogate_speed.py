@@ -17,19 +17,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench._common import (
-    BenchObject,
-    Times,
-    assets,
-    bench_objects,
-    in_rounds,
-    machine,
-    markdown_table,
-    painted_at_random,
-    rescaled,
-)
+from bench._common import BenchObject, Times, assets, bench_objects, in_rounds, machine, painted_at_random, rescaled
 from trompe_server.attack import Budget, Goal, attack, movable, start
 from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
+from trompe_server.markdown import markdown_table
 from trompe_server.memory import keep_freed_memory
 from trompe_server.phased_job import CHUNK
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of

@@ -17,10 +17,11 @@ from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict
 
-from bench._common import markdown_table, running_renderer
+from bench._common import running_renderer
 from bench._jobs import Paper, Rows
 from trompe_server.attack.metrics import FEW_RECOGNISED
 from trompe_server.experiments.groups import figure_words
+from trompe_server.markdown import markdown_table
 from trompe_server.reports import TransferMatrix
 from trompe_server.target import SailenvTarget
 from trompe_shared.api import Accuracy, Result

@@ -401,7 +401,7 @@ def test_the_matrix_is_written_for_people_and_for_programs() -> None:
     matrix = TransferMatrix(("a", "x|y"), ("a", "b"), ((1.0, None), (-0.126, 0.5)), ((3, 0), (2, 1)))
     assert matrix.markdown().splitlines() == [
         r"| attacked \ judged by | a | b |",
-        "| --- | ---: | ---: |",
+        "|---|---:|---:|",
         "| a | 1.00 (3) | n.a. |",
         r"| x\|y | -0.13 (2) | 0.50 (1) |",
     ]

@@ -41,7 +41,7 @@ Z: Final = NormalDist().inv_cdf(0.975)
 """Normal quantile of a two-sided 95 % interval."""
 RESAMPLES: Final = 4000
 FEW_RECOGNISED: Final = 0.3
-"""An ``a_before`` below this is worth a warning: few views are left for ``a_drop`` to rest on."""
+"""An ``a_before`` below this is worth a warning: few views are left for ``a_drop`` to rest on. It counts in no mean."""
 
 LITTLE: Final = 0.3
 """An ``a_drop`` below this is worth one too."""

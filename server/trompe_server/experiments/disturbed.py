@@ -158,13 +158,12 @@ def jittered(degrees: float, share: float) -> Aim:
     return aim
 
 
-def relit(azimuth: float, elevation: float = 0.0, intensity: float = 1.0) -> Aim:
-    """Light from so many degrees elsewhere, and so much brighter."""
+def relit(azimuth: float, intensity: float = 1.0) -> Aim:
+    """Light from so many degrees of azimuth elsewhere, and so much brighter."""
 
     def aim(view: View, _: int) -> View:
         light = view.light
-        lifted = float(np.clip(light.elevation + elevation, -90, 90))
-        moved = replace(light, azimuth=light.azimuth + azimuth, elevation=lifted, intensity=light.intensity * intensity)
+        moved = replace(light, azimuth=light.azimuth + azimuth, intensity=light.intensity * intensity)
         return replace(view, light=moved)
 
     return aim

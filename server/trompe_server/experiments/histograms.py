@@ -16,17 +16,15 @@ TOP = 6
 COLUMNS = 3
 
 
-def prediction_histograms(
-    rows: Sequence[ResultRow], predictions: Sequence[PredictionRow], *, views: str = "target"
-) -> Drawing:
+def prediction_histograms(rows: Sequence[ResultRow], predictions: Sequence[PredictionRow]) -> Drawing:
     """A panel for each job of ``rows``: its own class first, then the most frequent others. Bars are numbers of views.
 
-    Raises ``SpecError`` when no row has predictions of ``views`` (target or held_out).
+    Raises ``SpecError`` when no row has predictions of the target views.
     """
-    by_key = grouped((p for p in predictions if p.views == views), lambda p: p.key)
+    by_key = grouped((p for p in predictions if p.views == "target"), lambda p: p.key)
     jobs = [row for row in rows if row.key in by_key]
     if not jobs:
-        raise SpecError(f"There are no predictions of the {views} views of these rows; run the experiment again.")
+        raise SpecError("There are no predictions of the target views of these rows; run the experiment again.")
     columns = min(COLUMNS, len(jobs))
     shape = -(-len(jobs) // columns), columns
     with drawing(size=(3.6 * columns, 0.5 + 2.1 * shape[0]), panels=shape) as made:

@@ -16,10 +16,9 @@ AZIMUTH = 30.0
 
 @dataclass(frozen=True)
 class LibraryObject:
-    """An object, its class, the camera's distance (metres) and its range of elevations (degrees)."""
+    """An object, the camera's distance (metres) and its range of elevations (degrees)."""
 
     name: str
-    label: str
     obj: Object3D
     distance: float
     elevation: tuple[float, float]
@@ -28,7 +27,7 @@ class LibraryObject:
 def shipped() -> list[LibraryObject]:
     """The objects that come with Trompe."""
     return [
-        LibraryObject(each.name, each.label, load_object(each.read()), each.distance, each.elevation)
+        LibraryObject(each.name, load_object(each.read()), each.distance, each.elevation)
         for each in shipped_objects().values()
     ]
 
@@ -39,7 +38,6 @@ def paper_objects(assets: Path) -> list[LibraryObject]:
     return [
         LibraryObject(
             name,
-            str(row["imagenet_class"]),
             load_object(assets / "objects" / name),
             row["distance"],
             (row["elevation_range"][0], row["elevation_range"][1]),

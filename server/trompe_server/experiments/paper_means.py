@@ -3,8 +3,10 @@
 from collections.abc import Iterable, Sequence
 from typing import Final
 
+from trompe_server.attack.metrics import FEW_RECOGNISED
 from trompe_server.experiments.groups import average, by_tau, figure_words, grouped, tau_words
-from trompe_server.experiments.table_one import RECOGNISED, PaperCell, paper_numbers
+from trompe_server.experiments.table_one import PaperCell, paper_numbers
+from trompe_server.markdown import markdown_table
 from trompe_shared.experiment_table import ResultRow
 
 __all__ = ["paper_means_markdown"]
@@ -15,23 +17,23 @@ OTHERS_ONLY: Final = "inception_v3"
 
 def paper_means_markdown(rows: Sequence[ResultRow]) -> str:
     """A line for each classifier and tau, budgets across; means over the objects with A_before >= 0.3."""
-    counting = [row for row in rows if (row.target_a_before or 0) >= RECOGNISED and row.target_a_drop is not None]
+    counting = [row for row in rows if (row.target_a_before or 0) >= FEW_RECOGNISED and row.target_a_drop is not None]
     epsilons = sorted({row.epsilon for row in counting})
     told = sorted({cell.epsilon for cell in paper_numbers()} & set(epsilons))
     head = ["classifier", "texels", "objects", "surrogate and target differ by"]
     for epsilon in epsilons:
         head += [f"ε {epsilon:g}", *(["paper's"] * (epsilon in told))]
-    lines = ["| " + " | ".join(head) + " |", "|---|---|" + "---:|" * (len(head) - 2)]
+    lines = []
     for classifier, group in grouped(counting, lambda row: row.classifier).items():
         lines += [_line(classifier, tau, some, epsilons, told) for tau, some in by_tau(group).items()]
     if not any(row.classifier == OTHERS_ONLY for row in counting):
         lines += [_line(OTHERS_ONLY, tau, [], epsilons, told) for tau in by_tau(counting)]
-    return "\n".join(lines) + "\n"
+    return markdown_table(head, lines, align="ll" + "r" * (len(head) - 2)) + "\n"
 
 
 def _line(
     classifier: str, tau: float | None, rows: Sequence[ResultRow], epsilons: Sequence[float], told: Sequence[float]
-) -> str:
+) -> list[str]:
     gap = average(abs(row.transfer_gap) for row in rows if row.transfer_gap is not None)
     objects = str(len({row.object for row in rows})) if rows else ""
     cells = [classifier, tau_words(tau), objects, figure_words(gap, 3) if rows else ""]
@@ -41,7 +43,7 @@ def _line(
         if epsilon in told:
             theirs = [cell for cell in paper_numbers() if (cell.classifier, cell.tau) == (classifier, tau)]
             cells.append(_theirs(cell for cell in theirs if cell.epsilon == epsilon))
-    return "| " + " | ".join(cells) + " |"
+    return cells
 
 
 def _ours(rows: Sequence[ResultRow]) -> str:

@@ -12,6 +12,7 @@ from matplotlib.ticker import LogFormatter
 from trompe_server.experiments.front import front_of
 from trompe_server.experiments.groups import average, deviation, figure_words, grouped, known
 from trompe_server.experiments.style import GREY, INK, MARKERS, PALETTE, Drawing, drawing
+from trompe_server.markdown import markdown_table
 from trompe_shared.experiment_table import ResultRow
 
 __all__ = ["Configuration", "configurations", "pareto_front", "pareto_markdown", "speed_accuracy_chart"]
@@ -193,18 +194,16 @@ def pareto_markdown(rows: Sequence[ResultRow]) -> str:
     by_time, by_images = configurations(rows), configurations(rows, cost="evaluations")
     images = {(point.series, point.name): point.cost for point in by_images}
     fronts = {"time": _names(pareto_front(by_time)), "images": _names(pareto_front(by_images))}
-    lines = [
-        "| varied | configuration | s | images | held-out A_drop | target A_drop | transfer gap | on front | jobs |"
-    ]
-    lines.append("|---|---|---:|---:|---:|---:|---:|---|---:|")
+    head = ["varied", "configuration", "s", "images", "held-out A_drop", "target A_drop", "transfer gap", "on front"]
+    lines = []
     for point in sorted(by_time, key=lambda p: p.cost):
         place = point.series, point.name
         front = [words for words, names in fronts.items() if place in names]
         name = f"**{point.name}**" if front else point.name
         cells = [f"{point.cost:.3g}", f"{images[place]:.0f}" if place in images else "n.a."]
         cells += [_gain(point), figure_words(point.target), figure_words(point.gap), ", ".join(front)]
-        lines.append(f"| {point.series} | {name} | {' | '.join(cells)} | {point.jobs} |")
-    return _presets_markdown(by_time) + "\n".join(lines) + "\n"
+        lines.append([point.series, name, *cells, point.jobs])
+    return _presets_markdown(by_time) + markdown_table([*head, "jobs"], lines, align="llrrrrrlr") + "\n"
 
 
 def _names(points: Sequence[Configuration]) -> set[tuple[str, str]]:
@@ -216,10 +215,9 @@ def _presets_markdown(points: Sequence[Configuration]) -> str:
     presets, front = [point for point in points if point.series == PRESET], pareto_front(points)
     if not presets:
         return ""
-    lines = ["| preset | s | held-out A_drop | beside the Pareto front |", "|---|---:|---:|---|"]
-    for point in presets:
-        lines.append(f"| {point.name} | {point.cost:.3g} | {_gain(point)} | {_beside(point, front)} |")
-    return "\n".join(lines) + "\n\n"
+    head = ["preset", "s", "held-out A_drop", "beside the Pareto front"]
+    lines = [[point.name, f"{point.cost:.3g}", _gain(point), _beside(point, front)] for point in presets]
+    return markdown_table(head, lines, align="lrrl") + "\n\n"
 
 
 def _beside(point: Configuration, front: Sequence[Configuration]) -> str:

@@ -15,6 +15,7 @@ from PIL import Image
 from trompe_server.experiments.figures import Data, figures_of, histogram_rows, plain_rows, read_data
 from trompe_server.experiments.groups import known
 from trompe_server.experiments.pictures import job_pictures
+from trompe_server.markdown import cells_of
 from trompe_shared.experiment_table import RESULTS, ResultRow
 
 __all__ = ["write_report"]
@@ -177,7 +178,7 @@ def _html_table(markdown: str) -> str:
         if not lines[0].startswith("|"):
             parts.append(f"<p>{_bold(block)}</p>")
             continue
-        rows = [line.strip("|").split("|") for k, line in enumerate(lines) if k != 1]
+        rows = [cells_of(line) for k, line in enumerate(lines) if k != 1]
         parts.append(
             "<table>" + "".join(_html_row(row, "th" if k == 0 else "td") for k, row in enumerate(rows)) + "</table>"
         )
@@ -185,7 +186,7 @@ def _html_table(markdown: str) -> str:
 
 
 def _html_row(cells: Sequence[str], tag: str) -> str:
-    return "<tr>" + "".join(f"<{tag}>{_bold(cell.strip())}</{tag}>" for cell in cells) + "</tr>"
+    return "<tr>" + "".join(f"<{tag}>{_bold(cell)}</{tag}>" for cell in cells) + "</tr>"
 
 
 def _bold(text: str) -> str:

@@ -7,8 +7,9 @@ from typing import Any, Final
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from trompe_server.experiments.groups import average, deviation, figure_words, grouped, known
+from trompe_server.experiments.groups import average, figure_words, grouped, known
 from trompe_server.experiments.style import BLUE, GREEN, GREY, INK, RED, Drawing, drawing
+from trompe_server.markdown import markdown_table
 from trompe_shared.experiment_table import ResultRow
 
 __all__ = ["Behaviour", "behaviours", "stability_chart", "stability_markdown"]
@@ -43,7 +44,6 @@ class Behaviour:
     target_interval: tuple[float, float] | None
     held_out: float | None
     held_out_interval: tuple[float, float] | None
-    spread: float
     noticed: float
     said: tuple[str, ...]
 
@@ -88,7 +88,6 @@ def _behaviour(case: str, rows: Sequence[ResultRow]) -> Behaviour:
         _interval(rows, "target"),
         average(row.held_out_a_drop for row in rows),
         _interval(rows, "held_out"),
-        deviation(known(rows, "held_out_a_drop")),
         sum(bool(row.warnings or row.error) for row in rows) / len(rows),
         tuple(often),
     )
@@ -166,15 +165,13 @@ def stability_markdown(rows: Sequence[ResultRow]) -> str:
     cases = behaviours(rows)
     reference = _reference(cases)
     head = ["case", "jobs", "A_before", "surrogate", "target", "held-out", "noticed", "verdict", "what it said"]
-    lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * 6 + "---|---|"]
+    lines = []
     for case in cases:
-        figures = [str(case.jobs), _cell(case.a_before), _cell(case.surrogate)]
+        figures = [case.jobs, _cell(case.a_before), _cell(case.surrogate)]
         figures += [_cell(case.target, case.target_interval), _cell(case.held_out, case.held_out_interval)]
-        said = case.said[0].replace("|", "/") if case.said else ""
-        lines.append(
-            f"| {case.case} | {' | '.join(figures)} | {case.noticed:.0%} | {_verdict(case, reference)[0]} | {said} |"
-        )
-    return "\n".join(lines) + "\n"
+        said = case.said[0] if case.said else ""
+        lines.append([case.case, *figures, f"{case.noticed:.0%}", _verdict(case, reference)[0], said])
+    return markdown_table(head, lines, align="lrrrrrrll") + "\n"
 
 
 def _cell(value: float | None, interval: tuple[float, float] | None = None) -> str:

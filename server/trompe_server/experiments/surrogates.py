@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 
+from trompe_server.attack.metrics import FEW_RECOGNISED
 from trompe_server.experiments.groups import average, by_tau, figure_words, grouped, tau_words
 from trompe_server.experiments.style import GREY, MARKERS, PALETTE, Drawing, drawing
-from trompe_server.experiments.table_one import RECOGNISED
+from trompe_server.markdown import markdown_table
 from trompe_shared.experiment_table import ResultRow
 
 __all__ = ["surrogates_chart", "surrogates_markdown", "surrogates_of"]
@@ -54,24 +55,24 @@ def surrogates_markdown(rows: Sequence[ResultRow]) -> str:
     head = ["object", "A_before", *(word for name in names for word in (f"{name}: promised", "kept", "texels altered"))]
     parts = []
     for tau, group in by_tau(_asked_of_all(rows)).items():
-        lines = [f"**{tau_words(tau)}**", "", "| " + " | ".join(head) + " |", "|---|" + "---:|" * (len(head) - 1)]
-        counting = [row for row in group if (row.target_a_before or 0) >= RECOGNISED]
+        lines = []
+        counting = [row for row in group if (row.target_a_before or 0) >= FEW_RECOGNISED]
         for object_, some in grouped(group, lambda row: row.object).items():
             before = average(row.target_a_before for row in some)
             lines.append(_line(object_, figure_words(before), some, names))
-        lines.append(_line(f"**mean** of those with A_before ≥ {RECOGNISED:g}", "", counting, names))
-        parts.append("\n".join(lines))
+        lines.append(_line(f"**mean** of those with A_before ≥ {FEW_RECOGNISED:g}", "", counting, names))
+        parts.append(f"**{tau_words(tau)}**\n\n{markdown_table(head, lines, align='l' + 'r' * (len(head) - 1))}")
     return "\n\n".join(parts) + "\n"
 
 
-def _line(title: str, before: str, rows: Sequence[ResultRow], names: Sequence[str]) -> str:
+def _line(title: str, before: str, rows: Sequence[ResultRow], names: Sequence[str]) -> list[str]:
     cells = [title, before]
     for name in names:
         mine = [row for row in rows if row.surrogate == name]
         promised, kept = average(row.surrogate_a_drop for row in mine), average(row.target_a_drop for row in mine)
         altered = average(row.texels_altered for row in mine)
         cells += [figure_words(promised), f"**{figure_words(kept)}**", "n.a." if altered is None else f"{altered:.1%}"]
-    return "| " + " | ".join(cells) + " |"
+    return cells
 
 
 def _asked_of_all(rows: Sequence[ResultRow]) -> list[ResultRow]:

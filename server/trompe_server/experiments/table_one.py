@@ -13,19 +13,17 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from statistics import fmean
-from typing import Final
 
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from trompe_server.attack.metrics import FEW_RECOGNISED
 from trompe_server.experiments.groups import average, figure_words, grouped
 from trompe_server.experiments.style import BLUE, GREEN, GREY, INK, Drawing, drawing
+from trompe_server.markdown import markdown_table
 from trompe_shared.experiment_table import ResultRow
 
-__all__ = ["RECOGNISED", "Cell", "PaperCell", "paper_numbers", "table_one", "table_one_chart", "table_one_markdown"]
-
-RECOGNISED: Final = 0.3
-"""Objects that are recognised in a smaller share of the views than this count in no mean."""
+__all__ = ["Cell", "PaperCell", "paper_numbers", "table_one", "table_one_chart", "table_one_markdown"]
 
 
 @dataclass(frozen=True)
@@ -52,13 +50,12 @@ class Cell:
     surrogate: float | None
     target: float | None
     held_out: float | None
-    seeds: int
     paper: PaperCell | None
 
     @property
     def counts(self) -> bool:
         """Whether enough was recognised for the cell to count in a mean."""
-        return self.target is not None and self.a_before is not None and self.a_before >= RECOGNISED
+        return self.target is not None and self.a_before is not None and self.a_before >= FEW_RECOGNISED
 
 
 @cache
@@ -96,7 +93,6 @@ def table_one(rows: Sequence[ResultRow]) -> list[Cell]:
                 average(row.surrogate_a_drop for row in group),
                 average(row.target_a_drop for row in group),
                 average(row.held_out_a_drop for row in group),
-                len(group),
                 paper.get(key),
             )
         )
@@ -135,16 +131,16 @@ def _markdown(cells: Sequence[Cell], *, with_paper: bool) -> str:
     head = ["object", "A_before"]
     for epsilon in epsilons:
         head += [f"surrogate, ε {epsilon:g}", "target", *(["paper: surrogate", "paper: target"] * (epsilon in told))]
-    lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * (len(head) - 1)]
+    lines = []
     for object_, row in grouped(cells, lambda cell: cell.object).items():
         by_epsilon = {cell.epsilon: cell for cell in row}
         figures = [figure_words(row[0].a_before)]
         for epsilon in epsilons:
             figures += _figures(by_epsilon.get(epsilon), with_paper=epsilon in told)
-        lines.append(f"| {object_} | " + " | ".join(figures) + " |")
+        lines.append([object_, *figures])
     means = [text for epsilon in epsilons for text in _means(cells, epsilon, with_paper=epsilon in told)]
-    lines.append("| **mean** of those with A_before ≥ 0.3 | | " + " | ".join(means) + " |")
-    return "\n".join(lines) + "\n"
+    lines.append([f"**mean** of those with A_before ≥ {FEW_RECOGNISED:g}", "", *means])
+    return markdown_table(head, lines, align="l" + "r" * (len(head) - 1)) + "\n"
 
 
 def _figures(cell: Cell | None, *, with_paper: bool) -> list[str]:
@@ -213,7 +209,9 @@ def _draw_line(axes: Axes, y: int, cell: Cell) -> None:
 
 def _legend(made: Drawing, *, paper: bool) -> None:
     marks = [
-        Line2D([], [], marker="o", ms=7, color=BLUE, ls="", label="ours, target (faint: A_before < 0.3)"),
+        Line2D(
+            [], [], marker="o", ms=7, color=BLUE, ls="", label=f"ours, target (faint: A_before < {FEW_RECOGNISED:g})"
+        ),
         Line2D([], [], marker="D", ms=5, color=GREEN, ls="", label="ours, held-out views"),
     ]
     if paper:

@@ -22,7 +22,7 @@ from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import ShippedObject, shipped_objects
 
-__all__ = ["CLEAN", "Variant", "clean", "export_variants", "make_variants", "photographs"]
+__all__ = ["Variant", "clean", "export_variants", "make_variants", "photographs"]
 
 CLEAN: Final = "clean"
 TEST_SHARE: Final = 0.2

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from trompe_server.attack.metrics import FEW_RECOGNISED
+from trompe_server.markdown import markdown_table
 from trompe_server.reports.heat import heat_colours
 from trompe_server.reports.layout import CAPTION, GAP, INK, PAPER, beside, line, sheet, stacked
 from trompe_shared.api import Accuracy, Result
@@ -39,12 +40,11 @@ class TransferMatrix:
     def markdown(self) -> str:
         """A table for people: drops to two places, with the number of results they are means of."""
         head = ["attacked \\ judged by", *self.judging]
-        rows = [head, ["---"] + ["---:"] * len(self.judging)]
-        rows += [
+        rows = [
             [name, *(_words(*cell) for cell in zip(drops, counts, strict=True))]
             for name, drops, counts in zip(self.attacked, self.drops, self.counts, strict=True)
         ]
-        return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |\n" for row in rows)
+        return markdown_table(head, rows, align="l" + "r" * len(self.judging)) + "\n"
 
     def csv(self) -> str:
         """A table for programs: a line for each cell, ``a_drop`` empty where it is n.a."""
