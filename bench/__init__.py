@@ -1,9 +1,8 @@
 """Benches of the surrogate: fidelity, speed, growth. Run them from the repository's root: `python -m bench.fidelity`.
 
-The threads are set here because OpenMP reads its environment once, when torch is first imported.
+They have two threads, prepared as those of attack workers are.
 """
 
-import os
+from trompe_server.threads import prepare_threads
 
-os.environ.setdefault("OMP_NUM_THREADS", "2")
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+prepare_threads(2)

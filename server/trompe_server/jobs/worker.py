@@ -26,6 +26,7 @@ from trompe_server.jobs.store import JobStore
 from trompe_server.log import about_job
 from trompe_server.memory import keep_freed_memory
 from trompe_server.settings import Settings
+from trompe_server.threads import prepare_threads
 
 __all__ = ["READY", "prepare_data", "run_worker"]
 
@@ -61,20 +62,14 @@ def run_worker(settings: Settings, renderers: Renderers, *, announce: Callable[[
 
     ``announce`` is given the line READY once the worker takes jobs.
     """
-    prepare_environment()
+    keep_freed_memory()
+    prepare_threads()
     prepare_data(settings)
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     with worker_name(settings.data / "workers") as name:
         _work(settings, renderers, name, stop, announce)
-
-
-def prepare_environment() -> None:
-    """Thread counts for the libraries that are imported later (values that are set already stay), and memory."""
-    keep_freed_memory()
-    os.environ.setdefault("OMP_NUM_THREADS", str(len(os.sched_getaffinity(0))))
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def _work(
