@@ -21,7 +21,7 @@ demo: $(VENV)/.installed-server egl
 	$(BIN)/trompe demo --out trompe-demo
 
 test: $(VENV)/.installed-dev egl
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
 chaos: $(VENV)/.installed-dev egl
 	$(BIN)/python -m pytest -m "chaos and not slow" tests/service/test_chaos.py

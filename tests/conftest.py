@@ -8,17 +8,16 @@ import subprocess
 import sys
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from hypothesis import settings
 from numpy.typing import ArrayLike, NDArray
 
 from trompe_server.target import SailenvTarget
 from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files
 from trompe_shared.shipped import shipped_objects
-
-sys.path.append(str(Path(__file__).parent))  # of what lies beside this file, for all tests
 
 Surface = tuple[ArrayLike, ArrayLike, NDArray[np.uint8]]
 """Corners (F, 3, 3) in metres, their texture coordinates (F, 3, 2), and the texture (H, W, 3) they are painted with."""
@@ -27,9 +26,22 @@ INSTALLABLE = re.compile("install|NOT TESTED")
 """What the reason says of a test that is skipped for want of something that could be installed."""
 
 
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
+
+
 def pytest_configure() -> None:
     """Let Ctrl-C reach what tests start, also where a shell ran us in the background and had it ignored."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    share_the_cores(int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)))
+
+
+def share_the_cores(processes: int) -> None:
+    """Of several test processes, each has its share of the threads, and so have those that it starts."""
+    if processes > 1:
+        threads = max(1, len(os.sched_getaffinity(0)) // processes)
+        os.environ.setdefault("OMP_NUM_THREADS", str(threads))
+        torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
 
 
 @pytest.hookimpl(wrapper=True)

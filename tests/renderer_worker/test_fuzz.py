@@ -49,7 +49,7 @@ def reader(data: bytes) -> Reader:
     return read
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(st.binary(max_size=300), st.sampled_from([command.code for command in COMMANDS.values()]), st.booleans())
 def test_any_bytes_are_a_request_or_a_protocol_error_or_too_few(data: bytes, code: int, long: bool) -> None:
     for each in (data, bytes([code]) + data):

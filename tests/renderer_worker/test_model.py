@@ -23,7 +23,7 @@ def read(library: Library, archive: bytes) -> model_module.Model:
     return library.read(content_key(archive), archive)
 
 
-@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.dictionaries(st.sampled_from(["front", "back", "top"]), st.tuples(st.integers(1, 9), st.integers(1, 9))))
 def test_however_it_comes_the_same_content_is_the_same_model(
     make_boxes: Boxes, sizes: dict[str, tuple[int, int]]

@@ -82,7 +82,7 @@ def test_from_straight_above_the_front_is_at_the_bottom(target: SailenvTarget, m
     assert column > SIZE[1] / 2 + 1
 
 
-@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.floats(0.25, 0.6), st.floats(-180, 180), st.floats(-90, 90))
 def test_corners_are_within_a_pixel_of_where_the_camera_puts_them(
     target: SailenvTarget, make_boxes: Boxes, distance: float, azimuth: float, elevation: float
@@ -116,7 +116,7 @@ def area_and_middle(polygon: NDArray[np.float64]) -> tuple[float, NDArray[np.flo
     return float(cross.sum() / 2), ((polygon + following) * cross[:, None]).sum(axis=0) / (3 * cross.sum())
 
 
-@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.floats(0.3, 0.6), st.floats(-180, 180), st.floats(-90, 90))
 @example(0.5, 0.0, 0.0)
 def test_a_cubes_corners_are_where_the_camera_puts_them_to_a_fraction_of_a_pixel(
@@ -136,7 +136,7 @@ def test_a_cubes_corners_are_where_the_camera_puts_them_to_a_fraction_of_a_pixel
     assert np.abs(seen - middle).max() <= 0.13
 
 
-@settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.tuples(*[st.integers(0, 255)] * 3))
 def test_the_background_is_exactly_the_colour_asked_for(
     target: SailenvTarget, make_boxes: Boxes, color: tuple[int, int, int]

@@ -23,7 +23,7 @@ HALF = np.array([0.10, 0.06, 0.04])
 """Half the sides of the box that ``make_boxes`` makes."""
 DEPTH_RANGE = 0.8
 
-few = settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+few = settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 cameras = st.builds(Camera, st.floats(0.25, 0.6), st.floats(-180, 180), st.floats(-85, 85))
 
 

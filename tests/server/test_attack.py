@@ -44,7 +44,7 @@ def random_texture(seed: int) -> Tensor:
 
 
 @given(BUDGETS, SEEDS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_a_projected_change_keeps_the_budget_and_the_colours_that_exist(budget: Budget, seed: int) -> None:
     texture = random_texture(seed)
     delta = budget.project(random_tensor(seed + 1, low=-2, high=2), texture)
@@ -55,7 +55,7 @@ def test_a_projected_change_keeps_the_budget_and_the_colours_that_exist(budget: 
 
 
 @given(BUDGETS, SEEDS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_the_projection_is_the_nearest_change_that_is_allowed(budget: Budget, seed: int) -> None:
     texture, wish = random_texture(seed), random_tensor(seed + 1, low=-2, high=2)
     low, high = (-texture).clamp(min=-budget.epsilon), (1 - texture).clamp(max=budget.epsilon)
@@ -65,7 +65,7 @@ def test_the_projection_is_the_nearest_change_that_is_allowed(budget: Budget, se
 
 
 @given(BUDGETS, SEEDS, st.integers(1, 12))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_a_gradient_of_constant_sign_walks_straight_to_the_bound(budget: Budget, seed: int, steps: int) -> None:
     texture, gradient = random_texture(seed), random_tensor(seed + 1, low=-1, high=1)
     sign, delta = gradient.sign(), torch.zeros_like(texture)
@@ -83,7 +83,7 @@ def test_texels_without_gradient_stay_where_they_are() -> None:
 
 
 @given(st.floats(1 / 255, 1), SEEDS)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_the_texture_that_is_saved_keeps_the_budget_in_whole_levels(epsilon: float, seed: int) -> None:
     budget, texture = Budget(epsilon, epsilon), (random_texture(seed) * 255).round().byte()
     delta = budget.project(random_tensor(seed + 1, low=-2, high=2), texture.float() / 255)
@@ -201,7 +201,7 @@ def test_the_seed_determines_the_held_out_views() -> None:
 
 
 @given(st.floats(0, 360), st.floats(-90, 90))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_from_the_framing_distance_all_of_the_object_is_seen(mug: Object3D, azimuth: float, elevation: float) -> None:
     matrix = Camera(framing_distance(mug.radius), azimuth, elevation).world_to_camera()
     points = np.concatenate([part.vertices for part in mug.parts]) @ matrix[:3, :3].T + matrix[:3, 3]

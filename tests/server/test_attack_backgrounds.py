@@ -18,7 +18,7 @@ from trompe_shared.object3d import Object3D
 SIZE = (32, 32)
 PHOTO = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
 CHOICE: list[tuple[int, int, int] | str] = [(0, 0, 0), (255, 255, 255), "photo"]
-SMALL = settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SMALL = settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def in_front_of(choice: Sequence[int]) -> list[View]:

@@ -23,7 +23,7 @@ GOALS = [
 
 
 @given(LOGITS, st.integers(0, 4))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_the_margin_is_the_best_other_logit_minus_the_true_one(rows: list[list[float]], label: int) -> None:
     goal, logits = Goal(label), torch.tensor(rows)
     others = [max(row[:label] + row[label + 1 :]) for row in rows]
@@ -37,7 +37,7 @@ def test_the_margin_is_the_best_other_logit_minus_the_true_one(rows: list[list[f
 
 
 @given(LOGITS, st.integers(0, 3))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_a_targeted_goal_is_reached_where_the_target_is_the_best_class(rows: list[list[float]], target: int) -> None:
     goal, logits = Goal(4, target=target), torch.tensor(rows)
     margins = goal.margins(logits)
@@ -47,7 +47,7 @@ def test_a_targeted_goal_is_reached_where_the_target_is_the_best_class(rows: lis
 
 
 @given(LOGITS, st.integers(0, 4), st.integers(1, 4))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_a_top_k_goal_is_reached_where_k_classes_beat_the_true_one(rows: list[list[float]], label: int, k: int) -> None:
     goal, logits = Goal(label, top_k=k), torch.tensor(rows)
     for row, margin, reached in zip(rows, goal.margins(logits), goal.reached(logits), strict=True):
@@ -72,7 +72,7 @@ def test_the_logits_ratio_is_that_of_croce_and_hein() -> None:
 
 
 @given(LOGITS, st.floats(0.1, 100), st.floats(-10, 10))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_no_scale_or_shift_of_the_logits_changes_their_ratio(rows: list[list[float]], scale: float, by: float) -> None:
     logits = torch.tensor([[*range(5)], *([float(value) for value in row] for row in rows)], dtype=torch.float64)
     best = logits.sort(1, descending=True).values

@@ -153,7 +153,7 @@ def test_movable_are_the_texels_whose_whole_budget_is_worth_half_a_level(
 
 
 @given(SEEDS, st.sampled_from(["a.png", "Straße 7.png", "x.npy", "step", "file"]))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_a_state_comes_back_exactly(seed: int, name: str) -> None:
     generator = torch.Generator().manual_seed(seed)
     deltas = {name: torch.randn(4, 5, 3, generator=generator), "other.png": torch.zeros(1, 1, 3)}
@@ -238,7 +238,7 @@ def test_a_run_over_a_pool_that_was_cut_off_goes_on_bit_for_bit(square: Object3D
 # The optimisers
 
 OPTIMISERS = get_args(OptimiserName)
-SMALL = settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SMALL = settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def lengths(optimiser: str, steps: int) -> dict[str, Any]:
@@ -649,7 +649,7 @@ def test_every_run_begins_with_the_low_margin(square: Object3D, surrogate: Surro
 
 
 @given(length=st.integers(1, 2000))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_the_step_falls_to_nothing_in_every_round_and_rounds_grow(length: int) -> None:
     falling = [Pace(done, length).falling for done in range(length)]
     starts = [0, *(done for done in range(1, length) if falling[done] > falling[done - 1])]

@@ -31,7 +31,7 @@ from trompe_shared.object3d import Object3D
 
 Make = Callable[..., Any]
 LABEL = 6
-SMALL = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SMALL = settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 # Masks

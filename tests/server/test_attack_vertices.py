@@ -73,7 +73,7 @@ def relief(mug: Object3D, shape: Shape) -> Relief:
     return relief_of(mug, shape, FakeTarget(points=20_000))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 99), epsilon=st.sampled_from([1e-9, 1e-5, 1e-3, 0.02, 0.3]), smoothing=st.integers(0, 4))
 def test_no_vertex_of_the_saved_object_is_further_off_than_epsilon(
     mug: Object3D, shape: Shape, seed: int, epsilon: float, smoothing: int
@@ -85,7 +85,7 @@ def test_no_vertex_of_the_saved_object_is_further_off_than_epsilon(
         assert apart.max() >= 0.9 * epsilon * mug.radius
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 99))
 def test_corners_at_one_place_stay_at_one_place(mug: Object3D, shape: Shape, seed: int) -> None:
     moved = with_vertices(mug, shape, 1e-3 * field(shape, seed))
@@ -181,7 +181,7 @@ def test_a_hard_edge_stays_hard(roof: Object3D) -> None:
     assert (back.normals[:, 2] < -0.72).all()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 99), rounds=st.integers(0, 20))
 def test_smoothing_keeps_bounds_and_constants(shape: Shape, seed: int, rounds: int) -> None:
     values = field(shape, seed)

@@ -123,7 +123,7 @@ def test_the_estimate_comes_nearer_to_the_true_gradient_with_every_query() -> No
         assert cosine(found, true) > 0.65 * (pairs / (pairs + unknowns)) ** 0.5
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(-(2**40), 2**40), order=st.permutations(range(4)))
 def test_an_estimate_depends_on_the_image_and_the_seed_alone(seed: int, order: list[int]) -> None:
     network, images, weights = linear(), greyish(4), torch.tensor([[1.0, 2.0]]).repeat(4, 1)

@@ -263,7 +263,7 @@ def test_an_unwrapped_object_looks_the_same_in_its_own_format_and_as_glb(target:
 
 
 @given(st.lists(st.floats(-1e6, 1e6, width=32), min_size=9, max_size=9, unique=True))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_every_number_of_a_part_survives_the_obj_it_is_written_to(numbers: list[float]) -> None:
     vertices = np.array(numbers, np.float32).reshape(3, 3)
     part = Part("m", vertices, np.eye(3, dtype=np.float32), vertices[:, :2].copy(), np.int32([[2, 0, 1]]))

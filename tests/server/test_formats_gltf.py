@@ -545,7 +545,7 @@ def test_a_glb_and_the_zip_of_it_look_the_same_after_repainting(target: SailenvT
     st.tuples(*[st.floats(0.1, 3) | st.floats(-3, -0.1)] * 3),
     st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(x * x for x in q) > 0.01),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_any_place_keeps_normals_on_the_side_that_triangles_face(
     translation: tuple[float, ...], scale: tuple[float, ...], rotation: tuple[float, ...]
 ) -> None:

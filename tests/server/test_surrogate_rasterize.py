@@ -120,7 +120,7 @@ IN_THE_LAST_COLUMN = np.array([[[0.6258, 0.3086, 0.6584], [0.624, -0.2732, 0.457
 
 @given(triangle_soups(), CAMERAS, st.sampled_from([CENTRE, MSAA4]), st.booleans())
 @example(IN_THE_LAST_COLUMN, Camera(0.40625, -75, 0), CENTRE, False)
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 def test_every_sample_sees_the_triangle_that_a_ray_hits_first(
     soup: Floats, camera: Camera, samples: Samples, cull: bool
 ) -> None:
@@ -217,7 +217,7 @@ def test_of_two_sheets_in_one_plane_the_first_is_seen_however_they_are_cut_into_
 
 
 @given(triangle_soups(), CAMERAS, st.randoms(use_true_random=False))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_the_order_of_the_triangles_does_not_matter(soup: Floats, camera: Camera, random: Random) -> None:
     order = list(range(len(soup)))
     random.shuffle(order)
@@ -287,7 +287,7 @@ def decently_seen(camera: Camera, seen: Seen, corners: Floats) -> NDArray[np.boo
 
 
 @given(triangle_soups(), CAMERAS)
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_texture_coordinates_and_their_slopes_are_those_of_the_plane(soup: Floats, camera: Camera) -> None:
     corners, step = soup[0], 1e-4
     seen = look(mesh_from(soup[:1], UVS[None]), camera)

@@ -94,7 +94,7 @@ SIDES = st.one_of(st.integers(1, 20), st.sampled_from([24, 32]))
 
 
 @given(SIDES, SIDES, st.sampled_from([10, 100, 10_000]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_the_pyramid_is_the_texture_averaged_again_and_again(height: int, width: int, band: int) -> None:
     layout = mip_layout([(height, width), (2, 3)])
     textures = [noise(height, width) / 255, noise(2, 3, seed=1) / 255]
@@ -111,7 +111,7 @@ def test_the_pyramid_is_the_texture_averaged_again_and_again(height: int, width:
 
 
 @given(SIDES, SIDES, st.sampled_from([10, 100, 10_000]), st.floats(0, 1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_texels_of_the_pyramid_pass_their_gradient_back_to_all_they_are_averages_of(
     height: int, width: int, band: int, share: float
 ) -> None:

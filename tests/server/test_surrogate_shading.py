@@ -154,7 +154,7 @@ def test_two_probes_are_joined_by_a_line_in_linear_light() -> None:
 
 
 @given(st.lists(st.floats(0, 1), min_size=2, max_size=20), st.integers(0, 2**31))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_monotone_probes_give_monotone_colours_between_the_first_and_the_last(values: list[float], seed: int) -> None:
     probes = np.sort(np.random.default_rng(seed).integers(0, 250, (5, 1, 3)), axis=0)
     shading = curve(GREYS, probes)

@@ -1,19 +1,15 @@
 """What the tests of the service share: databases of both kinds, and worker processes that run fake pipelines."""
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from postgres import Postgres, find_programs
+from processes import Service, listening
 
 from trompe_server.jobs.store import JobStore
 from trompe_server.settings import Settings
-
-sys.path.append(str(Path(__file__).parent))  # of what lies beside this file, for the tests as well
-
-from postgres import Postgres, find_programs
-from processes import Service, listening
 
 
 @pytest.fixture(scope="session")

@@ -352,7 +352,7 @@ def test_migrating_again_or_from_many_sides_changes_nothing(store: JobStore) -> 
 Step = Callable[[], object]
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     moves=st.lists(st.sampled_from(["claim", "advance", "finish", "give back", "die", "reap", "cancel"]), max_size=25)
 )

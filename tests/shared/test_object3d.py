@@ -354,7 +354,7 @@ def test_an_image_without_pixels_is_refused() -> None:
 
 
 @given(place=st.integers(0, len(FILES["paint.png"]) - 1), value=st.integers(0, 255))
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 def test_a_texture_with_any_byte_changed_is_read_or_refused(place: int, value: int) -> None:
     data = bytearray(FILES["paint.png"])
     data[place] = value
@@ -368,7 +368,7 @@ ARCHIVE = zipped(FILES)
 
 
 @given(place=st.integers(0, len(ARCHIVE) - 1), value=st.integers(0, 255))
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 def test_an_archive_with_any_byte_changed_is_read_or_refused(place: int, value: int) -> None:
     data = bytearray(ARCHIVE)
     data[place] = value

@@ -60,7 +60,6 @@ def fuzz(operation, api, mode) -> set[int]:
     @settings(
         max_examples=20 if mode is GenerationMode.POSITIVE else 8,
         derandomize=True,
-        deadline=None,
         database=None,
         suppress_health_check=list(HealthCheck),
     )

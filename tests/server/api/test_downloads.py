@@ -103,7 +103,7 @@ def test_a_range_of_a_file(done, asked, status, content):
     assert ("content-range" in answer.headers) == (status == 206)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
 @given(st.integers(0, 9), st.integers(0, 12))
 def test_content_range_says_which_bytes_these_are(done, first, length):
     answer = done.get(f"{done.files}/digits.txt", headers={"Range": f"bytes={first}-{first + length}"})
