@@ -2,6 +2,7 @@
 
 import csv
 import json
+import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from io import StringIO
@@ -425,6 +426,20 @@ def test_a_log_shows_a_line_for_each_job_that_is_done(service: FakeService, tmp_
     assert lines[0] == "4 jobs, 0 of them done before"
     assert lines[1].startswith("1/4  mug  epsilon 0.02  seed 0  A_drop 0.20, held-out 0.20  about ")
     assert lines[4].startswith("4/4  chair  epsilon 0.05  seed 0  failed: the renderer said no")
+
+
+def test_jobs_that_the_server_did_long_ago_promise_nothing_on_the_time_that_is_left(
+    service: FakeService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran(plan_of(grid={"epsilon": [0.05]}), service, tmp_path / "before")
+    service.by_key = {key: service.job(job.id) for key, job in service.by_key.items()}
+    now = count(step=20)
+    monkeypatch.setattr(time, "monotonic", lambda: next(now))
+    written = StringIO()
+    with experiment_display(Console(file=written, width=200)) as show:
+        run_experiment(plan_of(grid={"epsilon": [0.02, 0.03, 0.05]}), service, tmp_path / "now", show=show)
+    ends = [line.partition("seed 0  ")[2].partition("  ")[2] for line in written.getvalue().splitlines()[1:]]
+    assert ends == ["", "", "about 60 s left", "about 40 s left", "about 20 s left", ""]
 
 
 def test_a_terminal_shows_one_bar_over_all_jobs(service: FakeService, tmp_path: Path) -> None:

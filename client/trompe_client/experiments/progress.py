@@ -38,20 +38,27 @@ def in_words(seconds: float) -> str:
 
 
 class _Clock:
-    """How many jobs are done, and when the rest will be, by those of this run."""
+    """How many jobs are done, and when the rest will be, by those that ended while they were watched."""
+
+    started: float | None = None
+    """When the first job was looked at; those that end before were done long ago."""
 
     def begin(self, total: int, done: int) -> None:
-        self.total, self.done, self.before, self.started = total, done, done, time.monotonic()
+        self.total, self.done = total, done
+
+    def watch(self) -> None:
+        if self.started is None:
+            self.started, self.before = time.monotonic(), self.done
 
     def tick(self) -> None:
         self.done += 1
 
     def left(self) -> str:
         """Words on the time that is left."""
-        fresh = self.done - self.before
-        if not fresh or self.done == self.total:
+        if self.started is None or self.done in {self.before, self.total}:
             return ""
-        return f"about {in_words((time.monotonic() - self.started) / fresh * (self.total - self.done))} left"
+        each = (time.monotonic() - self.started) / (self.done - self.before)
+        return f"about {in_words(each * (self.total - self.done))} left"
 
 
 class _Lines:
@@ -63,7 +70,8 @@ class _Lines:
         self._console.print(f"{total} jobs, {done} of them done before")
 
     def look(self, row: Row, job: Job) -> None:
-        """Nothing: a log shows ends alone."""
+        """A log shows ends alone."""
+        self._clock.watch()
 
     def end(self, row: Row, finished: Finished) -> None:
         self._clock.tick()
@@ -81,6 +89,7 @@ class _Bars:
         self._all = self._bars.add_task("jobs", total=total, completed=done, detail="")
 
     def look(self, row: Row, job: Job) -> None:
+        self._clock.watch()
         if job.state is not JobState.running:
             return
         if row.key not in self._running:
