@@ -183,6 +183,8 @@ def test_two_jobs_are_compared(service: Any, page: Page, done: str) -> None:
     differing = page.locator("tr.differs th").all_inner_texts()
     assert "epsilon" in differing
     assert "seed" not in differing
+    row = page.locator("tr", has=page.get_by_role("rowheader", name="classifier", exact=True))
+    expect(row.locator("td")).to_have_text(["tiny", "tiny"])
 
 
 def test_an_experiment_shows_its_jobs_as_points_that_open(service: Any, page: Page, done: str) -> None:

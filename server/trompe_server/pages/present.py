@@ -281,7 +281,10 @@ def command(spec: JobSpec, *, object: str, classifier: str) -> str:
 
 def differences(left: Result, right: Result) -> list[dict[str, Any]]:
     """What was asked and what came out of two jobs, line by line."""
-    specs = [side.spec.model_dump() for side in (left, right)]
+    specs = [
+        side.spec.model_dump() | {"label": side.label_name or side.label, "classifier": side.classifier}
+        for side in (left, right)
+    ]
     asked = [name for name in specs[0] if name != "object"]
     lines = [{"name": name, "cells": [value_text(spec[name]) for spec in specs]} for name in asked]
     for field, title in {"target": "target", "held_out": "held-out"}.items():
