@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from statistics import fmean
 from typing import Final, Literal
 
@@ -23,8 +24,8 @@ Place = tuple[str, str]
 UNITS: Final[dict[Cost, str]] = {"seconds": "wall time of a job, s", "evaluations": "images shown to the classifier"}
 PRESET: Final = "preset"
 """The series of the presets."""
-LINE, MARGIN = 0.055, 0.35
-"""Height of a line of text as a share of the axis, and room for the first name at the left, as a share of decades."""
+LINE, CHARACTER = 0.055, 0.0078
+"""Height of a line of text, and width of a character, as shares of the axes."""
 
 
 @dataclass(frozen=True)
@@ -151,17 +152,25 @@ def _name_points(axes: Axes, front: Sequence[Configuration], points: Sequence[Co
     low, high = min(gains) - max(p.spread for p in points), max(gains)
     line = max(high - low, 0.05) * LINE
     top = bottom = low
-    for point in front:
+    names = [f"{point.name}: {_told_cost(point.cost, cost)}, {point.gain:.2f}" for point in front]
+    for point, words in zip(front, names, strict=True):
         top = max(point.gain + line / 2, top + line)
-        _name_point(axes, point, f"{point.name}: {_told_cost(point.cost, cost)}, {point.gain:.2f}", top, "right")
+        _name_point(axes, point, words, top, "right")
     presets = [point for point in points if point.series == PRESET and point not in front]
     for number, point in enumerate(sorted(presets, key=lambda p: -p.gain)):
         bottom = min(point.gain - line, bottom - line if number else high)
         _name_point(axes, point, point.name, bottom, "left")
     low, high = min(low, bottom) - line, max(top, high) + 2 * line
-    axes.set_xlim(min(costs) / max(max(costs) / min(costs), 2) ** MARGIN, max(costs) * 1.3)
+    right = max(costs) * 1.3
+    axes.set_xlim(min(min(costs) / 1.3, *map(partial(_left_edge, right), front, names)), right)
     axes.set_ylim(low, high)
     axes.set_yticks([tick for tick in axes.get_yticks() if low <= tick <= 1.001])
+
+
+def _left_edge(right: float, point: Configuration, words: str) -> float:
+    """Where a logarithmic axis up to ``right`` must begin so that ``words`` that end at the point fit."""
+    share = min(CHARACTER * len(words), 0.8)
+    return float(point.cost ** (1 / (1 - share)) / right ** (share / (1 - share)))
 
 
 def _name_point(axes: Axes, point: Configuration, words: str, height: float, side: Literal["left", "right"]) -> None:
