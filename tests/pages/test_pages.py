@@ -278,8 +278,8 @@ def test_with_tokens_it_asks_for_one_and_goes_on_to_where_one_wanted(
     page.select_option("[name=object]", "mug")
     page.get_by_role("button", name="Submit").click()
     expect(page.locator(".error:visible")).to_contain_text("may only read")
-    faults.clear()  # 403
 
     page.get_by_role("button", name="Sign out").click()
     page.goto(f"{guarded.url}/jobs")
     assert "/login" in page.url
+    faults[:] = [fault for fault in faults if "403" not in fault]  # of the job, and of the check before it
