@@ -19,12 +19,11 @@ from pydantic import BaseModel, ConfigDict
 
 from bench._common import running_renderer
 from bench._jobs import Paper, Rows
-from trompe_server.attack.metrics import FEW_RECOGNISED
 from trompe_server.experiments.groups import figure_words
 from trompe_server.markdown import markdown_table
 from trompe_server.reports import TransferMatrix
 from trompe_server.target import SailenvTarget
-from trompe_shared.api import Accuracy, Result
+from trompe_shared.api import FEW_RECOGNISED, Accuracy, Result
 
 WHITE: Final = ("mobilenet_v2", "mobilenet_edgetpu_075", "squeezenet1_1")
 BLACK: Final = ("mobilenet_v1", "mobilenet_v3_large_min")

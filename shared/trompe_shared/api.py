@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 __all__ = [
+    "FEW_RECOGNISED",
     "SUN_LIMITS",
     "VIEWS_PER_PLACE",
     "VIEWS_PER_STEP",
@@ -432,6 +433,10 @@ class Event(_Schema):
     state: JobState
     progress: Progress
     message: str | None = None
+
+
+FEW_RECOGNISED: Final = 0.3
+"""An ``a_before`` below this is worth a warning: few views are left for ``a_drop`` to rest on. It counts in no mean."""
 
 
 class Accuracy(_Schema):

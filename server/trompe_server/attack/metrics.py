@@ -9,11 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_shared.api import Accuracy, ViewPrediction
+from trompe_shared.api import FEW_RECOGNISED, Accuracy, ViewPrediction
 from trompe_shared.geometry import View
 
 __all__ = [
-    "FEW_RECOGNISED",
     "DropOverSeeds",
     "accuracy",
     "drop_interval",
@@ -40,9 +39,6 @@ _NoVerdict = tuple[None, None, None]
 Z: Final = NormalDist().inv_cdf(0.975)
 """Normal quantile of a two-sided 95 % interval."""
 RESAMPLES: Final = 4000
-FEW_RECOGNISED: Final = 0.3
-"""An ``a_before`` below this is worth a warning: few views are left for ``a_drop`` to rest on. It counts in no mean."""
-
 LITTLE: Final = 0.3
 """An ``a_drop`` below this is worth one too."""
 

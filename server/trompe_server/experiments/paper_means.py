@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from trompe_server.attack.metrics import FEW_RECOGNISED
 from trompe_server.experiments.groups import average, by_tau, figure_words, grouped, tau_words
 from trompe_server.experiments.table_one import PaperCell, paper_numbers
 from trompe_server.markdown import markdown_table
+from trompe_shared.api import FEW_RECOGNISED
 from trompe_shared.experiment_table import ResultRow
 
 __all__ = ["paper_means_markdown"]

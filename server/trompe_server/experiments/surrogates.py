@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from trompe_server.attack.metrics import FEW_RECOGNISED
 from trompe_server.experiments.groups import average, by_tau, figure_words, grouped, tau_words
 from trompe_server.experiments.style import GREY, MARKERS, PALETTE, Drawing, drawing
 from trompe_server.markdown import markdown_table
+from trompe_shared.api import FEW_RECOGNISED
 from trompe_shared.experiment_table import ResultRow
 
 __all__ = ["surrogates_chart", "surrogates_markdown", "surrogates_of"]

@@ -17,10 +17,10 @@ from statistics import fmean
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from trompe_server.attack.metrics import FEW_RECOGNISED
 from trompe_server.experiments.groups import average, figure_words, grouped
 from trompe_server.experiments.style import BLUE, GREEN, GREY, INK, Drawing, drawing
 from trompe_server.markdown import markdown_table
+from trompe_shared.api import FEW_RECOGNISED
 from trompe_shared.experiment_table import ResultRow
 
 __all__ = ["Cell", "PaperCell", "paper_numbers", "table_one", "table_one_chart", "table_one_markdown"]

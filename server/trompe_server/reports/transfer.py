@@ -10,11 +10,10 @@ from typing import Final, Literal
 import numpy as np
 from PIL import Image
 
-from trompe_server.attack.metrics import FEW_RECOGNISED
 from trompe_server.markdown import markdown_table
 from trompe_server.reports.heat import heat_colours
 from trompe_server.reports.layout import CAPTION, GAP, INK, PAPER, beside, line, sheet, stacked
-from trompe_shared.api import Accuracy, Result
+from trompe_shared.api import FEW_RECOGNISED, Accuracy, Result
 
 __all__ = ["TransferMatrix", "transfer_matrix", "transfer_picture"]
 
