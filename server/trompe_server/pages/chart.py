@@ -1,7 +1,7 @@
 """The chart of an experiment: each job's seconds against what it achieved, and the jobs that no other one beats."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -11,8 +11,8 @@ __all__ = ["Chart", "Point", "chart"]
 
 LEFT, RIGHT, TOP, BOTTOM = 60.0, 700.0, 20.0, 310.0
 STEPS: Final = (1, 2, 5)
-MARKS: Final = 16
-"""Eight colours, as discs and as squares."""
+COLOURS: Final = 8
+"""Of objects; those beyond are squares, not discs."""
 
 
 @dataclass(frozen=True)
@@ -27,20 +27,20 @@ class Point:
 
 @dataclass(frozen=True)
 class Chart:
-    """What the template draws, in its own units."""
+    """What the template draws, in its own units. ``looks``: the CSS classes of each object's points."""
 
     points: Sequence[dict[str, Any]]
     front: str
     x_ticks: Sequence[dict[str, Any]]
     y_ticks: Sequence[dict[str, Any]]
-    objects: Sequence[str]
+    looks: Mapping[str, str]
     measure: str
 
 
 def chart(points: Sequence[Point], *, measure: str) -> Chart:
     """``measure`` names what ``drop`` is."""
     if not points:
-        return Chart((), "", (), (), (), measure)
+        return Chart((), "", (), (), {}, measure)
     seconds = [point.seconds for point in points]
     marks = _marks(min(seconds), max(seconds))
     low, high = marks[0], marks[-1]
@@ -53,14 +53,14 @@ def chart(points: Sequence[Point], *, measure: str) -> Chart:
         return round(BOTTOM - (BOTTOM - TOP) * (drop - bottom) / (1 - bottom), 1)
 
     front = front_of(points, cost=lambda point: point.seconds, gain=lambda point: point.drop)
-    objects = sorted({point.object for point in points})
+    looks = {name: _look(number) for number, name in enumerate(sorted({point.object for point in points}))}
     return Chart(
         points=[
             {
                 "job": point.job,
                 "x": x(point.seconds),
                 "y": y(point.drop),
-                "series": objects.index(point.object) % MARKS,
+                "look": looks[point.object],
                 "title": f"{point.object}: A_drop {point.drop:.2f} in {point.seconds:.0f} s",
             }
             for point in points
@@ -68,9 +68,13 @@ def chart(points: Sequence[Point], *, measure: str) -> Chart:
         front=" ".join(f"{x(point.seconds)},{y(point.drop)}" for point in front),
         x_ticks=[{"at": x(value), "text": f"{value:g}"} for value in marks],
         y_ticks=[{"at": y(value / 5), "text": f"{value / 5:.1f}"} for value in range(math.ceil(5 * bottom), 6)],
-        objects=objects,
+        looks=looks,
         measure=measure,
     )
+
+
+def _look(number: int) -> str:
+    return f"series-{number % COLOURS}" + " square" * (number // COLOURS % 2)
 
 
 def _marks(low: float, high: float) -> list[float]:

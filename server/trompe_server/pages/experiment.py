@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from trompe_server.pages.present import JobRow, value_text
-from trompe_shared.api import JobSpec, Result
+from trompe_shared.api import Result
 
 __all__ = ["Entry", "Line", "columns_and_lines"]
 
-Entry = tuple[JobRow, JobSpec, Result | None]
+Entry = tuple[JobRow, Mapping[str, Any], Result | None]
 """A job, what was asked, and what came out."""
 
 OUTCOME: Final = ("A_drop", "held-out A_drop", "seconds")
@@ -27,22 +27,21 @@ class Line:
 
 def columns_and_lines(entries: Sequence[Entry]) -> tuple[list[str], list[Line]]:
     """Columns are epsilon, the other options in which jobs on the same object differ, and what came of them."""
-    asked = [spec.model_dump() | {"classifier": row.classifier, "label": row.label} for row, spec, _ in entries]
-    options = _that_differ([row.object for row, _, _ in entries], asked)
+    options = _that_differ(entries)
     lines = [
-        Line(row.id, row.object, row.state, [*(value_text(spec[name]) for name in options), *_outcome(result)])
-        for (row, _, result), spec in zip(entries, asked, strict=True)
+        Line(row.id, row.object, row.state, [*(value_text(asked[name]) for name in options), *_outcome(result)])
+        for row, asked, result in entries
     ]
     return [*options, *OUTCOME], lines
 
 
-def _that_differ(objects: Sequence[str], asked: Sequence[Mapping[str, Any]]) -> list[str]:
+def _that_differ(entries: Sequence[Entry]) -> list[str]:
     first: dict[str, Mapping[str, Any]] = {}
     differ = {"epsilon"}
-    for name, spec in zip(objects, asked, strict=True):
-        one = first.setdefault(name, spec)
-        differ |= {option for option in spec if option != "object" and spec[option] != one[option]}
-    return [option for option in asked[0] if option in differ]
+    for row, asked, _ in entries:
+        one = first.setdefault(row.object, asked)
+        differ |= {option for option in asked if asked[option] != one[option]}
+    return [option for option in entries[0][1] if option in differ]
 
 
 def _outcome(result: Result | None) -> list[str]:

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from functools import cache
+from typing import Any
 
 from trompe_server.errors import NotFoundError
 from trompe_server.library import Library
 from trompe_server.pages.present import ClassNames, JobRow, job_row
-from trompe_shared.api import Job
+from trompe_shared.api import Job, JobSpec
 from trompe_shared.errors import TrompeError
 
 __all__ = ["Names"]
@@ -22,13 +23,19 @@ class Names:
 
     def row(self, job: Job) -> JobRow:
         """A job in a list."""
-        spec = job.spec
-        return job_row(
-            job,
-            object=self._object(spec.object),
-            classifier=self._classifier(spec.classifier),
-            label=self.classes(spec.classifier)(spec.label) if isinstance(spec.label, int) else spec.label,
-        )
+        asked = self.options(job.spec)
+        return job_row(job, object=self._object(job.spec.object), classifier=asked["classifier"], label=asked["label"])
+
+    def options(self, spec: JobSpec) -> dict[str, Any]:
+        """What was asked of an object, with names for ids and for the numbers of classes."""
+        name = self.classes(spec.classifier)
+        classes = {"label": spec.label, "target_label": spec.target_label}
+        return spec.model_dump(exclude={"object"}) | {
+            "classifier": self._classifier(spec.classifier),
+            **{option: name(given) if isinstance(given, int) else given for option, given in classes.items()},
+            "ensemble": [self._classifier(each) for each in spec.ensemble],
+            "judges": [self._classifier(each) for each in spec.judges],
+        }
 
     def classes(self, classifier: str) -> ClassNames:
         """What a classifier's classes are called."""

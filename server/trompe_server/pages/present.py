@@ -279,21 +279,16 @@ def command(spec: JobSpec, *, object: str, classifier: str) -> str:
     return shlex.join([*words, "--out", "result"])
 
 
-def differences(left: Result, right: Result) -> list[dict[str, Any]]:
+def differences(asked: Sequence[Mapping[str, Any]], results: Sequence[Result]) -> list[dict[str, Any]]:
     """What was asked and what came out of two jobs, line by line."""
-    specs = [
-        side.spec.model_dump() | {"label": side.label_name or side.label, "classifier": side.classifier}
-        for side in (left, right)
-    ]
-    asked = [name for name in specs[0] if name != "object"]
-    lines = [{"name": name, "cells": [value_text(spec[name]) for spec in specs]} for name in asked]
+    lines = [{"name": name, "cells": [value_text(options[name]) for options in asked]} for name in asked[0]]
     for field, title in {"target": "target", "held_out": "held-out"}.items():
-        judged: list[Accuracy | None] = [getattr(side, field) for side in (left, right)]
+        judged: list[Accuracy | None] = [getattr(side, field) for side in results]
         drops = [each.a_drop if each else None for each in judged]
         lines.append({"name": f"A_drop, {title}", "cells": [_share(drop) for drop in drops]})
     for field, name in MEASURES.items():
-        lines.append({"name": name, "cells": [value_text(getattr(side, field)) for side in (left, right)]})
-    seconds = [sum(side.seconds.values()) for side in (left, right)]
+        lines.append({"name": name, "cells": [value_text(getattr(side, field)) for side in results]})
+    seconds = [sum(side.seconds.values()) for side in results]
     lines.append({"name": "seconds", "cells": [f"{took:.1f}" for took in seconds]})
     return [line | {"differs": line["cells"][0] != line["cells"][1]} for line in lines]
 

@@ -124,16 +124,17 @@ def show_turntable(
 @router.get("/jobs/compare")
 def compare(request: Request, services: ServicesDep, a: str, b: str) -> HTMLResponse:
     """Two results side by side."""
-    sides, results = [], []
+    names, sides, asked, results = Names(services.library), [], [], []
     for each in (a, b):
         job = services.store.get(each)
         result = _result(services, job)
         if result is None:
             raise NotFoundError(f"Job {each} is {job.state} and has no result to compare.")
-        row = _row(services, job)
+        row = names.row(job)
+        asked.append(names.options(job.spec))
         results.append(result)
         sides.append({"job": row, "shown": _shown(services, row, result)})
-    return page(request, "compare.html", sides=sides, lines=differences(*results))
+    return page(request, "compare.html", sides=sides, lines=differences(asked, results))
 
 
 @router.get("/jobs/{job}")
@@ -190,7 +191,7 @@ def show_experiment(request: Request, services: ServicesDep, name: str, cursor: 
     if not found.jobs:
         raise NotFoundError(f"There is no experiment {name!r}.")
     names = Names(services.library)
-    entries = [(names.row(job), job.spec, _result(services, job)) for job in found.jobs]
+    entries = [(names.row(job), names.options(job.spec), _result(services, job)) for job in found.jobs]
     states = [row.state for row, _, _ in entries]
     columns, lines = columns_and_lines(entries)
     return page(
