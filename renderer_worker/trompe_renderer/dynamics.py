@@ -166,7 +166,7 @@ def motion_of(kind: str, description: str | Mapping[str, Any]) -> Motion:
         raise RendererError(f"There is no movement {kind!r}; choose one of {sorted(makers)}.")
     try:
         return makers[kind](json.loads(description) if isinstance(description, str) else description)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise RendererError(f"A {kind} movement is described wrongly: {type(error).__name__} {error}.") from error
 
 

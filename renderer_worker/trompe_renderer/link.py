@@ -8,6 +8,7 @@ import sys
 import termios
 import threading
 import time
+from collections.abc import Iterator
 from typing import Final
 
 from trompe_shared.errors import ProtocolError
@@ -30,13 +31,14 @@ _UNSENT: Final = 0x894B if sys.platform == "linux" else termios.TIOCOUTQ
 
 
 class Memory:
-    """What all agents together may be sending at a time; an agent that wants more waits for the others."""
+    """What all agents together may take up at a time; an agent that wants more waits for the others."""
 
     def __init__(self, total: int = 2 * MAX_REQUEST) -> None:
-        self._left = total
+        self._total = self._left = total
         self._freed = threading.Condition()
+        self._line = threading.Lock()
 
-    def take(self, count: int, *, timeout: float) -> None:
+    def take(self, count: int, *, timeout: float | None) -> None:
         """Reserve ``count`` bytes. Raises ``TimeoutError`` when they do not become free."""
         with self._freed:
             if not self._freed.wait_for(lambda: self._left >= count, timeout):
@@ -48,6 +50,20 @@ class Memory:
         with self._freed:
             self._left += count
             self._freed.notify_all()
+
+    @contextlib.contextmanager
+    def lent(self, count: int) -> Iterator[None]:
+        """Reserve ``count`` bytes, or all there are, for the time of a ``with``.
+
+        One after the other: who wants much is not passed over for those who want little.
+        """
+        share = min(count, self._total)
+        with self._line:
+            self.take(share, timeout=None)
+        try:
+            yield
+        finally:
+            self.give_back(share)
 
 
 class Link:
@@ -64,14 +80,18 @@ class Link:
             if hasattr(socket, name):
                 connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
-    def wait(self) -> None:
-        """Wait, for as long as the agent likes, until it begins a request. Raises ``EOFError`` when it hangs up."""
+    def wait(self) -> int:
+        """Wait, for as long as the agent likes, until it begins a request; the byte that it begins with.
+
+        Raises ``EOFError`` when it hangs up.
+        """
         self._memory.give_back(self._reserved)
         self._bytes = self._reserved = 0
         self.idle_since = time.monotonic()
-        self._peek(None)
+        first = self._peek(None)
         self.idle_since = None
         self._deadline = time.monotonic() + self._timeout
+        return first
 
     def says_more(self, seconds: float) -> bool:
         """Whether the agent sends more within ``seconds``."""
@@ -139,11 +159,13 @@ class Link:
             raise TimeoutError("it takes too long")
         return left
 
-    def _peek(self, timeout: float | None) -> None:
+    def _peek(self, timeout: float | None) -> int:
+        """The next byte, which stays to be read."""
         self._acknowledge()
         self._socket.settimeout(timeout)
-        if not self._socket.recv(1, socket.MSG_PEEK):
+        if not (data := self._socket.recv(1, socket.MSG_PEEK)):
             raise EOFError("it closed the connection")
+        return data[0]
 
     def _acknowledge(self) -> None:
         """Acknowledge at once: without it each small field of a client waits 40 ms."""

@@ -1,4 +1,8 @@
-"""The one thread that may touch OpenGL, and the agents' turns on it: first come, first served, one picture a turn."""
+"""The one thread that may touch OpenGL, and the agents' turns on it: one picture a turn.
+
+Of those who wait, the one has the next turn whose turns took the least time so far: who asks for large pictures does
+not make those wait who ask for small ones.
+"""
 
 import logging
 import os
@@ -6,7 +10,8 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +39,40 @@ def _leave(reason: str) -> None:
     os._exit(LOST)
 
 
+class _Line:
+    """Those who wait for a turn. ``whose`` is any object; what is known of it goes with it."""
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[object, Callable[[], Any]]] = []
+        self._used: WeakKeyDictionary[object, float] = WeakKeyDictionary()
+        self._least = 0.0
+        self._lock = threading.Lock()
+
+    def join(self, whose: object, work: Callable[[], Any]) -> None:
+        """Wait for a turn. Who has been away has saved nothing up."""
+        with self._lock:
+            self._used[whose] = max(self._used.get(whose, 0.0), self._least)
+            self._waiting.append((whose, work))
+
+    def next(self) -> tuple[object, Callable[[], Any]]:
+        """Whose turn it is, and for what: who used the least, and of those who came first."""
+        with self._lock:
+            turn = min(self._waiting, key=lambda each: self._used[each[0]])
+            self._waiting.remove(turn)
+            self._least = self._used[turn[0]]
+            return turn
+
+    def charge(self, whose: object, seconds: float) -> None:
+        """Note how long a turn took."""
+        with self._lock:
+            self._used[whose] += seconds
+
+
 class Renderer:
-    """The engine behind its thread. Any thread may ask; ``lost`` is called when OpenGL hangs or fails for good."""
+    """The engine behind its thread. Any thread may ask; ``lost`` is called when OpenGL hangs or fails for good.
+
+    ``whose`` says for whom something is drawn.
+    """
 
     def __init__(
         self,
@@ -48,25 +85,42 @@ class Renderer:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="render")
         self._lost, self._limit = lost, turn_limit
         self._since: float | None = None
+        self._line = _Line()
         self._engine = self._thread.submit(engine, quality).result()
         threading.Thread(target=self._watch, name="watch", daemon=True).start()
 
-    def start(self, scenery: Scenery, *, width: int, height: int) -> "Future[NDArray[np.uint8]]":
+    def start(self, scenery: Scenery, *, width: int, height: int, whose: object) -> "Future[NDArray[np.uint8]]":
         """Line up for a picture (height, width, 3), as ``Engine.render`` makes it."""
-        return self._turn(lambda: self._engine.render(scenery, width=width, height=height))
+        return self._turn(lambda: self._engine.render(scenery, width=width, height=height), whose)
 
-    def render(self, scenery: Scenery, *, width: int, height: int) -> NDArray[np.uint8]:
+    def render(self, scenery: Scenery, *, width: int, height: int, whose: object) -> NDArray[np.uint8]:
         """As ``Engine.render``."""
-        return self.start(scenery, width=width, height=height).result()
+        return self.start(scenery, width=width, height=height, whose=whose).result()
 
-    def survey(self, scenery: Scenery, before: Scenery, *, width: int, height: int) -> Survey:
+    def survey(self, scenery: Scenery, before: Scenery, *, width: int, height: int, whose: object) -> Survey:
         """As ``Engine.survey``."""
-        return self._turn(lambda: self._engine.survey(scenery, before, width=width, height=height)).result()
+        return self._turn(lambda: self._engine.survey(scenery, before, width=width, height=height), whose).result()
 
-    def _turn(self, work: Callable[[], Made]) -> "Future[Made]":
-        return self._thread.submit(self._take_turn, work)
+    def _turn(self, work: Callable[[], Made], whose: object) -> "Future[Made]":
+        made: Future[Made] = Future()
 
-    def _take_turn(self, work: Callable[[], Made]) -> Made:
+        def fulfil() -> None:
+            try:
+                made.set_result(self._watched(work))
+            except BaseException as error:
+                made.set_exception(error)
+
+        self._line.join(whose, fulfil)
+        self._thread.submit(self._take_turn)
+        return made
+
+    def _take_turn(self) -> None:
+        whose, fulfil = self._line.next()
+        started = time.monotonic()
+        fulfil()
+        self._line.charge(whose, time.monotonic() - started)
+
+    def _watched(self, work: Callable[[], Made]) -> Made:
         self._since = time.monotonic()
         try:
             return work()

@@ -10,7 +10,7 @@ from trompe_shared.errors import RendererError
 
 __all__ = ["Actor", "Script", "read_script"]
 
-_WRONG: Final = (ValueError, KeyError, TypeError, AttributeError)
+_WRONG: Final = (ValueError, KeyError, TypeError, AttributeError, OverflowError)
 
 
 @dataclass(frozen=True)

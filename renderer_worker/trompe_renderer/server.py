@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from select import select
 from typing import Any, Final
@@ -31,6 +32,7 @@ from trompe_renderer.session import Session
 from trompe_renderer.views import flat, label_views
 from trompe_shared.errors import ProtocolError, RendererError, TrompeError
 from trompe_shared.sailenv import (
+    COMMANDS,
     MAX_SIDE,
     REGISTER,
     Request,
@@ -45,13 +47,23 @@ __all__ = ["MAX_AGENTS", "Server"]
 MAX_AGENTS: Final = 64
 PATIENCE: Final = 600.0
 """Seconds for which an agent may be idle and keep its place when others have none."""
-GRACE: Final = 5.0
+GRACE: Final = 8.0
 """Seconds that agents have, when the worker stops, to take the replies they wait for."""
+PAUSE: Final = 0.5
+"""Seconds until the next try when no agent could be accepted."""
 DIALECT_WAIT: Final = 0.3
 """Seconds of silence after a short SPAWN_OBJECT that tell the short dialect from the long one."""
 LONG_ONLY: Final = {"spawn_view_frustum", "load_scenario", "move_object"}
 AHEAD: Final = 2
 """Pictures of one agent that may be in line or drawn and not yet sent."""
+MOST_TOLD: Final = 1000
+"""Characters of a refusal's reason that are logged and told."""
+PIXEL_BYTES: Final = {"main": 16, "labels": 64}
+"""What a pixel of the main view takes while it is drawn, encoded and sent, and one of all the others together."""
+SMALL: Final = 32 * 2**20
+"""Bytes of a frame or batch that needs no permission."""
+
+_NAMES: Final = {command.code: command.name for command in COMMANDS.values()}
 
 Changes = Sequence[tuple[str, Mapping[str, Any]]]
 Picture = NDArray[np.uint8]
@@ -67,6 +79,7 @@ class Shared:
     options: Options
     library: Library = field(default_factory=Library)
     memory: Memory = field(default_factory=Memory)
+    pictures: Memory = field(default_factory=Memory)
     stopping: threading.Event = field(default_factory=threading.Event)
 
 
@@ -91,25 +104,33 @@ class Server:
         for agent in itertools.count():
             if self._wake in select([self._listener, self._wake], [], [])[0]:
                 break
-            connection, peer = self._listener.accept()
-            if not self._make_room():
-                log.warning("agent %d from %s: turned away, %d agents are served already", agent, peer[0], MAX_AGENTS)
-                connection.close()
-                continue
-            link = Link(connection, self._shared.memory)
-            thread = threading.Thread(target=self._serve, args=(link, agent), daemon=True, name=f"agent-{agent}")
-            self._agents[agent] = link, thread
-            thread.start()
+            try:
+                self._accept(agent)
+            except OSError as error:  # no file descriptor is left, or it is gone already
+                log.warning("agent %d: cannot be accepted: %s", agent, error)
+                time.sleep(PAUSE)
         self._finish()
 
     def stop(self) -> None:
         """Make ``serve_forever`` return. A signal's handler may call it, however often: it takes no lock."""
-        with contextlib.suppress(BlockingIOError):
+        with contextlib.suppress(OSError):  # it is full, or all is over
             self._waker.send(b"!")
+
+    def _accept(self, agent: int) -> None:
+        connection, peer = self._listener.accept()
+        if not self._make_room():
+            log.warning("agent %d from %s: turned away, %d agents are served already", agent, peer[0], MAX_AGENTS)
+            connection.close()
+            return
+        link = Link(connection, self._shared.memory)
+        thread = threading.Thread(target=self._serve, args=(link, agent), daemon=True, name=f"agent-{agent}")
+        self._agents[agent] = link, thread
+        thread.start()
 
     def _finish(self) -> None:
         self._shared.stopping.set()
-        self._listener.close()
+        for each in (self._listener, self._wake, self._waker):
+            each.close()
         agents = [*self._agents.values()]
         for link, _ in agents:
             link.hang_up()
@@ -131,15 +152,7 @@ class Server:
 
     def _serve(self, link: Link, agent: int) -> None:
         try:
-            _Agent(link, agent, self._shared).serve()
-        except ProtocolError as error:
-            log.warning("agent %d: closed, what it sent is malformed: %s", agent, error)
-        except TimeoutError as error:
-            log.warning("agent %d: closed, %s", agent, error)
-        except (EOFError, OSError) as error:
-            log.info("agent %d: gone (%s)", agent, error)
-        except Exception:
-            log.exception("agent %d: closed after an error of the worker", agent)
+            _converse(_Agent(link, agent, self._shared), agent)
         finally:
             link.close()
             with self._left:
@@ -147,8 +160,23 @@ class Server:
                 self._left.notify_all()
 
 
+def _converse(client: "_Agent", agent: int) -> None:
+    """Serve an agent, and log why that ended."""
+    try:
+        client.serve()
+    except ProtocolError as error:
+        reason = str(error)[:MOST_TOLD]
+        log.warning("agent %d: closed at %s, what it sent is malformed: %s", agent, client.doing, reason)
+    except TimeoutError as error:
+        log.warning("agent %d: closed at %s: %s", agent, client.doing, error)
+    except (EOFError, OSError) as error:
+        log.info("agent %d: gone (%s)", agent, error)
+    except Exception:
+        log.exception("agent %d: closed at %s after an error of the worker", agent, client.doing)
+
+
 class _Agent:
-    """One connection."""
+    """One connection. ``doing`` is the command that is read or answered, or was last."""
 
     def __init__(self, link: Link, number: int, shared: Shared) -> None:
         self._link, self._id, self._shared = link, number, shared
@@ -159,12 +187,13 @@ class _Agent:
         self._width = self._height = 1
         self._gzip = False
         self._last_frame = time.monotonic()
+        self.doing = REGISTER.name
 
     def serve(self) -> None:
         """Shake hands and answer requests until DELETE or until the agent hangs up."""
         self._register()
         while True:
-            self._link.wait()
+            self.doing = _NAMES.get(code := self._link.wait(), f"{code:#04x}")
             request = decode_request(self._link.read, is_long=self._is_long)
             if request.command.name == "delete":
                 return
@@ -194,43 +223,59 @@ class _Agent:
         else:
             try:
                 values = getattr(self._session, command.name)(**request.values)
-            except TrompeError as error:
-                self._note(command.name, str(error))
-                self._link.send(command.encode_refusal(str(error)))
+            except Exception as error:  # the client waits for a whole reply, whatever happens
+                self._link.send(_refusal(request, self._note(command.name, self._explained(error))))
             else:
                 for reason in self._session.take_refusals():
                     self._note(command.name, reason)
                 self._link.send(command.encode_reply(*values))
 
-    def _note(self, command: str, reason: str) -> None:
-        log.warning("agent %d: refused %s: %s", self._id, command, reason)
-        self._session.note_refusal(reason)
+    def _explained(self, error: Exception) -> str:
+        """Why something was not done; what was not foreseen is logged with its trace."""
+        if isinstance(error, TrompeError):
+            return str(error)
+        log.error("agent %d: an error of the worker", self._id, exc_info=error)
+        return f"The worker failed: {error!r}"
+
+    def _note(self, command: str, reason: str) -> str:
+        """Log a refusal and keep its reason for LAST_ERROR; as much of it as is told."""
+        told = reason[:MOST_TOLD].encode("utf-8", "replace").decode()
+        log.warning("agent %d: refused %s: %s", self._id, command, told)
+        self._session.note_refusal(told)
+        return told
 
     def _send_frame(self, flags: int) -> None:
         """A frame whose rendering fails is sent flat: the client would wait for ever for one that does not come."""
-        delta_time = self._time_step()
-        self._session.advance(delta_time)
-        views = {name: flat(name, self._width, self._height) for name in views_of(flags)}
-        try:
-            views |= self._views([*views])
-        except Exception as error:
-            log.exception("agent %d: rendering failed", self._id)
-            self._session.note_refusal(f"Rendering failed: {error!r}")
-            delta_time = math.nan
-        for number, piece in enumerate(encode_frame([*views.values()], delta_time=delta_time, compress=self._gzip)):
-            if number:
-                self._link.drain()
-            self._link.send(piece)
+        delta_time, names = self._time_step(), [*views_of(flags)]
+        cost = ("main" in names) * PIXEL_BYTES["main"] + any(name != "main" for name in names) * PIXEL_BYTES["labels"]
+        with self._room_for(cost):
+            try:
+                self._session.advance(delta_time)
+                views = self._views(names)
+            except Exception as error:
+                self._note("frame", self._explained(error))
+                delta_time = math.nan
+                views = [flat(name, self._width, self._height) for name in names]
+            for number, piece in enumerate(encode_frame(views, delta_time=delta_time, compress=self._gzip)):
+                if number:
+                    self._link.drain()
+                self._link.send(piece)
+
+    def _room_for(self, pixel_bytes: int) -> AbstractContextManager[None]:
+        """Memory for so many bytes a pixel, for the time of a ``with``; who asks for much waits for others to send."""
+        wanted = self._width * self._height * pixel_bytes
+        return contextlib.nullcontext() if wanted <= SMALL else self._shared.pictures.lent(wanted)
 
     def _send_pictures(self, views: Sequence[Changes]) -> None:
         """Draw a picture while the one before travels."""
         drawn: deque[Future[Picture]] = deque()
-        for changes in views:
-            drawn.append(self._start_picture(changes))
-            if len(drawn) == AHEAD and not self._send_picture(drawn.popleft()):
-                return
-        while drawn and self._send_picture(drawn.popleft()):
-            pass
+        with self._room_for(AHEAD * PIXEL_BYTES["main"]):
+            for changes in views:
+                drawn.append(self._start_picture(changes))
+                if len(drawn) == AHEAD and not self._send_picture(drawn.popleft()):
+                    return
+            while drawn and self._send_picture(drawn.popleft()):
+                pass
 
     def _start_picture(self, changes: Changes) -> "Future[Picture]":
         try:
@@ -240,7 +285,7 @@ class _Agent:
                 getattr(self._session, name)(**values)
             self._session.advance(self._time_step())
             self._seen = self._session.scenery()
-            return self._renderer.start(self._seen, width=self._width, height=self._height)
+            return self._renderer.start(self._seen, width=self._width, height=self._height, whose=self)
         except TrompeError as error:
             refused: Future[Picture] = Future()
             refused.set_exception(error)
@@ -251,9 +296,7 @@ class _Agent:
         try:
             picture = np.ascontiguousarray(drawn.result())
         except Exception as error:
-            reason = str(error) if isinstance(error, TrompeError) else f"Rendering failed: {error!r}"
-            self._note("render_views", reason)
-            self._link.send(encode_status(reason))
+            self._link.send(encode_status(self._note("render_views", self._explained(error))))
             return False
         self._link.send(encode_status(), picture.data.cast("B"))
         return True
@@ -264,9 +307,10 @@ class _Agent:
         passed, self._last_frame = now - self._last_frame, now
         return passed if self._options.time_step is None else self._options.time_step
 
-    def _views(self, names: list[str]) -> dict[str, bytes]:
+    def _views(self, names: list[str]) -> list[bytes]:
         """Payloads of the views, as the session stands; flow is what changed since this was called last."""
-        scenery, size = self._session.scenery(), {"width": self._width, "height": self._height}
+        scenery = self._session.scenery()
+        size: dict[str, Any] = {"width": self._width, "height": self._height, "whose": self}
         views = {}
         if "main" in names:
             views["main"] = _png(self._renderer.render(scenery, **size)[:, ::-1])  # as Unity shows it: mirrored
@@ -275,7 +319,15 @@ class _Agent:
             survey = self._renderer.survey(scenery, self._seen or scenery, **size)
             views |= label_views(labels, survey, scenery, depth_range=self._options.depth_range)
         self._seen = scenery
-        return views
+        return [views[name] for name in names]
+
+
+def _refusal(request: Request, reason: str) -> bytes:
+    """The whole reply that refuses a request: for a scenario an empty id for each of its objects."""
+    command = request.command
+    if command.repeated:
+        return command.encode_reply(*[""] * len(request.values["scenario"]["objects"]))
+    return command.encode_refusal(reason)
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:

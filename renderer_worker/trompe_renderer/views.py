@@ -32,8 +32,8 @@ def label_views(names: list[str], survey: Survey, scenery: Scenery, *, depth_ran
 
 def instance_color(numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
     """(..., 3) uint8 RGB for instance numbers (...): black for 0, else a colour that no other number below 2^24 has."""
-    scattered = numbers * _SCATTER % 2**24
-    return np.stack([scattered >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
+    scattered = (numbers.astype(np.uint32) * np.uint32(_SCATTER)).astype(">u4")
+    return scattered[..., None].view(np.uint8)[..., 1:]
 
 
 def _category(survey: Survey, scenery: Scenery) -> bytes:

@@ -121,7 +121,7 @@ class ObjectCommands:
     ) -> tuple[str]:
         """Put an object into the world. Nothing here has a movement of its own to remove, or a parent elsewhere."""
         if not all(0 < x < 1e6 for x in scale):
-            raise RendererError(f"A scale must be positive, got {scale}.")
+            raise RendererError(f"A scale must be three positive numbers below a million, got {scale}.")
         motion = motion_of(*dynamic) if dynamic else None
         size = checked_vector(scale, "scale")
         return (self._spawn(name, placed(position, rotation), size, motion=motion, limited=frustum_limited),)

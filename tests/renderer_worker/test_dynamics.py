@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from trompe_renderer.dynamics import NO_WALLS, Motion, Place, frustum_walls, motion_of, room_walls
@@ -169,11 +169,34 @@ def test_a_view_frustum_holds_what_the_camera_sees_from_near_to_far(
         pytest.param("uniform_movement_random_bounce", bouncing(speed=-1), "speed", id="negative speed"),
         pytest.param("uniform_movement_random_bounce", {"speed": 1}, "KeyError", id="fields are missing"),
         pytest.param("uniform_movement_random_bounce", [], "TypeError", id="not an object"),
+        pytest.param("uniform_movement_random_bounce", bouncing() | {"seed": math.inf}, "Overflow", id="endless seed"),
+        pytest.param("linear_waypoints", waypoints((0, 10**400, 0)), "OverflowError", id="no float is so large"),
     ],
 )
 def test_a_movement_that_makes_no_sense_is_refused(kind: str, description: Any, reason: str) -> None:
     with pytest.raises(RendererError, match=reason):
         motion_of(kind, description)
+
+
+numbers = st.floats(-3, 3) | st.sampled_from([math.inf, math.nan, -1e300, 10**400, 1e-320, 0, "7", None, True, [], {}])
+vectors = st.fixed_dictionaries({"x": numbers, "y": numbers, "z": numbers})
+rows = st.lists(st.fixed_dictionaries({"position": vectors, "rotation": vectors}), max_size=3)
+tables = st.fixed_dictionaries(
+    {"waypoints": rows, "total_time": numbers, "start_direction": vectors}
+    | {"speed": numbers, "angular_speed": numbers, "seed": numbers}
+)
+
+
+@given(st.sampled_from(["linear_waypoints", "catmull_waypoints", "uniform_movement_random_bounce"]), tables)
+@example("uniform_movement_random_bounce", bouncing() | {"seed": math.inf})
+def test_whatever_numbers_a_description_has_it_is_refused_or_leads_somewhere(kind: str, table: Any) -> None:
+    try:
+        motion = motion_of(kind, json.dumps(table))
+    except RendererError:
+        return
+    for place in after(motion, 10.0, steps=4, walls=ROOM):
+        assert np.isfinite(place.position).all()
+        assert np.isfinite(place.turn).all()
 
 
 # --- on the wire ---

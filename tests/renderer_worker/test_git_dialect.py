@@ -117,3 +117,4 @@ def test_commands_that_only_the_git_client_has_prove_its_dialect(wire: Callable[
     time.sleep(0.5)  # longer than a client of unknown dialect would be given
     agent.socket.sendall(spawn.encode_request(**LONG)[len(short) :])
     assert spawn.decode_reply(agent.read) == ("1",)
+    assert agent.ask("get_position") == (0, 0, 0)  # nothing of the tail was taken for a command

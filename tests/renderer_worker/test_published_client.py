@@ -179,8 +179,11 @@ def test_the_published_client_learns_that_a_broken_zip_was_not_spawned(agent: An
 
 
 def test_the_many_small_sends_of_the_published_client_do_not_wait_for_acknowledgements(agent: Any) -> None:
-    start = time.monotonic()
-    for angle in range(20):
+    seconds = []
+    for angle in range(50):
+        start = time.monotonic()
         agent.set_position((0, 0, 1))
         agent.set_rotation((180, angle, 180))
-    assert time.monotonic() - start < 0.8  # 40 ms a wait would make it 1.6 s
+        seconds.append(time.monotonic() - start)
+    assert min(seconds) < 0.001
+    assert np.median(seconds) < 0.02  # on a busy machine too; a wait is one of 40 ms

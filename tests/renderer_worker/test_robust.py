@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from trompe_renderer import link as link_module
 from trompe_renderer.link import Link, Memory
 from trompe_renderer.model import Library
 from trompe_renderer.options import Quality
-from trompe_renderer.render_thread import Renderer
+from trompe_renderer.render_thread import Renderer, _Line
 from trompe_renderer.scenery import Scenery
 from trompe_renderer.session import Session
 from trompe_renderer.supervise import LOST
@@ -80,6 +81,29 @@ def test_an_agent_that_takes_no_reply_is_given_up(pair: Any) -> None:
     link = Link(theirs, Memory(), timeout=0.3)
     with pytest.raises(TimeoutError):
         link.send(bytes(64 * 2**20))
+
+
+def test_no_piece_of_a_reply_waits_until_the_one_before_is_acknowledged(pair: Any) -> None:
+    Link(pair[1], Memory())
+    assert pair[1].getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+
+def test_a_link_is_drained_when_nothing_is_left_to_send(pair: Any) -> None:
+    ours, theirs = pair
+    theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2**20)
+    theirs.setblocking(False)
+    sent = 0
+    with suppress(BlockingIOError):
+        while True:
+            sent += theirs.send(bytes(2**16))
+    with pytest.raises(TimeoutError):
+        Link(theirs, Memory(), timeout=0.2).drain()
+    reader = threading.Thread(target=lambda: [ours.recv(2**16) for _ in range(sent // 2**12)])
+    ours.settimeout(1)
+    reader.start()
+    Link(theirs, Memory(), timeout=30).drain()
+    theirs.close()
+    reader.join()
 
 
 def test_an_idle_agent_may_be_silent_for_longer_than_any_request(pair: Any) -> None:
@@ -231,6 +255,10 @@ sys.exit(supervise(work))
     assert (tmp_path / "log").read_text() == "." * runs
 
 
+SMALL: dict[str, Any] = {"width": 4, "height": 4, "whose": Session}
+"""A picture for anybody."""
+
+
 class _Engine:
     """Fails as it is told to."""
 
@@ -258,12 +286,12 @@ def test_opengl_counts_as_lost_when_not_even_an_empty_picture_can_be_drawn() -> 
     renderer = Renderer(Quality(), engine=lambda _: _Engine(broken), lost=lost.append)  # type: ignore[arg-type, return-value]
     for _ in range(2):
         with pytest.raises(RuntimeError, match="out of memory"):
-            renderer.render(scene(placements=(1,)), width=4, height=4)
-        assert renderer.render(scene(), width=4, height=4).shape == (4, 4, 3)
+            renderer.render(scene(placements=(1,)), **SMALL)
+        assert renderer.render(scene(), **SMALL).shape == (4, 4, 3)
     assert lost == []
     broken.append(True)
     with pytest.raises(RuntimeError, match="out of memory"):
-        renderer.render(scene(placements=(1,)), width=4, height=4)
+        renderer.render(scene(placements=(1,)), **SMALL)
     assert "context lost" in lost[0]
 
 
@@ -276,10 +304,65 @@ def test_opengl_counts_as_lost_when_a_picture_takes_for_ever() -> None:
         turn_limit=0.2,
     )
     for _ in range(5):
-        renderer.render(scene(seconds=0.1), width=4, height=4)
+        renderer.render(scene(seconds=0.1), **SMALL)
     assert not lost.is_set()
-    renderer.render(scene(seconds=1.0), width=4, height=4)
+    renderer.render(scene(seconds=1.0), **SMALL)
     assert lost.is_set()
+
+
+def test_the_next_turn_is_of_whom_the_turns_took_least_and_of_those_of_whoever_came_first() -> None:
+    line, (large, small, late) = _Line(), (Session(Library()) for _ in range(3))
+
+    def turns(count: int, seconds: dict[Any, float]) -> list[Any]:
+        served = []
+        for _ in range(count):
+            served.append(line.next()[0])
+            line.charge(served[-1], seconds[served[-1]])
+        return served
+
+    seconds = {large: 2.0, small: 0.5, late: 0.5}
+    for whose in (large, large, small, small, small):
+        line.join(whose, int)
+    assert turns(4, seconds) == [large, small, small, small]
+    for whose in (small, small, late, late, late):  # who comes late has no claim for the time before
+        line.join(whose, int)
+    assert turns(6, seconds) == [late, small, late, large, small, late]
+
+
+def test_who_asks_for_large_pictures_does_not_make_those_wait_who_ask_for_small_ones() -> None:
+    renderer = Renderer(Quality(), engine=lambda _: _Engine([]))  # type: ignore[arg-type, return-value]
+    agents = {name: Session(Library()) for name in ("large", "small")}
+    order: list[str] = []
+
+    def ask(name: str, seconds: float) -> Any:
+        drawn = renderer.start(scene(seconds=seconds), width=4, height=4, whose=agents[name])
+        drawn.add_done_callback(lambda _: order.append(name))
+        return drawn
+
+    asked = [ask(name, seconds) for name, seconds in (("large", 0.3), ("large", 0.3), ("small", 0.01), ("small", 0.01))]
+    for drawn in asked:
+        drawn.result()
+    assert order == ["large", "small", "small", "large"]
+
+
+def test_who_wants_much_memory_is_not_passed_over_for_those_who_want_little() -> None:
+    memory, order = Memory(100), []
+
+    def use(count: int) -> None:
+        with memory.lent(count):
+            order.append(count)
+            time.sleep(0.05)
+
+    with memory.lent(30):
+        threads = [threading.Thread(target=use, args=(count,)) for count in (1000, 20, 20)]
+        for thread in threads:
+            thread.start()
+            time.sleep(0.1)
+        assert order == []
+    for thread in threads:
+        thread.join()
+    assert order == [1000, 20, 20]
+    memory.take(100, timeout=0)
 
 
 def test_the_textures_of_all_that_is_spawned_have_a_largest_size(

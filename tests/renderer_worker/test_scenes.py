@@ -257,6 +257,7 @@ def test_a_scenario_loads_its_scene_spawns_its_objects_and_leaves_the_camera(wir
         pytest.param("mug", "AttributeError", id="not an object"),
         pytest.param(actor("mug", dynamic={"type": "fly", "description": {}}), "fly", id="no such movement"),
         pytest.param(actor("mug", position={"x": 1e30, "y": 0, "z": 0}), "finite", id="too far away"),
+        pytest.param(actor("mug", position={"x": 10**400, "y": 0, "z": 0}), "OverflowError", id="no float is so large"),
     ],
 )
 def test_an_object_of_a_scenario_that_is_refused_has_no_id_and_the_others_have(

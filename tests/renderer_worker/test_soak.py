@@ -1,5 +1,6 @@
-"""A worker at work for long: many agents at once, many frames, many uploads. The figures: ``--log-cli-level=INFO``.
+"""A worker at work for long: many agents at once, many frames, many uploads.
 
+The figures: ``--log-cli-level=INFO`` shows them, ``--junit-xml=FILE`` keeps them as properties of the test.
 The slow runs last TROMPE_SOAK_SECONDS (600) with 8 agents, and 10,000 frames and 1,000 uploads.
 """
 
@@ -43,7 +44,7 @@ def marked(box: Object3D, agent: int, turn: int) -> Object3D:
     ],
 )
 def test_agents_at_work_at_once_get_their_own_pictures_and_none_waits_for_long(
-    seconds: float, own_worker: Start, make_boxes: Boxes
+    seconds: float, own_worker: Start, make_boxes: Boxes, record_property: Callable[[str, object], None]
 ) -> None:
     worker, turns = own_worker(), 3
     objects = [[marked(make_boxes(), agent, turn) for turn in range(turns)] for agent in range(AGENTS)]
@@ -72,6 +73,8 @@ def test_agents_at_work_at_once_get_their_own_pictures_and_none_waits_for_long(
         thread.join()
     middle, late = (float(np.percentile(np.concatenate(waits), share)) for share in (50, 99))
     counts = [len(mine) for mine in waits]
+    for name, value in (("requests", sum(counts)), ("median_ms", 1000 * middle), ("p99_ms", 1000 * late)):
+        record_property(name, round(value, 1))
     log.info(
         "%d agents, %.0f s: %d requests, %d to %d an agent; a picture takes %.1f ms (median), %.1f ms (p99)",
         *(AGENTS, seconds, sum(counts), min(counts), max(counts), 1000 * middle, 1000 * late),

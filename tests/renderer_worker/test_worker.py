@@ -18,10 +18,11 @@ from PIL import Image
 
 from trompe_renderer.link import Link, Memory
 from trompe_renderer.options import Options
-from trompe_renderer.server import MAX_AGENTS, Shared, _Agent
+from trompe_renderer.server import MAX_AGENTS, MOST_TOLD, Server, Shared, _Agent
+from trompe_renderer.session import Session
 from trompe_shared.errors import ProtocolError, RendererError
 from trompe_shared.object3d import Object3D, encode_png, pack_zip
-from trompe_shared.sailenv import COMMANDS, VIEW_FLAGS, Command
+from trompe_shared.sailenv import COMMANDS, MAX_TEXT, VIEW_FLAGS, Command, decode_frame
 
 Connect = Callable[..., Any]
 Boxes = Callable[..., Object3D]
@@ -105,21 +106,6 @@ def test_bits_that_stand_for_no_view_add_none(wire: Connect, unused: int) -> Non
     assert Image.open(io.BytesIO(agent.read(length))).mode == "L"
     assert struct.unpack("<f", agent.read(4))[0] >= 0
     assert agent.ask("get_position") == (0, 0, 0)
-
-
-@pytest.mark.parametrize("gzip", [False, True])
-def test_each_length_of_a_large_frame_can_be_read_at_once(wire: Connect, make_boxes: Boxes, gzip: bool) -> None:
-    agent = wire(size=(301, 503), gzip=gzip)
-    agent.spawn(make_boxes())
-    agent.ask("set_position", position=(0, 0, 0.3))
-    agent.ask("set_rotation", rotation=(180, 0, 180))
-    for _ in range(4):
-        agent.socket.sendall(COMMANDS["frame"].encode_request(flags=ALL_VIEWS))
-        for _view in VIEW_FLAGS:
-            length = agent.socket.recv(4)  # as the published client does: without a loop
-            assert len(length) == 4
-            agent.read(int.from_bytes(length, "little"))
-        agent.read(4)
 
 
 def test_the_handshake_names_the_agent_and_the_scenes(wire: Connect) -> None:
@@ -315,21 +301,21 @@ def test_an_upload_of_the_same_bytes_gets_the_same_path_and_of_others_another(wi
 
 
 class _BrokenRenderer:
-    def render(self, *_args: object, **_sizes: int) -> None:
+    def render(self, *_args: object, **_options: object) -> None:
         raise RuntimeError("out of memory")
 
     survey = render
 
 
 @contextmanager
-def agent_of_a_broken_renderer(wire_to: Connect) -> Iterator[Any]:
+def agent_of_a_broken_renderer(wire_to: Connect, **shared_values: Any) -> Iterator[Any]:
     """Agent 3 of a server in this process, which can answer everything but draw nothing."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def serve() -> None:
             connection = listener.accept()[0]
             with connection:
-                shared = Shared(_BrokenRenderer(), Options())  # type: ignore[arg-type]
+                shared = Shared(_BrokenRenderer(), Options(), **shared_values)  # type: ignore[arg-type]
                 with suppress(ProtocolError):
                     _Agent(Link(connection, Memory()), 3, shared).serve()
 
@@ -352,6 +338,146 @@ def test_a_frame_that_cannot_be_rendered_is_sent_flat_and_marked(wire_to: Connec
         if "main" in views:
             assert np.array(Image.open(io.BytesIO(views["main"]))).shape == (32, 48, 3)
         assert "out of memory" in agent.ask("last_error")
+
+
+@pytest.mark.parametrize("flags", [0, 1, ALL_VIEWS])
+def test_each_view_is_sent_whole_once_the_one_before_is_on_its_way(
+    wire_to: Connect, monkeypatch: pytest.MonkeyPatch, flags: int
+) -> None:
+    """The published client reads a length by one ``recv``: if a segment ends within it, the stream is lost."""
+    done: list[Any] = []
+    send, drain = Link.send, Link.drain
+
+    def note_send(link: Link, *pieces: Any) -> None:
+        done.append(b"".join(map(bytes, pieces)))
+        send(link, *pieces)
+
+    def note_drain(link: Link) -> None:
+        drain(link)
+        done.append("drained")
+
+    with agent_of_a_broken_renderer(wire_to) as agent:
+        monkeypatch.setattr(Link, "send", note_send)
+        monkeypatch.setattr(Link, "drain", note_drain)
+        agent.views(flags)
+        monkeypatch.undo()
+    views = flags.bit_count()
+    assert done[1::2] == ["drained"] * max(views - 1, 0)
+    for number, piece in enumerate(done[::2], start=1):
+        rest = 4 if number >= views else 0  # deltaTime goes with the last view
+        assert len(piece) == (4 + int.from_bytes(piece[:4], "little") if views else 0) + rest
+
+
+@pytest.mark.parametrize(
+    ("command", "values", "answer"),
+    [
+        pytest.param("spawn_object", SAMPLES["spawn_object"], "", id="an empty text"),
+        pytest.param("send_obj_zip", SAMPLES["send_obj_zip"], "", id="no path"),
+        pytest.param("load_scenario", {"scenario": {"objects": [{}, {}, {}]}}, ("", "", ""), id="ids that are missing"),
+        pytest.param("set_position", SAMPLES["set_position"], None, id="a status"),
+    ],
+)
+def test_an_error_of_the_worker_is_answered_in_full_like_a_refusal(
+    wire_to: Connect, monkeypatch: pytest.MonkeyPatch, command: str, values: dict[str, Any], answer: Any
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise MemoryError("none left")
+
+    monkeypatch.setattr(Session, command, fail)
+    with agent_of_a_broken_renderer(wire_to) as agent:
+        if command == "load_scenario":
+            assert agent.load(values["scenario"]) == answer
+        elif answer is None:
+            with pytest.raises(RendererError, match="none left"):
+                agent.ask(command, **values)
+        else:
+            assert agent.ask(command, **values) == answer
+        assert "none left" in agent.ask("last_error")
+        assert agent.ask("get_position") == (0, 0, 0)
+
+
+@pytest.mark.parametrize("letter", ["x", "\0", "€", "\U0001f600"])
+def test_the_reason_of_a_refusal_is_no_longer_than_can_be_told(wire_to: Connect, letter: str) -> None:
+    with agent_of_a_broken_renderer(wire_to) as agent:
+        with pytest.raises(RendererError, match="no scene"):
+            agent.ask("change_scene", scene=letter * MAX_TEXT)
+        assert len(agent.ask("last_error")) <= MOST_TOLD
+        assert agent.ask("get_position") == (0, 0, 0)
+
+
+def test_a_large_frame_waits_until_there_is_memory_for_it_and_a_small_one_does_not(
+    wire_to: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = Memory(1000)
+    memory.take(1, timeout=0)
+    with agent_of_a_broken_renderer(wire_to, pictures=memory) as agent:
+        agent.views(ALL_VIEWS)
+        monkeypatch.setattr("trompe_renderer.server.SMALL", 1000)
+        agent.views(0)
+        agent.socket.sendall(COMMANDS["frame"].encode_request(flags=ALL_VIEWS))
+        agent.socket.settimeout(0.3)
+        with pytest.raises(TimeoutError):
+            agent.socket.recv(1)
+        memory.give_back(1)
+        agent.socket.settimeout(60)
+        decode_frame(agent.read, flags=ALL_VIEWS, compressed=False)
+        agent.views(ALL_VIEWS)  # what was lent has come back
+
+
+@contextmanager
+def server_without_opengl(monkeypatch: pytest.MonkeyPatch, listener: Any) -> Iterator[Server]:
+    """A server in this process that can draw nothing."""
+    monkeypatch.setattr("trompe_renderer.server.Renderer", lambda _: _BrokenRenderer())
+    server = Server(listener)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield server
+    server.stop()
+    thread.join(timeout=30)
+
+
+class _Exhausted:
+    """A listening socket that has no file descriptor left for the first agent."""
+
+    def __init__(self, listener: socket.socket) -> None:
+        self._listener, self._failed = listener, False
+        self.fileno, self.getsockname, self.close = listener.fileno, listener.getsockname, listener.close
+
+    def accept(self) -> Any:
+        if not self._failed:
+            self._failed = True
+            raise OSError(24, "Too many open files")
+        return self._listener.accept()
+
+
+def test_an_agent_that_cannot_be_accepted_does_not_end_the_worker(
+    wire_to: Connect, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with server_without_opengl(monkeypatch, _Exhausted(socket.create_server(("127.0.0.1", 0)))) as server:
+        agent = wire_to(server.address)
+        assert agent.ask("get_position") == (0, 0, 0)
+        agent.socket.close()
+    assert "cannot be accepted: [Errno 24]" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("sent", "said"),
+    [
+        pytest.param(b"\x0c" + struct.pack("<i", 5) + b"x", "closed at send_obj_zip: timed out", id="stays silent"),
+        pytest.param(b"\xaa", "closed at 0xaa, what it sent is malformed", id="unknown command"),
+        pytest.param(b"\x02" + struct.pack("<i", -5), "closed at change_scene, what it sent", id="negative length"),
+    ],
+)
+def test_an_agent_that_is_closed_is_logged_with_its_command_and_the_reason(
+    wire_to: Connect, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, sent: bytes, said: str
+) -> None:
+    monkeypatch.setattr(Link.__init__, "__kwdefaults__", {"timeout": 0.2})
+    with server_without_opengl(monkeypatch, socket.create_server(("127.0.0.1", 0))) as server:
+        agent = wire_to(server.address)
+        agent.socket.sendall(sent)
+        assert is_closed(agent.socket)
+        agent.socket.close()
+    assert f"agent {agent.agent}: {said}" in caplog.text
 
 
 @pytest.mark.parametrize(
