@@ -4,6 +4,7 @@ trimesh drops the material names (and with them the UVs) of an OBJ whose .mtl is
 SAILenv ships its objects; so the few statements that matter are read here, with errors that name the line.
 """
 
+import re
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -32,6 +33,10 @@ LARGEST: Final = 1e6
 _WIDTHS: Final = {"v": 3, "vt": 2, "vn": 3}
 MAX_LINE: Final = 2**20
 """Characters of a line; one polygon with a hundred thousand corners is within."""
+MAX_LINES: Final = 20_000_000
+"""Lines of a file; ten for each triangle are within."""
+_LINE: Final = re.compile(r"[\r\n]{0,65536}([^\r\n]*)")
+"""A line, after the end of the one before. Many empty lines are read in pieces: other threads have their turns."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +85,13 @@ class _Reader:
         self._triangles = 0
 
     def read(self, text: str) -> None:
-        for number, line in enumerate(text.splitlines(), start=1):
+        for count, found in enumerate(_LINE.finditer(text)):  # a list of all lines can be a hundred times the text
+            line = found[1]
+            if count == MAX_LINES:
+                raise ObjectError(f"{self.file!r} has more than {MAX_LINES} lines; simplify the mesh.")
             if len(line) > MAX_LINE:
                 raise ObjectError(
-                    f"{self.file}, line {number} has {len(line)} characters; at most {MAX_LINE} are read. "
+                    f"{self.file}, line {_number(found)} has {len(line)} characters; at most {MAX_LINE} are read. "
                     "Split its polygon into triangles."
                 )
             words = line.split()
@@ -93,7 +101,7 @@ class _Reader:
                 self._statement(words, line)
             except (ValueError, IndexError) as error:
                 raise ObjectError(
-                    f"{self.file}, line {number}: {line.strip()[:80]!r} cannot be read ({error})."
+                    f"{self.file}, line {_number(found)}: {line.strip()[:80]!r} cannot be read ({error})."
                 ) from error
 
     def _statement(self, words: list[str], line: str) -> None:
@@ -131,6 +139,11 @@ class _Reader:
         if not 0 <= index < count:
             raise ValueError(f"{kind} {value} does not exist, {count} are defined so far")
         return index
+
+
+def _number(line: re.Match[str]) -> int:
+    """The number of a line, from 1, whether lines end with a line feed, a carriage return or both."""
+    return 1 + max(line.string.count(end, 0, line.start(1)) for end in "\r\n")
 
 
 def parse_obj(text: str, file: str) -> tuple[Part, ...]:
@@ -230,8 +243,8 @@ def parse_mtl(text: str) -> dict[str, dict[str, str]]:
     keys = {"map_kd": "albedo", "map_bump": "normal", "bump": "normal", "norm": "normal"}
     materials: dict[str, dict[str, str]] = {}
     current: dict[str, str] = {}
-    for line in text.splitlines():
-        words = line.split(maxsplit=1)
+    for found in _LINE.finditer(text):
+        words = found[1].split(maxsplit=1)
         if len(words) < 2:
             continue
         if words[0] == "newmtl":

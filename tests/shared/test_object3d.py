@@ -3,6 +3,7 @@
 import io
 import json
 import struct
+import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -276,6 +277,29 @@ def test_what_does_not_hold_together_is_refused_with_the_place_and_the_remedy(
 ) -> None:
     message = refusal(files)
     assert [word for word in words if word not in message] == []
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"], ids=repr)
+def test_lines_may_end_in_any_way_and_are_counted_with_the_empty_ones(end: str) -> None:
+    obj = object_from_files(with_files(thing__obj=MESH.replace("\n", end).encode()))
+    np.testing.assert_array_equal(obj.parts[0].vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    with pytest.raises(ObjectError, match="line 70004: 'f 9'"):
+        parse_obj(f"v 0 0 0{end}" + end * 70_000 + f"v 1 0 0{end}# nothing{end}f 9{end}", "thing.obj")
+
+
+def test_a_mesh_of_empty_lines_takes_no_more_memory_than_its_text() -> None:
+    text = "\n" * 2**23
+    tracemalloc.start()
+    with pytest.raises(ObjectError, match="no faces"):
+        parse_obj(text, "bomb.obj")
+    assert tracemalloc.get_traced_memory()[1] < len(text)
+    tracemalloc.stop()
+
+
+def test_a_mesh_of_too_many_lines_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trompe_shared.wavefront.MAX_LINES", 100)
+    with pytest.raises(ObjectError, match=r"'thing\.obj' has more than 100 lines; simplify"):
+        parse_obj("#\n" * 101, "thing.obj")
 
 
 def encrypted() -> bytes:
