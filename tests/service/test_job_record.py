@@ -19,7 +19,7 @@ from trompe_server.errors import ConflictError, NotFoundError
 from trompe_server.jobs.desk import Claim, Ending, JobDesk, LostJobError
 from trompe_server.jobs.roll import WorkerRoll, take_lease
 from trompe_server.jobs.store import JobStore
-from trompe_server.jobs.tables import workers
+from trompe_server.jobs.tables import jobs, workers
 from trompe_shared.api import JobRequest, JobState, Progress
 from trompe_shared.errors import SpecError
 
@@ -124,6 +124,20 @@ def test_jobs_are_taken_by_priority_then_by_age(store: JobStore) -> None:
     later = create(store)
     order = [claim(store, f"w{number}").job.id for number in range(4)]
     assert order == [made["interactive"], made["normal"], later, made["sweep"]]
+
+
+@pytest.mark.parametrize(
+    ("number", "name"), [(-1, "interactive"), (11, "normal"), (100, "normal"), (500, "sweep"), (9999, "sweep")]
+)
+def test_a_priority_without_a_name_is_called_by_what_comes_no_sooner_and_holds_nobody_up(
+    store: JobStore, number: int, name: str
+) -> None:
+    odd, after = create(store), create(store, priority="sweep")
+    with write(store.engine) as connection:
+        connection.execute(jobs.update().where(jobs.c.id == odd).values(priority=number))
+    taken = [claim(store, worker).job for worker in ("v", "w")]
+    assert {job.id: job.priority for job in taken} == {odd: name, after: "sweep"}
+    assert [job.id for job in store.page().jobs] == [after, odd]
 
 
 def test_a_worker_takes_what_it_can_serve_and_no_more(store: JobStore) -> None:

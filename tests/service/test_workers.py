@@ -115,8 +115,8 @@ def test_a_frozen_worker_never_replaces_what_a_newer_attempt_wrote(service: Serv
             result = service.artifacts(job).read("result.json")
             frozen.send(signal.SIGCONT)  # it sees the gate open, and writes attack-001.txt of the first attempt
             wait_until(lambda: "goes on elsewhere" in frozen.words())
+            wait_until(lambda: LocalArtifacts(service.folder(job) / "1").names() == [])
     assert service.artifacts(job).read("result.json") == result
-    assert not (service.folder(job) / "1" / "result.json").exists()
     assert service.store.get(job).state is JobState.succeeded
 
 

@@ -12,6 +12,7 @@ from typing import Any, Final
 import sqlalchemy as sa
 
 from trompe_server.database import clock, write
+from trompe_server.errors import NotFoundError
 from trompe_server.jobs.tables import Row, fresh, job_of, jobs, locked, update_job
 from trompe_shared.api import Job, JobState, Progress
 
@@ -111,6 +112,15 @@ class JobDesk:
         """Whether the job is still this worker's."""
         with self._engine.connect() as connection:
             return _is_held(fresh(connection, claim.job.id), claim)
+
+    def left(self, claim: Claim) -> list[str] | None:
+        """The artifacts of a job that has ended, none of one that was deleted; ``None`` while it goes on."""
+        try:
+            with self._engine.connect() as connection:
+                row = fresh(connection, claim.job.id)
+        except NotFoundError:
+            return []
+        return list(row.artifacts) if JobState(row.state).final else None
 
     def _any(self, condition: sa.ColumnElement[bool]) -> bool:
         """Whether there is such a job, asked without a lock."""

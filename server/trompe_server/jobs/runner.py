@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
 from trompe_server.database import DatabaseDownError, patiently
+from trompe_server.errors import NotFoundError
 from trompe_server.jobs.desk import Claim, Ending, JobDesk, LostJobError
 from trompe_server.pipeline import DamagedFileError, PhaseReport, Pipeline
 from trompe_shared.api import JobState, Progress
@@ -80,8 +81,9 @@ class JobRunner:
             kept = self.patiently(lambda: self.desk.finish(claim, ending))
             self._tidy(claim, kept)
             return ending.state
-        except (_Lost, LostJobError) as error:
+        except (_Lost, LostJobError, NotFoundError) as error:
             logger.warning("job %s goes on elsewhere: %s", claim.job.id, error)
+            self._tidy_after(claim)
             return None
         finally:
             self.current = None
@@ -89,6 +91,12 @@ class JobRunner:
     def patiently(self, action: Callable[[], T]) -> T:
         """Do what asks the database, again and again while it is down."""
         return patiently(action, stopped=self.stopped.is_set)
+
+    def _tidy_after(self, claim: Claim) -> None:
+        """Remove what this attempt wrote after another one had ended the job, which has tidied before."""
+        kept = self.patiently(lambda: self.desk.left(claim))
+        if kept is not None:
+            self._tidy(claim, kept)
 
     def _tidy(self, claim: Claim, kept: list[str]) -> None:
         try:
