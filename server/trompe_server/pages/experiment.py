@@ -1,13 +1,14 @@
-"""The table of an experiment: a line for each job, with what sets it apart and what came of it."""
+"""An experiment's jobs, with what sets them apart and what came of them: lines of its table, points of its chart."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from trompe_server.pages.chart import Point
 from trompe_server.pages.present import JobRow, value_text
 from trompe_shared.api import Result
 
-__all__ = ["Entry", "Line", "columns_and_lines"]
+__all__ = ["Entry", "Line", "columns_and_lines", "points_of"]
 
 Entry = tuple[JobRow, Mapping[str, Any], Result | None]
 """A job, what was asked, and what came out."""
@@ -33,6 +34,18 @@ def columns_and_lines(entries: Sequence[Entry]) -> tuple[list[str], list[Line]]:
         for row, asked, result in entries
     ]
     return [*options, *OUTCOME], lines
+
+
+def points_of(entries: Sequence[Entry]) -> list[Point]:
+    """The jobs that were judged; a configuration is all in which those on the same object differ, but the seed."""
+    options = [option for option in _that_differ(entries) if option != "seed"]
+    points = []
+    for row, asked, result in entries:
+        judged = result and (result.held_out or result.target)
+        if result and judged and judged.a_drop is not None:
+            words = ", ".join(f"{name} {value_text(asked[name])}" for name in options)
+            points.append(Point(row.id, row.object, words, max(sum(result.seconds.values()), 0.1), judged.a_drop))
+    return points
 
 
 def _that_differ(entries: Sequence[Entry]) -> list[str]:

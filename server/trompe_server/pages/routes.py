@@ -18,8 +18,8 @@ from trompe_server.api.jobs import Cursor, labels_of
 from trompe_server.api.services import Services, ServicesDep
 from trompe_server.database import DatabaseDownError
 from trompe_server.errors import NotFoundError
-from trompe_server.pages.chart import Point, chart
-from trompe_server.pages.experiment import columns_and_lines
+from trompe_server.pages.chart import chart
+from trompe_server.pages.experiment import columns_and_lines, points_of
 from trompe_server.pages.naming import Names
 from trompe_server.pages.pictures import Kind, ViewSet
 from trompe_server.pages.present import TERMS, JobRow, Shown, differences, present
@@ -199,10 +199,7 @@ def show_experiment(request: Request, services: ServicesDep, name: str, cursor: 
         "experiment.html",
         name=name,
         counts={state: states.count(state) for state in dict.fromkeys(states)},
-        chart=chart(
-            [point for row, _, result in entries if (point := _point(row, result))],
-            measure="A_drop in the target, held-out views",
-        ),
+        chart=chart(points_of(entries), measure="A_drop in the target (held-out views, if any)"),
         columns=columns,
         lines=lines,
         older=found.next_cursor and f"?{urlencode({'cursor': found.next_cursor})}",
@@ -293,10 +290,3 @@ def _result(services: Services, job: Job) -> Result | None:
 
 def _shown(services: Services, row: JobRow, result: Result) -> Shown:
     return present(result, row, names=Names(services.library).classes(result.spec.classifier))
-
-
-def _point(row: JobRow, result: Result | None) -> Point | None:
-    judged = result and (result.held_out or result.target)
-    if not result or not judged or judged.a_drop is None:
-        return None
-    return Point(row.id, row.object, max(sum(result.seconds.values()), 0.1), judged.a_drop)
