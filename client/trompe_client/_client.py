@@ -32,7 +32,8 @@ class Client:
     """A connection to a Trompe server. Use it as a context manager, or ``close`` it. Threads may share one.
 
     ``server`` is by default TROMPE_SERVER, else http://127.0.0.1:8000; ``token`` is by default TROMPE_TOKEN.
-    ``timeout`` is how long the server may be silent, seconds. ``transport`` replaces the network (a mock, in tests).
+    ``timeout`` is how long the server may be silent, seconds; after an upload, which it reads first, 300 s more.
+    ``transport`` replaces the network (a mock, in tests).
 
     Every method raises ``APIError`` for what the server refuses and ``ServerUnreachable``; what can be asked twice
     without harm is asked again as ``retries`` says, and that is nearly everything.

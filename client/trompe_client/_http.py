@@ -23,6 +23,9 @@ __all__ = ["AsyncPort", "BlockingPort"]
 CONNECT_SECONDS: Final = 10.0
 """Longest time to get through to the server."""
 
+READING_SECONDS: Final = 300.0
+"""How much longer the server may be silent after an upload, which it reads before it answers."""
+
 T = TypeVar("T")
 
 
@@ -31,14 +34,14 @@ class BlockingPort:
 
     def __init__(self, connection: Connection, retries: Retries) -> None:
         self.retries = retries
-        self._url = connection.url
+        self._url, self._timeout = connection.url, connection.timeout
         self._http = httpx.Client(**_options(connection))
 
     @asynccontextmanager
     async def open(self, request: Request[Any], *, silence: float | None = None) -> AsyncIterator["_Answer"]:
         with (
             _translated(self._url),
-            _arguments(request, silence) as arguments,
+            _arguments(request, silence, self._timeout) as arguments,
             self._http.stream(**arguments) as response,
         ):
             yield _Answer(response)
@@ -68,12 +71,12 @@ class AsyncPort:
 
     def __init__(self, connection: Connection, retries: Retries) -> None:
         self.retries = retries
-        self._url = connection.url
+        self._url, self._timeout = connection.url, connection.timeout
         self._http = httpx.AsyncClient(**_options(connection))
 
     @asynccontextmanager
     async def open(self, request: Request[Any], *, silence: float | None = None) -> AsyncIterator["_AsyncAnswer"]:
-        with _translated(self._url), _arguments(request, silence) as arguments:
+        with _translated(self._url), _arguments(request, silence, self._timeout) as arguments:
             async with self._http.stream(**arguments) as response:
                 yield _AsyncAnswer(response)
 
@@ -149,8 +152,11 @@ def _options(connection: Connection) -> dict[str, Any]:
 
 
 @contextmanager
-def _arguments(request: Request[Any], silence: float | None) -> Iterator[dict[str, Any]]:
-    """What httpx is told; a file that is to be sent is open for the time of the block, and httpx reads it in pieces."""
+def _arguments(request: Request[Any], silence: float | None, timeout: float) -> Iterator[dict[str, Any]]:
+    """What httpx is told; a file that is to be sent is open for the time of the block, and httpx reads it in pieces.
+
+    ``timeout`` is the connection's own longest silence.
+    """
     upload = request.upload
     arguments: dict[str, Any] = {
         "method": request.method,
@@ -159,8 +165,10 @@ def _arguments(request: Request[Any], silence: float | None) -> Iterator[dict[st
         "headers": dict(request.headers) | ({"Content-Type": "application/json"} if request.json else {}),
         "content": request.json,
     }
+    if silence is None and upload is not None:
+        silence = timeout + READING_SECONDS
     if silence is not None:
-        arguments["timeout"] = httpx.Timeout(silence)
+        arguments["timeout"] = httpx.Timeout(silence, connect=min(CONNECT_SECONDS, silence))
     if upload is None:
         yield arguments
         return

@@ -214,11 +214,11 @@ class Library:
         with _intake() as intake:
             payload = intake / f"data{suffix}"
             identity = _copy(file, payload)
-            found = _inspect(str(payload))
-            _check_classes(classes, found)
             before = self._classifiers.stored(identity)
+            found = _inspect(str(payload)) if before is None else before.model_dump()
+            _check_classes(classes, found)
             if classes is None:
-                classes = before.classes if before is not None else found.get("classes")  # type: ignore[assignment]
+                classes = found.get("classes")  # type: ignore[assignment]
             info = ClassifierInfo.model_validate(
                 found | {"id": identity, "name": name or Path(filename).stem, "classes": classes}
             )

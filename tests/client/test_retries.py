@@ -119,3 +119,17 @@ def test_a_server_that_says_nothing_is_given_up(server):
         pytest.raises(ServerUnreachable, match="ReadTimeout"),
     ):
         client.objects()
+
+
+def test_a_server_may_read_an_upload_for_long_before_it_answers(server, tmp_path):
+    (tmp_path / "net.onnx").write_bytes(b"much to read")
+
+    def silence(request: httpx.Request) -> httpx.Response:
+        assert request.extensions["timeout"] == {"connect": 10, "read": 302, "write": 302, "pool": 302}
+        raise httpx.ReadTimeout("nothing", request=request)
+
+    with (
+        Client(server.url, timeout=2, transport=httpx.MockTransport(silence), retries=Retries(limit=0)) as client,
+        pytest.raises(ServerUnreachable, match="ReadTimeout"),
+    ):
+        client.upload_classifier(tmp_path / "net.onnx")

@@ -83,7 +83,9 @@ def test_shipped_objects_are_there_from_the_start(tmp_path: Path) -> None:
     assert load_object(Library(tmp_path).object_bytes("mug")).n_texels > 0
 
 
-def test_a_classifier_file_is_described_by_a_process_of_its_own(tmp_path: Path) -> None:
+def test_a_classifier_file_is_described_by_a_process_of_its_own_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "net.pt2"
     subprocess.run([sys.executable, "-W", "ignore", "-c", EXPORT, str(file)], check=True)
     library = Library(tmp_path / "library")
@@ -92,6 +94,12 @@ def test_a_classifier_file_is_described_by_a_process_of_its_own(tmp_path: Path) 
     assert (info.name, info.white_box, info.image_size, info.n_classes) == ("colours", True, (8, 12), 3)
     assert info.classes == ["r", "g", "b"]
     assert Path(library.classifier_path("colours")).read_bytes() == file.read_bytes()
+    monkeypatch.delattr("trompe_server.library._inspect")
+    with file.open("rb") as content:
+        again = library.add_classifier(content, "net.pt2")
+    assert again == info.model_copy(update={"name": "net"})
+    with file.open("rb") as content, pytest.raises(ClassifierError, match="2 class names came with a classifier of 3"):
+        library.add_classifier(content, "net.pt2", classes=["r", "g"])
 
 
 def test_a_file_that_is_no_classifier_is_refused_and_leaves_nothing_behind(tmp_path: Path) -> None:
