@@ -1,16 +1,12 @@
 """What the benches share: the objects, a renderer to compare with, rounds of timing."""
 
 import gc
-import json
 import os
 import platform
-import re
 import statistics
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,10 +15,11 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from trompe_server.attack import grid_views
-from trompe_server.target import SailenvTarget
-from trompe_shared.geometry import View
-from trompe_shared.object3d import Object3D, load_object
+from trompe_server.experiments.library_objects import LibraryObject as BenchObject
+from trompe_server.experiments.library_objects import loaded
+from trompe_server.experiments.own_renderer import running_renderer
+from trompe_shared.asset_objects import asset_objects
+from trompe_shared.object3d import Object3D
 from trompe_shared.shipped import shipped_objects
 
 __all__ = [
@@ -37,29 +34,6 @@ __all__ = [
     "running_renderer",
 ]
 
-BACKGROUNDS = {"white": (255, 255, 255), "black": (0, 0, 0)}
-
-
-@dataclass(frozen=True)
-class BenchObject:
-    """An object and how the paper (or this project, for the shipped ones) looks at it: metres, degrees, sRGB."""
-
-    name: str
-    obj: Object3D
-    distance: float
-    elevation: tuple[float, float]
-    background: tuple[int, int, int]
-
-    def views(self, *, azimuths: int = 6, elevations: int = 10) -> list[View]:
-        """The paper's grid of views."""
-        return grid_views(
-            distance=self.distance,
-            elevation=self.elevation,
-            azimuths=azimuths,
-            elevations=elevations,
-            background=self.background,
-        )
-
 
 def assets() -> Path | None:
     """The folder of the real objects and classifiers, by the environment variable TROMPE_ASSETS."""
@@ -68,35 +42,14 @@ def assets() -> Path | None:
 
 def bench_objects(names: Sequence[str] = ()) -> list[BenchObject]:
     """The objects called ``names``, by default the paper's ten, or the shipped ones without TROMPE_ASSETS."""
-    table = _shipped() | _of_the_paper()
-    wanted = names or list(_of_the_paper()) or list(table)
+    folder = assets()
+    paper = {} if folder is None else asset_objects(folder)
+    table = shipped_objects() | paper
+    wanted = names or list(paper or table)
     unknown = sorted(set(wanted) - set(table))
     if unknown:
         sys.exit(f"There is no object {', '.join(unknown)}; there are {', '.join(table)}. Is TROMPE_ASSETS set?")
-    return [table[name]() for name in wanted]
-
-
-def _shipped() -> dict[str, Callable[[], BenchObject]]:
-    def read(name: str) -> BenchObject:
-        row = shipped_objects()[name]
-        return BenchObject(name, load_object(row.read()), row.distance, row.elevation, BACKGROUNDS["white"])
-
-    return {name: lambda name=name: read(name) for name in shipped_objects()}  # type: ignore[misc]
-
-
-def _of_the_paper() -> dict[str, Callable[[], BenchObject]]:
-    folder = assets()
-    if folder is None:
-        return {}
-    table = json.loads((folder / "objects" / "objects.json").read_text(encoding="utf-8"))
-
-    def read(name: str) -> BenchObject:
-        row = table[name]
-        low, high = row["elevation_range"]
-        obj = load_object(folder / "objects" / name)
-        return BenchObject(name, obj, row["distance"], (low, high), BACKGROUNDS[row["background"]])
-
-    return {name: lambda name=name: read(name) for name in table}  # type: ignore[misc]
+    return [loaded(table[name]) for name in wanted]
 
 
 def rescaled(obj: Object3D, factor: float) -> Object3D:
@@ -122,24 +75,6 @@ def painted_at_random(
     shade = generator.uniform(0.4, 0.9, (n_views, *size, 1))
     probes = np.stack([np.broadcast_to((grey * shade).astype(np.uint8), clean.shape) for grey in greys])
     return clean, probes
-
-
-@contextmanager
-def running_renderer() -> Iterator[SailenvTarget]:
-    """A renderer worker process of its own on a free port, for as long as the context lasts."""
-    command = [sys.executable, "-m", "trompe_renderer", "--port", "0"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    try:
-        ready = re.search(r"listening on ([\d.]+):(\d+)", process.stdout.readline())
-        if ready is None:
-            sys.exit("The renderer worker did not start; its message is above. `trompe doctor` says what is missing.")
-        target = SailenvTarget(ready[1], int(ready[2]))
-        yield target
-        target.close()
-    finally:
-        process.kill()
-        process.communicate()
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from trompe_server.attack_job import open_pipeline
 from trompe_server.library import Library
 from trompe_server.target import SailenvTarget
 from trompe_shared.api import JobSpec, Result
+from trompe_shared.asset_objects import asset_objects
 from trompe_shared.object3d import load_object
 
 __all__ = ["Paper", "Rows"]
@@ -67,7 +68,7 @@ class Paper:
             sys.exit("TROMPE_ASSETS must name the folder with the paper's objects and the classifiers.")
         self.assets, self.folder = Path(os.environ["TROMPE_ASSETS"]), folder
         self.library = Library(folder / "library")
-        self.objects: dict[str, Any] = json.loads((self.assets / "objects" / "objects.json").read_text())
+        self.objects = asset_objects(self.assets)
         names = json.loads((self.assets / "classifiers" / "imagenet_classes.json").read_text())
         for file in classifiers:
             with (self.assets / "classifiers" / file).open("rb") as data:
@@ -81,13 +82,13 @@ class Paper:
         """The paper's protocol for an object: its distance, elevations and background; with ``mixed`` black, white and
         the photographs."""
         row = self.objects[name]
-        stored = self.library.add_object(io.BytesIO(load_object(self.assets / "objects" / name).to_zip()), name)
-        protocol = {
+        stored = self.library.add_object(io.BytesIO(load_object(row.path).to_zip()), name)
+        protocol: dict[str, Any] = {
             "object": stored.id,
-            "label": row["imagenet_class"],
-            "distance": row["distance"],
-            "elevation": row["elevation_range"],
-            "background": [*self._photographs(), "black", "white"] if mixed else row["background"],
+            "label": row.label,
+            "distance": row.distance,
+            "elevation": row.elevation,
+            "background": [*self._photographs(), "black", "white"] if mixed else row.background,
         }
         return JobSpec(**(protocol | options))
 

@@ -29,8 +29,8 @@ from torch.optim.lr_scheduler import OneCycleLR
 from bench._common import machine
 from trompe_server.classifiers import NetworkClassifier, WhiteBoxClassifier
 from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, TinyNet, load_tiny
-from trompe_server.experiments.disturbed import renderer
 from trompe_server.experiments.in_process import Change
+from trompe_server.experiments.own_renderer import running_renderer
 from trompe_server.experiments.variants import Variant, clean, make_variants, photographs
 from trompe_server.markdown import markdown_table
 from trompe_server.surrogate import Surrogate, textures_of
@@ -241,7 +241,7 @@ def main() -> None:
     torch.manual_seed(0)
     print(machine() + "\n")
     rows: list[list[str]] = []
-    with renderer() as target, tempfile.TemporaryDirectory(prefix="trompe-") as scratch:
+    with running_renderer() as target, tempfile.TemporaryDirectory(prefix="trompe-") as scratch:
         bench, shipped = Bench(target, Path(scratch), options.epsilon), load_tiny()
         plain, old = [clean(name) for name in shipped_objects()], bench.attacked(shipped, seed=JUDGES)
         for name, network in bench.networks(shipped, steps=options.steps).items():

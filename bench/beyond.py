@@ -8,7 +8,6 @@ with the target's own albedo; whatever is found is judged in the target, on the 
 
 import argparse
 import csv
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -40,6 +39,7 @@ from trompe_server.markdown import markdown_row, markdown_table
 from trompe_server.surrogate.calibration import calibrate
 from trompe_server.surrogate.shading import ENCODERS, Encoding, decode_as
 from trompe_server.target import SailenvTarget
+from trompe_shared.asset_objects import asset_objects
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, encode_png
 
@@ -244,12 +244,12 @@ def main() -> None:
     if folder is None:
         sys.exit("TROMPE_ASSETS must name the folder with the paper's objects and the classifiers.")
     network = load_classifier(folder / "classifiers" / "mobilenet_v2.pt2", name="mobilenet_v2", classes=None)
-    labels = json.loads((folder / "objects" / "objects.json").read_text(encoding="utf-8"))
+    paper = asset_objects(folder)
     rows = []
     print(f"{machine()}\n\n{markdown_table(COLUMNS, [])}", flush=True)
     with running_renderer() as target:
         for entry in bench_objects(options.objects):
-            stage = staged(entry, target, network, labels[entry.name]["imagenet_class"])  # type: ignore[arg-type]
+            stage = staged(entry, target, network, paper[entry.name].label)  # type: ignore[arg-type]
             for row in attacks(stage, options):
                 rows.append(row)
                 print(markdown_row(row), flush=True)

@@ -10,10 +10,9 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from bench._common import running_renderer
-
 from trompe_server.artifacts import LocalArtifacts
 from trompe_server.attack_job import open_pipeline
+from trompe_server.experiments.own_renderer import running_renderer
 from trompe_server.library import Library
 from trompe_server.pages.pictures import Kind, Pictures
 from trompe_server.pages.present import viewer_record

@@ -10,10 +10,8 @@ in image space as a check that the network is an ordinary one. About five minute
 
 import argparse
 import hashlib
-import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -26,6 +24,7 @@ from torch.nn import functional as F
 
 from trompe_server.attack.views import grid_views
 from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, WEIGHTS, TinyNet, load_tiny, save_tiny
+from trompe_server.experiments.own_renderer import running_renderer
 from trompe_server.surrogate import SamplingModel, diffuse_surrogate, prepare_geometry
 from trompe_server.target.sailenv import SailenvTarget
 from trompe_shared.geometry import Camera, Light, View
@@ -54,21 +53,6 @@ class Pictures:
 
 
 # --- pictures ---
-
-
-@contextmanager
-def renderer() -> Iterator[SailenvTarget]:
-    """A renderer worker of our own on a free port."""
-    command = [sys.executable, "-m", "trompe_renderer", "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            port = int(process.stdout.readline().rsplit(":", 1)[-1])
-            target = SailenvTarget("127.0.0.1", port)
-            yield target
-            target.close()
-        finally:
-            process.terminate()
 
 
 def random_views(shipped: ShippedObject, count: int, random: np.random.Generator) -> list[View]:
@@ -269,7 +253,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--epochs", type=int, default=9)
     options = parser.parse_args(arguments)
-    with renderer() as target:
+    with running_renderer() as target:
         network = train(collect(target, options.seed, options.cache), epochs=options.epochs, seed=options.seed)
         save_tiny(network, options.out)
         judge(target, load_tiny(options.out))

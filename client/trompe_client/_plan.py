@@ -1,5 +1,6 @@
 """What the user points at, made ready to send: files are found and options checked before any server is asked."""
 
+import hashlib
 import io
 import json
 import zipfile
@@ -65,10 +66,12 @@ class Upload:
     content: bytes | Path = field(repr=False)
     form: Mapping[str, str] = field(default_factory=dict)
 
-    @property
-    def data(self) -> bytes:
-        """All its bytes."""
-        return self.content.read_bytes() if isinstance(self.content, Path) else self.content
+    def sha256(self) -> str:
+        """Of its bytes, in hexadecimal."""
+        if isinstance(self.content, bytes):
+            return hashlib.sha256(self.content).hexdigest()
+        with self.content.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
 
     def opened(self) -> AbstractContextManager[bytes | BinaryIO]:
         """Its bytes, or the file, open for the time of the block."""

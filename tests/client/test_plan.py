@@ -23,7 +23,8 @@ from trompe_shared.errors import ClassifierError, ObjectError, SpecError
 
 
 def names(upload: Upload) -> list[str]:
-    return zipfile.ZipFile(io.BytesIO(upload.data)).namelist()
+    assert isinstance(upload.content, bytes)
+    return zipfile.ZipFile(io.BytesIO(upload.content)).namelist()
 
 
 def test_a_folder_is_zipped_flat_sorted_and_without_hidden_files(mug_folder):
@@ -31,11 +32,11 @@ def test_a_folder_is_zipped_flat_sorted_and_without_hidden_files(mug_folder):
 
 
 def test_the_same_folder_gives_the_same_bytes_whatever_its_dates(mug_folder):
-    before = object_source(str(mug_folder)).data
+    before = object_source(str(mug_folder)).content
     for file in mug_folder.iterdir():
         file.write_bytes(file.read_bytes())
     later = mug_folder.rename(mug_folder.with_name("elsewhere"))
-    assert object_source(later).data == before
+    assert object_source(later).content == before
 
 
 def test_an_obj_file_takes_its_materials_and_pictures_along_but_no_other_mesh(mug_folder):
@@ -46,7 +47,7 @@ def test_an_obj_file_takes_its_materials_and_pictures_along_but_no_other_mesh(mu
 
 def test_a_zip_is_sent_as_it_is(mug_folder, tmp_path):
     archive = tmp_path / "cup.zip"
-    archive.write_bytes(object_source(mug_folder).data)
+    archive.write_bytes(object_source(mug_folder).content)
     assert object_source(archive) == Upload("cup.zip", archive)
 
 

@@ -1,6 +1,7 @@
 """Files are sent from where they are: piece by piece, and from the beginning again where that is tried again."""
 
 import asyncio
+import hashlib
 import tracemalloc
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import httpx
 import pytest
 
 from trompe_client import AsyncClient, Client
+from trompe_client._plan import background_upload
 from trompe_shared.api import BackgroundInfo
 
 LARGE = 48 * 2**20
@@ -67,6 +69,16 @@ def test_a_large_file_takes_little_memory(way, picture):
     finally:
         tracemalloc.stop()
     assert transport.zeros == [LARGE]
+
+
+def test_the_name_of_a_large_file_takes_little_memory(picture):
+    expected = hashlib.sha256(bytes(LARGE)).hexdigest()
+    tracemalloc.start()
+    try:
+        assert background_upload(picture).sha256() == expected
+        assert tracemalloc.get_traced_memory()[1] < LITTLE_MEMORY
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("way", [send, send_with_asyncio])

@@ -26,7 +26,7 @@ from trompe_server.experiments.report import write_report
 from trompe_server.experiments.stability_chart import behaviours, stability_markdown
 from trompe_server.experiments.style import stamp_of
 from trompe_server.experiments.surrogates import surrogates_markdown
-from trompe_server.experiments.table_one import paper_numbers, table_one, table_one_markdown
+from trompe_server.experiments.table_one import paper_numbers, table_one, table_one_chart, table_one_markdown
 from trompe_shared.errors import SpecError
 from trompe_shared.experiment_table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, write_table
 
@@ -185,6 +185,17 @@ def test_table_one_puts_ours_beside_the_papers_and_leaves_saliency_and_the_unrec
     text = table_one_markdown(rows)
     assert "| candle | 0.80 | 1.00 | **0.90** | 1.00 | 0.76 |" in text
     assert "| **mean** of those with A_before ≥ 0.3 |  | **1.00** | **0.90** | **1.00** | **0.76** |" in text
+
+
+def test_each_classifier_fills_a_row_of_its_own_however_many_budgets_it_was_given() -> None:
+    asked = {"squeezenet1_1": [0.5, 0.05], "mobilenet_v2": [0.01, 0.02, 0.05, 0.1, 0.5]}
+    made = table_one_chart([row(classifier=name, epsilon=epsilon) for name, some in asked.items() for epsilon in some])
+    titles = [panel.get_title(loc="left") for panel in made.panels]
+    assert titles == [f"{name}, ε = {epsilon:g}" for name, some in asked.items() for epsilon in sorted(some)]
+    assert all(panel.lines for panel in made.panels)
+    made.figure.draw_without_rendering()
+    ends = [panel.get_position().x1 for panel in made.panels]
+    assert ends[1] == pytest.approx(ends[-1], abs=0.01)
 
 
 def test_another_network_stands_beside_inceptions_means() -> None:

@@ -47,7 +47,7 @@ def _no_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
         yield FakeTarget()
 
     for module in (suite, variants):
-        monkeypatch.setattr(module, "renderer", fake)
+        monkeypatch.setattr(module, "running_renderer", fake)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """From the file of an experiment to its jobs, each with a key that stays the same however often it is run."""
 
-import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import product
@@ -20,6 +18,7 @@ from trompe_client._plan import (
 )
 from trompe_client.experiments.design import AssetsFolder, Experiment, expanded
 from trompe_shared.api import JobRequest
+from trompe_shared.asset_objects import asset_objects
 from trompe_shared.errors import ObjectError, SpecError
 from trompe_shared.experiment_table import RowId, job_key
 from trompe_shared.presets import PRESETS
@@ -165,18 +164,15 @@ def _objects(experiment: Experiment, files: "_Files") -> Iterator[tuple[str, dic
 
 
 def _of_assets(given: AssetsFolder, files: "_Files") -> Iterator[tuple[str, dict[str, Any]]]:
-    folder = files.path(given.assets) / "objects"
-    try:
-        table = json.loads((folder / "objects.json").read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise ObjectError(f"{str(folder)!r} must hold an objects.json with a table of objects ({error}).") from error
+    folder = files.path(given.assets)
+    table = asset_objects(folder)
     unknown = sorted(set(given.only) - set(table))
     if unknown:
-        raise ObjectError(f"{str(folder)!r} has no {', '.join(unknown)}; there are {', '.join(table)}.")
+        raise ObjectError(f"{str(folder / 'objects')!r} has no {', '.join(unknown)}; there are {', '.join(table)}.")
     for name in given.only or table:
-        row = table[name]
-        seen = {"label": row["imagenet_class"], "distance": row["distance"], "elevation": row["elevation_range"]}
-        yield name, {"object": folder / name, "background": row["background"]} | seen
+        each = table[name]
+        seen = {"label": each.label, "distance": each.distance, "elevation": each.elevation}
+        yield name, {"object": each.path, "background": each.background} | seen
 
 
 class _Files:
@@ -213,7 +209,7 @@ class _Files:
         known = self._read.get((kind, str(source)))
         if known is None:
             found = self._opened(kind, source)
-            known = (found, None) if isinstance(found, str) else (_sha256(found.data), File(kind, found))
+            known = (found, None) if isinstance(found, str) else (found.sha256(), File(kind, found))
             self._read[kind, str(source)] = known
         return known
 
@@ -223,7 +219,3 @@ class _Files:
         is_file = Path(source).suffix.lower() in (CLASSIFIER_SUFFIXES if kind == "classifier" else PICTURE_SUFFIXES)
         path = self.path(str(source)) if is_file else str(source)
         return classifier_source(path) if kind == "classifier" else background_source(path)
-
-
-def _sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()

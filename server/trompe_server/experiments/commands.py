@@ -57,12 +57,12 @@ def fill(document: Path, check: bool) -> None:
 @click.option("--object", "names", multiple=True, help="An object; several times. Default: all.")
 def objects_grid(out: Path, assets: Path | None, names: tuple[str, ...]) -> None:
     """Show the paper's objects (TROMPE_ASSETS), or the shipped ones, in target and surrogates."""
-    from trompe_server.experiments.disturbed import renderer
     from trompe_server.experiments.library_objects import paper_objects, shipped, shown
+    from trompe_server.experiments.own_renderer import running_renderer
     from trompe_server.experiments.pictures import objects_grid as grid
 
     objects = shipped() if assets is None else paper_objects(assets)
-    with renderer() as target:
+    with running_renderer() as target:
         grid([shown(each) for each in objects if each.name in names or not names], target).save(out)
     click.echo(f"written: {out}")
 

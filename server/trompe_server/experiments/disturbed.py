@@ -1,11 +1,7 @@
 """Targets and classifiers that are not what the attack takes them for, or not as they come: what suites are made of."""
 
 import io
-import re
-import subprocess
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -18,8 +14,7 @@ from torch import Tensor
 
 from trompe_server.classifiers import WhiteBoxClassifier
 from trompe_server.classifiers.protocol import Images, Logits, Wrapper, fit_images, in_batches
-from trompe_server.target import SailenvTarget, TargetRenderer
-from trompe_shared.errors import RendererError
+from trompe_server.target import TargetRenderer
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
@@ -37,7 +32,6 @@ __all__ = [
     "jpeg",
     "quantised",
     "relit",
-    "renderer",
     "resized_twice",
     "saturated",
     "smaller",
@@ -172,28 +166,6 @@ def relit(azimuth: float, intensity: float = 1.0) -> Aim:
 def smaller(target: TargetRenderer, scale: float) -> DisturbedTarget:
     """A target whose images are ``scale`` times the size that is asked for, and scaled up."""
     return DisturbedTarget(target, scale=scale)
-
-
-@contextmanager
-def renderer(*, field_of_view: float | None = None) -> Iterator[SailenvTarget]:
-    """A renderer worker of our own, with a vertical field of view (degrees) other than the protocol's, if one is given.
-
-    Raises ``RendererError`` when it does not start.
-    """
-    patch = f"import trompe_shared.geometry as g; g.FIELD_OF_VIEW = {field_of_view}; " if field_of_view else ""
-    code = f"{patch}from trompe_server.jobs.leash import main; main(['render', '--port', '0'])"
-    pipe = subprocess.PIPE  # when its input closes, it ends
-    with subprocess.Popen([sys.executable, "-c", code], stdin=pipe, stdout=pipe, text=True) as process:
-        try:
-            assert process.stdout is not None
-            ready = re.search(r"listening on ([\d.]+):(\d+)", process.stdout.readline())
-            if ready is None:
-                raise RendererError("The renderer worker did not start. `trompe doctor` says what is missing.")
-            target = SailenvTarget(ready[1], int(ready[2]))
-            yield target
-            target.close()
-        finally:
-            process.terminate()
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,11 @@ from trompe_server.experiments.disturbed import (
     jpeg,
     quantised,
     relit,
-    renderer,
     resized_twice,
     saturated,
     smaller,
 )
+from trompe_server.experiments.own_renderer import running_renderer
 from trompe_server.experiments.suite import Case, OnRow, plan_jobs, run_planned
 from trompe_shared.experiment_table import ResultRow, RowId
 
@@ -46,7 +46,7 @@ def _aimed(aim: Any) -> Case:
 
 
 DISTURBANCES: Final[Mapping[str, Case]] = {
-    "field of view 61 degrees": Case(renderer=lambda: renderer(field_of_view=61.0)),
+    "field of view 61 degrees": Case(renderer=lambda: running_renderer(field_of_view=61.0)),
     "camera jitter 1 degree, 1 %": _aimed(jittered(1.0, 0.01)),
     "light 30 degrees elsewhere": _aimed(relit(30.0)),
     "light from behind, half as bright": _aimed(relit(180.0, intensity=0.5)),

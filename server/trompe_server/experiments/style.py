@@ -2,6 +2,7 @@
 the same data."""
 
 import hashlib
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pydantic import BaseModel
 
-__all__ = ["BLUE", "GREEN", "GREY", "INK", "MARKERS", "ORANGE", "PALETTE", "RED", "Drawing", "drawing", "stamp_of"]
+__all__ = [
+    "BLUE",
+    "GREEN",
+    "GREY",
+    "INK",
+    "MARKERS",
+    "ORANGE",
+    "PALETTE",
+    "RED",
+    "Drawing",
+    "drawing",
+    "drawing_in_rows",
+    "stamp_of",
+]
 
 INK: Final = "#262626"
 GREY: Final = "#999999"
@@ -39,15 +53,10 @@ RC: Final[Any] = {
 
 
 class Drawing:
-    """A figure with its panels, ``axes`` (rows, columns)."""
+    """A figure with its panels, row by row."""
 
-    def __init__(self, figure: Figure, axes: Any) -> None:
-        self.figure, self.axes = figure, axes
-
-    @property
-    def panels(self) -> list[Axes]:
-        """All panels, row by row."""
-        return list(self.axes.flat)
+    def __init__(self, figure: Figure, panels: Sequence[Axes]) -> None:
+        self.figure, self.panels = figure, list(panels)
 
     def save(self, folder: Path, name: str, *, stamp: str) -> list[Path]:
         """Write ``name``.svg and ``name``.png; ``stamp``, in their metadata, names the data. Gives their paths."""
@@ -65,7 +74,17 @@ def drawing(*, size: tuple[float, float], panels: tuple[int, int] = (1, 1), **op
     with matplotlib.rc_context(RC):
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(*panels, squeeze=False, **options)
-        yield Drawing(figure, axes)
+        yield Drawing(figure, axes.flat)
+
+
+@contextmanager
+def drawing_in_rows(*, size: tuple[float, float], rows: Sequence[int], **options: Any) -> Iterator[Drawing]:
+    """As ``drawing``, with so many panels in each row: they fill it, and are wider where there are fewer."""
+    parts = math.lcm(*rows)
+    places = [[f"{row}.{part * count // parts}" for part in range(parts)] for row, count in enumerate(rows)]
+    with matplotlib.rc_context(RC):
+        figure = Figure(figsize=size, layout="constrained")
+        yield Drawing(figure, list(figure.subplot_mosaic(places, **options).values()))  # type: ignore[arg-type]
 
 
 def stamp_of(rows: Sequence[BaseModel]) -> str:

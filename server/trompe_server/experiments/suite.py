@@ -14,9 +14,9 @@ from typing import Any
 import torch
 
 from trompe_server.attack.metrics import accuracy
-from trompe_server.experiments.disturbed import renderer
 from trompe_server.experiments.groups import grouped
 from trompe_server.experiments.in_process import Change, Done, MakeSurrogate, run_job
+from trompe_server.experiments.own_renderer import running_renderer
 from trompe_server.target import TargetRenderer
 from trompe_shared.api import JobSpec, JobState
 from trompe_shared.errors import TrompeError
@@ -120,7 +120,7 @@ def _rows(planned: Sequence[Planned], known: Mapping[str, ResultRow]) -> list[Re
 
 def _run_all(group: Sequence[Planned]) -> Iterator[ResultRow]:
     """The rows of one object and seed; what is met afterwards is met by the object of one undisturbed job."""
-    with tempfile.TemporaryDirectory(prefix="trompe-") as scratch, renderer() as target:
+    with tempfile.TemporaryDirectory(prefix="trompe-") as scratch, running_renderer() as target:
         undisturbed: Done | None = None
         for number, each in enumerate(group):
             folder = Path(scratch, str(number))

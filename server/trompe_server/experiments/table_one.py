@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from trompe_server.experiments.groups import average, figure_words, grouped
-from trompe_server.experiments.style import BLUE, GREEN, GREY, INK, Drawing, drawing
+from trompe_server.experiments.style import BLUE, GREEN, GREY, INK, Drawing, drawing_in_rows
 from trompe_server.markdown import markdown_table
 from trompe_shared.api import FEW_RECOGNISED
 from trompe_shared.experiment_table import ResultRow
@@ -162,32 +162,26 @@ def _means(cells: Sequence[Cell], epsilon: float, *, with_paper: bool) -> list[s
 
 
 def table_one_chart(rows: Sequence[ResultRow]) -> Drawing:
-    """A panel for each classifier and epsilon, a line for each object: the paper's target, ours, and held-out views."""
+    """A row for each classifier, a panel for each epsilon, a line for each object: the paper's target, ours, and
+    held-out views."""
     cells = table_one(rows)
-    panels = grouped(cells, lambda cell: (cell.classifier, cell.epsilon))
-    classifiers = list(dict.fromkeys(classifier for classifier, _ in panels))
-    epsilons = sorted({epsilon for _, epsilon in panels})
+    classifiers = list(dict.fromkeys(cell.classifier for cell in cells))
+    panels = grouped(cells, lambda cell: (classifiers.index(cell.classifier), cell.epsilon))
+    places = sorted(panels)
     objects = list(dict.fromkeys(cell.object for cell in cells))
-    size = (1.8 + 2.6 * len(epsilons), 1.2 + (0.6 + 0.26 * len(objects)) * len(classifiers))
-    shape = len(classifiers), len(epsilons)
-    with drawing(size=size, panels=shape, sharex=True, sharey=True) as made:
-        for axes, (classifier, epsilon) in zip(
-            made.panels, [(c, e) for c in classifiers for e in epsilons], strict=True
-        ):
-            axes.set_visible((classifier, epsilon) in panels)
-            for cell in panels.get((classifier, epsilon), []):
+    counts = [len(row) for row in grouped(places, lambda place: place[0]).values()]
+    size = (1.8 + 2.6 * max(counts), 0.8 + (0.9 + 0.26 * len(objects)) * len(counts))
+    with drawing_in_rows(size=size, rows=counts, sharex=True, sharey=True) as made:
+        for axes, place in zip(made.panels, places, strict=True):
+            for cell in panels[place]:
                 _draw_line(axes, objects.index(cell.object), cell)
-            axes.set_title(f"{classifier}, ε = {epsilon:g}")
+            axes.set_title(f"{classifiers[place[0]]}, ε = {place[1]:g}")
             axes.set_yticks(range(len(objects)), objects)
             axes.axvline(0, color=GREY, lw=0.8)
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel("A_drop (share)" if place[0] == places[-1][0] else "")
         made.panels[0].set_ylim(len(objects) - 0.5, -0.5)
         made.panels[0].set_xlim(right=1.06)
-        for row in made.axes:
-            next(axes for axes in row if axes.get_visible()).tick_params(labelleft=True)
-        for column in zip(*made.axes, strict=True):
-            lowest = next(axes for axes in reversed(column) if axes.get_visible())
-            lowest.tick_params(labelbottom=True)
-            lowest.set_xlabel("A_drop (share)")
         _legend(made, paper=any(cell.paper for cell in cells))
     return made
 

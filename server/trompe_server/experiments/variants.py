@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trompe_server.attack import ViewDistribution
-from trompe_server.experiments.disturbed import renderer
 from trompe_server.experiments.in_process import Change, run_job
+from trompe_server.experiments.own_renderer import running_renderer
 from trompe_server.target import TargetRenderer
 from trompe_shared.api import JobSpec
 from trompe_shared.errors import SpecError
@@ -117,7 +117,7 @@ def export_variants(
     (out / "objects").mkdir(parents=True, exist_ok=True)
     made: list[Variant] = []
     with (
-        renderer() as target,
+        running_renderer() as target,
         tempfile.TemporaryDirectory(prefix="trompe-") as scratch,
         (out / "labels.csv").open("w", newline="", encoding="utf-8") as file,
     ):
