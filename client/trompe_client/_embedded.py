@@ -13,12 +13,16 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from trompe_client._errors import EmbeddedServerError, ServerUnreachable
+from trompe_client._errors import EmbeddedServerError, ServerUnreachable, Unauthorized
 
 __all__ = ["embedded_server"]
 
 SERVE: Final = (sys.executable, "-m", "trompe_client.cli", "serve", "--port", "0", "--data")
 READY: Final = re.compile(r"^trompe serving on (http://\S+)", re.MULTILINE)
+HAS_TOKENS: Final = (
+    "The service of this command's own works on data that have tokens (TROMPE_DATA, TROMPE_DATABASE); "
+    "`trompe token create NAME` makes another."
+)
 TAIL_LINES: Final = 20
 STOP_SECONDS: Final = 20.0
 
@@ -28,7 +32,8 @@ def embedded_server(*, command: Sequence[str] = SERVE, start_seconds: float = 18
     """The URL of a service of our own, up for the time of the block.
 
     Its data lie in ``$TROMPE_DATA``, else in a temporary folder that goes with it. Raises ``EmbeddedServerError`` with
-    the end of its log when it does not come up within ``start_seconds``, or dies.
+    the end of its log when it does not come up within ``start_seconds``, or dies. ``Unauthorized`` that is raised in
+    the block says that the data have tokens.
     """
     with tempfile.TemporaryDirectory(prefix="trompe-") as scratch, _signals_unwind():
         log = Path(scratch, "serve.log")
@@ -38,6 +43,9 @@ def embedded_server(*, command: Sequence[str] = SERVE, start_seconds: float = 18
             yield _wait_for_url(process, log, start_seconds)
         except ServerUnreachable as error:
             raise EmbeddedServerError(f"The embedded service is gone. {error}\n{_tail(log)}") from error
+        except Unauthorized as error:
+            detail = f"{error.problem.detail or ''} {HAS_TOKENS}".strip()
+            raise Unauthorized(error.problem.model_copy(update={"detail": detail})) from error
         finally:
             _stop(process)
 

@@ -8,9 +8,11 @@
         ├── ContractError            an answer that this client cannot read: another version, or no Trompe server
         ├── APIError                 the server said no: has status, problem
         │   ├── BadRequest           400, 413, 415, 422: what was sent is wrong
+        │   ├── Unauthorized         401: a token is needed, or this one is not known
+        │   ├── Forbidden            403: the token has not the right to do this
         │   ├── NotFound             404: no such job, object, classifier or file
         │   ├── Conflict             409: not possible in the present state
-    │   ├── TooMany              429: too many requests; has retry_after
+        │   ├── TooMany              429: too many requests; has retry_after
         │   └── ServerFault          5xx: the server's own fault
         └── JobError                 has job, as last seen
             ├── JobFailed            the job ended in an error
@@ -19,6 +21,8 @@
 
 A job that ends as n.a. (nothing was recognised before the attack) is a result, not an error.
 """
+
+from typing import ClassVar
 
 from trompe_shared.api import Job, Problem
 from trompe_shared.errors import TrompeError
@@ -86,6 +90,8 @@ class APIError(ClientError):
     """
 
     code = "api"
+    remedy: ClassVar[str] = ""
+    """What helps, where the server does not know how its clients are told."""
 
     def __init__(
         self,
@@ -95,7 +101,9 @@ class APIError(ClientError):
         job_id: str | None = None,
         retry_after: float | None = None,
     ) -> None:
-        super().__init__(_explain(problem), request_id=request_id or problem.request_id, job_id=job_id)
+        super().__init__(
+            f"{_explain(problem)} {self.remedy}".strip(), request_id=request_id or problem.request_id, job_id=job_id
+        )
         self.problem = problem
         self.status = problem.status
         self.retry_after = retry_after
@@ -111,6 +119,7 @@ class Unauthorized(APIError):  # noqa: N818
     """A token is needed, or this one is unknown or revoked. Give one by ``token=`` or TROMPE_TOKEN."""
 
     code = "unauthorized"
+    remedy = "Give a token by TROMPE_TOKEN, --token or Client(token=...)."
 
 
 class Forbidden(APIError):  # noqa: N818

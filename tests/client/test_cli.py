@@ -223,7 +223,7 @@ def test_a_report_of_100_columns_keeps_every_number_whole(client):
 
 def test_an_object_comes_back_in_the_form_it_was_given(server, mug_folder, tmp_path):
     archive = tmp_path / "cup.zip"
-    archive.write_bytes(object_source(mug_folder).data)
+    archive.write_bytes(object_source(mug_folder).content)
     for source in (mug_folder, archive, mug_folder / "mug.obj", mug_folder):
         done = trompe("attack", source, "--label", 0, "--server", server.url, "--out", tmp_path / "out")
         assert done.exit_code == 0, done.output
@@ -364,6 +364,17 @@ def test_ctrl_c_cancels_the_job_on_a_server_of_our_own(server, tmp_path, monkeyp
     done = trompe("attack", "mug", "--label", 0, "--out", tmp_path)
     assert done.exit_code == 130
     assert server.jobs["job-1"].state is JobState.cancelled
+
+
+def test_a_token_that_is_given_opens_the_service_of_the_command_too(server, monkeypatch):
+    @contextmanager
+    def embedded():
+        yield server.url
+
+    server.token = "trompe_secret"
+    monkeypatch.setattr(connection, "embedded_server", embedded)
+    with connection.service(None, "trompe_secret") as client:
+        assert client.objects()
 
 
 class EntryPoints(list):

@@ -84,7 +84,7 @@ def readers_folder(server, mug_folder, tmp_path, monkeypatch):
     """A folder with the files that the pages speak of; the fake server is where commands look for one."""
     from trompe_client._plan import object_upload
 
-    (tmp_path / "mug.zip").write_bytes(object_upload(mug_folder).data)
+    (tmp_path / "mug.zip").write_bytes(object_upload(mug_folder).content)
     (tmp_path / "net.pt2").write_bytes(b"network")
     (tmp_path / "room.png").write_bytes(b"picture")
     server.when_listed = server.finish_all

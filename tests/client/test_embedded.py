@@ -6,8 +6,9 @@ import sys
 
 import pytest
 
-from trompe_client import EmbeddedServerError, ServerUnreachable
+from trompe_client import EmbeddedServerError, ServerUnreachable, Unauthorized
 from trompe_client._embedded import embedded_server
+from trompe_shared.api import Problem
 
 NOTE_AND_WAIT = """
 import os, pathlib, signal, sys, time
@@ -56,6 +57,16 @@ def test_a_service_that_dies_is_told_apart_from_a_server_elsewhere():
         embedded_server(command=script(f"{code}; import time; time.sleep(60)")),
     ):
         raise ServerUnreachable("nobody there")
+
+
+def test_data_with_tokens_are_told_of_where_none_was_given():
+    code = "print('trompe serving on http://127.0.0.1:1', flush=True); import time; time.sleep(60)"
+    asked = Problem(title="Unauthorized", status=401, detail="This needs a token.")
+    with (
+        pytest.raises(Unauthorized, match=r"needs a token\. The service of .*\(TROMPE_DATA, .*TROMPE_TOKEN, --token"),
+        embedded_server(command=script(code)),
+    ):
+        raise Unauthorized(asked)
 
 
 def test_a_terminated_command_takes_its_service_along(tmp_path):

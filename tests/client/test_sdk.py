@@ -209,7 +209,7 @@ def test_a_problem_document_becomes_a_typed_error(status, error):
     body = json.dumps({"title": "Wrong", "status": status, "detail": "Look."}).encode()
     with answering(status, body) as client, pytest.raises(error) as caught:
         client.objects()
-    assert str(caught.value) == "Wrong. Look."
+    assert str(caught.value) == f"Wrong. Look. {error.remedy}".strip()
     assert caught.value.status == status
     fields = [{"field": "epsilon", "message": "too large"}, {"field": "tau", "message": "too small"}]
     body = json.dumps({"title": "Wrong", "status": status, "errors": fields}).encode()
@@ -217,6 +217,12 @@ def test_a_problem_document_becomes_a_typed_error(status, error):
         answering(status, body) as client,
         pytest.raises(error, match=r"Wrong\. epsilon: too large\. tau: too small\."),
     ):
+        client.objects()
+
+
+def test_who_lacks_a_token_is_told_how_to_give_one():
+    body = json.dumps({"title": "Unauthorized", "status": 401, "detail": "This needs a token."}).encode()
+    with answering(401, body) as client, pytest.raises(Unauthorized, match=r"a token\. Give a token by TROMPE_TOKEN"):
         client.objects()
 
 

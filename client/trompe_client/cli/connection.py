@@ -55,7 +55,7 @@ def service(server: str | None, token: str | None) -> Iterator[Client]:
         with Client(server, token=token) as client:
             yield client
         return
-    with _embedded_with_spinner() as url, Client(url) as client:
+    with _embedded_with_spinner() as url, Client(url, token=token) as client:
         yield client
 
 
