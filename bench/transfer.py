@@ -87,7 +87,11 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--pool", type=int, default=120)
     parser.add_argument("--held-out", type=int, default=60)
-    parser.add_argument("--diverse", action="store_true", help="show images at random places, win by all one can")
+    parser.add_argument(
+        "--diverse",
+        action=argparse.BooleanOptionalAction,
+        help="show images at random places, win by all one can (as everywhere the default for ensembles alone)",
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--csv", type=Path, metavar="FILE", help="read if it is there, and written job by job")
     return parser.parse_args()
@@ -101,7 +105,8 @@ def attacks() -> Iterator[str]:
 
 def _key(options: argparse.Namespace, name: str, seed: int, attacked: str) -> dict[str, Any]:
     """What the rows of a job are found again by."""
-    return {"object": name, "attacked": attacked, "seed": seed} | {one: getattr(options, one) for one in SETTINGS}
+    key = {"object": name, "attacked": attacked, "seed": seed} | {one: getattr(options, one) for one in SETTINGS}
+    return key | ({"diverse": TOGETHER in attacked} if options.diverse is None else {})
 
 
 def _judged(paper: Paper, target: SailenvTarget, table: Rows[Row], key: dict[str, Any]) -> list[Row]:

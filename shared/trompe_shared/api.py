@@ -204,7 +204,8 @@ class JobSpec(_Schema):
     diverse: bool = Field(
         False,
         description="for transfer to other classifiers: show images scaled, shifted and mirrored at random, and win "
-        "each view by as much as possible. Never ends before all steps are taken",
+        "each view by as much as possible. Never ends before all steps are taken. By default true of a texture that "
+        "is attacked through the gradients of an ensemble, else false",
     )
     attack_on: AttackOn = Field(
         "texture",
@@ -295,6 +296,14 @@ class JobSpec(_Schema):
         if isinstance(given, dict) and "alpha" not in given and isinstance(given.get("epsilon"), float):
             return given | {"alpha": _mean_step(given["epsilon"])}
         return given
+
+    @model_validator(mode="before")
+    @classmethod
+    def _an_ensemble_is_for_transfer(cls, given: Any) -> Any:
+        if not isinstance(given, dict) or "diverse" in given or not given.get("ensemble"):
+            return given
+        by_gradients = given.get("queries") is None
+        return given | {"diverse": by_gradients and given.get("attack_on", "texture") == "texture"}
 
     @model_validator(mode="after")
     def _consistent(self) -> "JobSpec":

@@ -127,6 +127,23 @@ def test_every_kind_of_attack_stays_in_its_budget_and_says_what_it_was(
     assert any(mask.any() for mask in changed(painted).values())
 
 
+@pytest.mark.parametrize(
+    ("options", "diverse"),
+    [
+        ({}, False),
+        ({"ensemble": ["net"]}, True),
+        ({"ensemble": ["net"], "diverse": False}, False),
+        ({"ensemble": ["net"], "queries": 4}, False),
+        ({"ensemble": ["net"], "attack_on": "vertices"}, False),
+    ],
+    ids=str,
+)
+def test_an_ensemble_is_attacked_for_transfer_unless_that_is_impossible_or_unwanted(
+    options: dict[str, Any], diverse: bool
+) -> None:
+    assert JobSpec(object="mug", label="mug", **options).diverse is diverse
+
+
 def test_the_view_constraint_is_kept_in_the_surrogate_and_told_of_the_target(library: Library, tmp_path: Path) -> None:
     free, _ = attacked(library, tmp_path / "free")
     bound, _ = attacked(library, tmp_path / "bound", epsilon_view=0.02)

@@ -137,10 +137,10 @@ GRID: Final = ("azimuths", "elevations")
     help=f"Further runs, which share the steps. Default: {_default('restarts')}.",
 )
 @_search(
-    "--diverse",
-    is_flag=True,
+    "--diverse/--no-diverse",
+    default=None,
     help="For transfer to other classifiers: show images scaled, shifted and mirrored, and win by as much as possible; "
-    "takes all steps.",
+    "takes all steps. Default: with --ensemble.",
 )
 @_search(
     "--queries",
