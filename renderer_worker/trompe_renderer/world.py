@@ -66,6 +66,7 @@ class ObjectCommands:
         self._fixtures = tuple(_placement(number, fixture) for number, fixture in enumerate(fixtures, start=1))
         self._last_number = len(fixtures)
         self._spawned = {}
+        self._library.textures.hold(self, 0)
         self._room, self._frustum = room, NO_WALLS
 
     def _placements(self) -> tuple[Placement, ...]:
@@ -102,10 +103,11 @@ class ObjectCommands:
         """Keep an archive and answer a path that SPAWN_OBJECT takes; the oldest go when an agent keeps too much."""
         data = file[1]
         path = content_key(data)
-        self._uploads.pop(path, None)
-        self._uploads[path] = data
-        while len(self._uploads) > 1 and sum(map(len, self._uploads.values())) > MAX_STORED_BYTES:
-            self._uploads.pop(next(iter(self._uploads)))
+        kept = {other: archive for other, archive in self._uploads.items() if other != path} | {path: data}
+        while len(kept) > 1 and sum(map(len, kept.values())) > MAX_STORED_BYTES:
+            kept.pop(next(iter(kept)))
+        self._library.uploads.hold(self, sum(map(len, kept.values())))
+        self._uploads = kept
         return (path,)
 
     def spawn_object(
@@ -129,6 +131,7 @@ class ObjectCommands:
     def despawn_object(self, *, instance: int) -> tuple[()]:
         self._spawned_object(instance)
         del self._spawned[instance]
+        self._library.textures.hold(self, self._texture_bytes())
         return ()
 
     def move_object(self, *, instance: int, position: Vector, rotation: Vector) -> tuple[()]:
@@ -147,12 +150,18 @@ class ObjectCommands:
 
     def _admit(self, model: Model) -> None:
         """Raise ``RendererError`` if the textures of ``model`` and of all that is spawned are too large together."""
-        models = [model, *(item.model for item in self._spawned.values())]
-        sizes = {id(texture): texture.nbytes for each in models for texture in each.obj.textures.values()}
-        if sum(sizes.values()) > MAX_SHOWN_BYTES:
+        size = self._texture_bytes(model)
+        if size > MAX_SHOWN_BYTES:
             raise RendererError(
                 f"The spawned objects' textures take more than {MAX_SHOWN_BYTES >> 20} MiB; despawn some first."
             )
+        self._library.textures.hold(self, size)
+
+    def _texture_bytes(self, *more: Model) -> int:
+        """What the textures of all that is spawned take, and those of ``more``."""
+        models = [*more, *(item.model for item in self._spawned.values())]
+        sizes = {id(texture): texture.nbytes for each in models for texture in each.obj.textures.values()}
+        return sum(sizes.values())
 
     def get_spawnable_objects_names(self) -> tuple[Sequence[str]]:
         return (list(shipped_objects()),)

@@ -39,6 +39,7 @@ __all__ = [
     "open_image",
     "pack_zip",
     "unpack",
+    "unpacked_size",
     "unzip",
 ]
 
@@ -217,6 +218,14 @@ def unpack(data: bytes) -> dict[str, bytes]:
         return {name: _read_member(archive, info) for name, info in zip(names, members, strict=True)}
     except _DAMAGED as error:
         raise ObjectError(f"The archive is damaged or encrypted ({error}). Zip the folder again.") from error
+
+
+def unpacked_size(data: bytes) -> int:
+    """Bytes that a zip says it unpacks to; 0 for what is none."""
+    try:
+        return sum(info.file_size for info in zipfile.ZipFile(io.BytesIO(data)).infolist())
+    except _DAMAGED:
+        return 0
 
 
 def _check_size(members: list[zipfile.ZipInfo], packed: int) -> None:

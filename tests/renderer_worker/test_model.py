@@ -1,5 +1,8 @@
 """Objects are found again by their content, and one that differs in its albedo alone is not read anew."""
 
+import gc
+import threading
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -8,8 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from trompe_renderer import model as model_module
-from trompe_renderer.model import Library, content_key, model_of, repainted
-from trompe_shared.errors import ObjectError
+from trompe_renderer.model import Holdings, Library, content_key, model_of, repainted
+from trompe_renderer.session import Session
+from trompe_shared.errors import ObjectError, RendererError
 from trompe_shared.object3d import Object3D, load_object, pack_zip
 
 Boxes = Callable[..., Object3D]
@@ -90,3 +94,82 @@ def test_a_library_forgets_what_was_used_longest_ago(make_boxes: Boxes, monkeypa
     assert len(read_from_scratch) == model_module.CAPACITY + 1
     read(library, archives[1])
     assert len(read_from_scratch) == model_module.CAPACITY + 2
+
+
+def test_large_archives_are_read_one_after_the_other_and_small_ones_beside_them(
+    make_boxes: Boxes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = make_boxes()
+    small, *large = (box.with_textures({"front_albedo.png": noise(k, 60 * k, 60)}).to_zip() for k in (1, 8, 9))
+    monkeypatch.setattr(model_module, "LARGE", 64 * 2**10)
+    reading: list[int] = []
+    most: list[int] = []
+
+    def slowly(files: dict[str, bytes]) -> Object3D:
+        reading.append(len(files))
+        most.append(len(reading))
+        time.sleep(0.2)
+        reading.pop()
+        return box
+
+    monkeypatch.setattr(model_module, "object_from_files", slowly)
+    for archives, together in ((large, 1), ([small, large[0]], 2)):
+        library = Library()
+        most.clear()
+        threads = [threading.Thread(target=read, args=(library, archive)) for archive in archives]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(most) == 2
+        assert max(most) == together
+
+
+def test_a_library_keeps_the_last_models_within_a_number_of_bytes(
+    make_boxes: Boxes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = Library()
+    archives = [make_boxes().with_textures({"front_albedo.png": noise(k, 64, 64)}).to_zip() for k in range(3)]
+    first = read(library, archives[0])
+    monkeypatch.setattr(model_module, "KEPT_BYTES", 2 * first.nbytes + 2000)
+    second, third = (read(library, archive) for archive in archives[1:])
+    assert read(library, archives[2]) is third
+    assert read(library, archives[1]) is second
+    assert read(library, archives[0]) is not first
+    monkeypatch.setattr(model_module, "KEPT_BYTES", 0)
+    assert read(library, archives[1]) is read(library, archives[1])
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 40)), max_size=30))
+def test_holders_together_never_keep_more_than_there_is_and_may_always_keep_less(wishes: list[tuple[int, int]]) -> None:
+    holders, held, holdings = [Session(Library()) for _ in range(4)], [0] * 4, Holdings(100)
+    for k, count in wishes:
+        fits = sum(held) - held[k] + count <= 100
+        try:
+            holdings.hold(holders[k], count)
+            assert fits or count <= held[k]
+            held[k] = count
+        except RendererError:
+            assert not fits
+        assert sum(held) <= 100
+
+
+def test_what_agents_keep_is_limited_for_all_together_and_free_when_they_leave(make_boxes: Boxes) -> None:
+    archive = make_boxes().to_zip()
+    textures = sum(texture.nbytes for texture in make_boxes().textures.values())
+    library = Library(uploads=2 * len(archive), textures=textures)
+    place = {"position": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0), "scale": (1.0, 1.0, 1.0)}
+    one, other, third = (Session(library) for _ in range(3))
+    (path,) = one.send_obj_zip(file=("box.zip", archive))
+    one.send_obj_zip(file=("box.zip", archive))
+    other.send_obj_zip(file=("box.zip", archive))
+    with pytest.raises(RendererError, match="All agents together keep up to"):
+        third.send_obj_zip(file=("box.zip", archive))
+    one.spawn_object(name=f"file:{path}", **place)
+    with pytest.raises(RendererError, match="Try again when others have left"):
+        other.spawn_object(name=f"file:{path}", **place)
+    one.despawn_object(instance=1)
+    other.spawn_object(name=f"file:{path}", **place)
+    del one
+    gc.collect()
+    third.send_obj_zip(file=("box.zip", archive))
