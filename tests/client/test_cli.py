@@ -121,6 +121,8 @@ def test_what_is_not_said_is_left_to_the_job(server, tmp_path):
     ("words", "wanted"),
     [
         pytest.param("--grid", {"pool": 0}, id="grid"),
+        pytest.param("--ensemble hub:a/b.pt", {"ensemble": ["hub:a/b.pt"], "diverse": True}, id="for transfer"),
+        pytest.param("--ensemble hub:a/b.pt --no-diverse", {"ensemble": ["hub:a/b.pt"], "diverse": False}, id="not so"),
         pytest.param("--pool 0 --azimuths 4", {"pool": 0, "azimuths": 4}, id="no pool"),
         pytest.param("--grid --azimuths 4 --elevations 3", {"pool": 0, "azimuths": 4, "elevations": 3}, id="its size"),
         pytest.param("--target vase", {"target_label": "vase"}, id="target by name"),
