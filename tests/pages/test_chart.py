@@ -41,6 +41,13 @@ def test_means_are_over_the_objects_that_all_configurations_have() -> None:
     assert [(mean.configuration, mean.drop) for mean in means] == [("short", 0.6), ("long", 0.9)]
 
 
+def test_a_configuration_that_has_just_begun_is_left_out() -> None:
+    begun = point("easy", "begun", 10, 1.0)
+    means, common = means_of([*HARD_AND_EASY, point("other", "short", 10, 0.0), point("other", "long", 10, 0.0), begun])
+    assert common == {"easy", "hard", "other"}
+    assert [mean.configuration for mean in means] == ["short", "long"]
+
+
 def test_an_object_counts_once_however_many_seeds_it_has() -> None:
     means, _ = means_of([point("a", "c", 10, 1.0), point("a", "c", 30, 0.8), point("b", "c", 40, 0.1)])
     assert len(means) == 1

@@ -109,12 +109,17 @@ def chart(points: Sequence[Point], *, measure: str) -> Chart:
 def means_of(points: Sequence[Point]) -> tuple[list[Mean], set[str]]:
     """The configurations, and the objects on which all of them have a point: each is a mean over these alone.
 
-    No configuration where there are no such objects. An object counts once, whatever the number of its jobs.
+    One that has points on less than half of the objects, as one that has just begun, is left out. None where there are
+    no common objects. An object counts once, whatever the number of its jobs.
     """
     groups = grouped(points, lambda point: point.configuration)
-    common = set.intersection(*({point.object for point in group} for group in groups.values()))
+    objects = {name: {point.object for point in group} for name, group in groups.items()}
+    enough = len(set.union(*objects.values())) / 2
+    compared = [name for name, mine in objects.items() if len(mine) >= enough]
+    common = set.intersection(*(objects[name] for name in compared)) if compared else set()
     means = []
-    for name, group in groups.items() if common else ():
+    for name in compared if common else ():
+        group = groups[name]
         parts = grouped((point for point in group if point.object in common), lambda point: point.object).values()
         seconds, drops = ([fmean(getattr(p, of) for p in part) for part in parts] for of in ("seconds", "drop"))
         means.append(Mean(name, fmean(seconds), fmean(drops)))
