@@ -85,7 +85,7 @@ class _Reader:
         self._triangles = 0
 
     def read(self, text: str) -> None:
-        for count, found in enumerate(_LINE.finditer(text)):  # a list of all lines can be a hundred times the text
+        for count, found in enumerate(_LINE.finditer(text)):  # a list of all lines takes many times the text
             line = found[1]
             if count == MAX_LINES:
                 raise ObjectError(f"{self.file!r} has more than {MAX_LINES} lines; simplify the mesh.")

@@ -23,19 +23,26 @@ class Names:
 
     def row(self, job: Job) -> JobRow:
         """A job in a list."""
-        asked = self.options(job.spec)
-        return job_row(job, object=self._object(job.spec.object), classifier=asked["classifier"], label=asked["label"])
+        spec = job.spec
+        return job_row(
+            job,
+            object=self._object(spec.object),
+            classifier=self._classifier(spec.classifier),
+            label=self._class(spec, spec.label),
+        )
 
     def options(self, spec: JobSpec) -> dict[str, Any]:
         """What was asked of an object, with names for ids and for the numbers of classes."""
-        name = self.classes(spec.classifier)
-        classes = {"label": spec.label, "target_label": spec.target_label}
         return spec.model_dump(exclude={"object"}) | {
             "classifier": self._classifier(spec.classifier),
-            **{option: name(given) if isinstance(given, int) else given for option, given in classes.items()},
+            "label": self._class(spec, spec.label),
+            "target_label": None if spec.target_label is None else self._class(spec, spec.target_label),
             "ensemble": [self._classifier(each) for each in spec.ensemble],
             "judges": [self._classifier(each) for each in spec.judges],
         }
+
+    def _class(self, spec: JobSpec, given: str | int) -> str:
+        return self.classes(spec.classifier)(given) if isinstance(given, int) else given
 
     def classes(self, classifier: str) -> ClassNames:
         """What a classifier's classes are called."""
