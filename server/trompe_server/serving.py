@@ -28,6 +28,9 @@ __all__ = ["run_service"]
 
 BACKLOG: Final = 2048
 """Connections that wait until they are accepted."""
+KEEP_ALIVE: Final = 75
+"""Seconds that an idle connection stays open: longer than clients keep theirs (httpx 5, most proxies 60). The client must
+be the first to close one: a request that is sent while the server does is lost."""
 OPEN_FILES: Final = 65_536
 CHECKPOINT_PAGES: Final = 10_000
 """Pages of 4 KiB that SQLite's log may have before the API moves them; the workers do at 1000."""
@@ -68,7 +71,14 @@ def _serve_http(
     services = Services(settings, library, store, files, tokens, supervisor.renderer_infos, supervisor.missing)
     app = create_app(services)
     _allow_many_connections()
-    config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=5, backlog=BACKLOG, server_header=False)
+    config = uvicorn.Config(
+        app,
+        log_level="warning",
+        timeout_keep_alive=KEEP_ALIVE,
+        timeout_graceful_shutdown=5,
+        backlog=BACKLOG,
+        server_header=False,
+    )
     try:
         _Server(config, lambda: announce(f"trompe serving on {_url(listener)}")).run(sockets=[listener])
     finally:

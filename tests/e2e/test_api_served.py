@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,23 @@ def test_a_thousand_jobs_submitted_at_once_are_all_there_and_none_twice(serve: S
         folder = serve.settings.data / "jobs" / job["id"]
         assert serve.store.get(job["id"]).state is JobState.succeeded
         assert [note for note in trace(folder) if note.startswith("end")] == [f"end {phase}" for phase in PHASES]
+
+
+def test_an_idle_connection_outlives_the_time_that_clients_keep_theirs(serve: Serve) -> None:
+    """A server that closes first, or after the same 5 s as httpx, loses the request that is sent at that moment."""
+    url = httpx.URL(serve.url)
+    connection = HTTPConnection(url.host, url.port, timeout=60)
+
+    def answered() -> bool:
+        connection.request("GET", "/healthz")
+        with connection.getresponse() as response:
+            return bool(response.read()) and response.status == 200
+
+    assert answered()
+    connection.auto_open = 0  # never a second connection in place of the first
+    time.sleep(httpx.Limits().keepalive_expiry + 2)
+    assert answered()
+    connection.close()
 
 
 def test_a_revoked_token_is_worthless_within_moments(serve: Serve) -> None:
