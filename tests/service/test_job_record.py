@@ -140,6 +140,50 @@ def test_a_priority_without_a_name_is_called_by_what_comes_no_sooner_and_holds_n
     assert [job.id for job in store.page().jobs] == [after, odd]
 
 
+@pytest.mark.parametrize(
+    ("change", "unknown"),
+    [
+        ({"glitter": 3}, ["glitter"]),
+        ({"loss": "of another version", "alpha": 0.02}, ["loss"]),
+        ({"glitter": 3, "loss": "of another version"}, ["glitter", "loss"]),
+    ],
+)
+def test_a_job_of_another_version_is_left_to_that_version_and_holds_nobody_up(
+    store: JobStore, change: dict[str, Any], unknown: list[str]
+) -> None:
+    """It is shown as far as it is understood, and nothing of it is lost."""
+    foreign, after = create(store, epsilon=0.1), create(store)
+    row = jobs.c.id == foreign
+    with write(store.engine) as connection:
+        spec = connection.execute(sa.select(jobs.c.spec).where(row)).scalar_one() | change
+        connection.execute(jobs.update().where(row).values(spec=spec))
+    taking = desk(store)
+    taken = taking.claim(("any", "cpu"))
+    assert taken is not None
+    assert taken.job.id == after
+    taking.finish(taken, DONE)
+    assert taking.claim(("any", "cpu")) is None
+    shown = store.get(foreign)
+    assert store.page().jobs == [store.get(after), shown]
+    assert (shown.state, shown.spec.epsilon) == (JobState.queued, 0.1)
+    assert shown.note == f"Not understood by this version of Trompe and not shown: the options {unknown}."
+    with store.engine.connect() as connection:
+        assert connection.execute(sa.select(jobs.c.spec).where(row)).scalar_one() == spec
+    assert store.request_cancel(foreign).state == JobState.cancelled
+
+
+def test_a_worker_that_comes_back_as_an_older_version_does_not_go_on_with_what_it_no_longer_understands(
+    store: JobStore,
+) -> None:
+    job = create(store)
+    assert claim(store, "w").job.id == job
+    with write(store.engine) as connection:
+        spec = connection.execute(sa.select(jobs.c.spec).where(jobs.c.id == job)).scalar_one() | {"glitter": 3}
+        connection.execute(jobs.update().where(jobs.c.id == job).values(spec=spec))
+    assert desk(store, "w").claim(("any", "cpu")) is None
+    assert store.get(job).state == JobState.queued
+
+
 def test_a_worker_takes_what_it_can_serve_and_no_more(store: JobStore) -> None:
     cuda, either, cpu = (create(store, needs=needs) for needs in ("cuda", "any", "cpu"))
     assert claim(store, "c", ("any", "cpu")).job.id == either

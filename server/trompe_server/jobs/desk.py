@@ -5,6 +5,7 @@ another, that number is out of date, and every write raises ``LostJobError``: so
 does no harm.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -13,10 +14,12 @@ import sqlalchemy as sa
 
 from trompe_server.database import clock, write
 from trompe_server.errors import NotFoundError
-from trompe_server.jobs.tables import Row, fresh, job_of, jobs, locked, update_job
+from trompe_server.jobs.tables import Row, fresh, job_of, jobs, locked, spec_of, update_job
 from trompe_shared.api import Job, JobState, Progress
 
 __all__ = ["MAX_LOST", "Claim", "Ending", "JobDesk", "LostJobError", "lose"]
+
+logger = logging.getLogger(__name__)
 
 MAX_LOST: Final = 3
 """A job that ended this many workers, one after the other in the same phase, is failed."""
@@ -54,19 +57,34 @@ class JobDesk:
 
     def __init__(self, engine: sa.Engine, worker: str) -> None:
         self._engine, self.worker = engine, worker
+        self._foreign: set[str] = set()
+        """Jobs with options that this version does not know."""
 
     def claim(self, needs: Sequence[str]) -> Claim | None:
-        """Take the job that is next among those with one of these ``needs``; ``None`` where none waits."""
-        if not self._any(_waits(needs)) and not self._any(self._mine()):
+        """Take the job that is next among those with one of these ``needs``; ``None`` where none waits.
+
+        A job with options that only another version of Trompe knows is left to a worker of that version.
+        """
+        if not self._any(self._waits(needs)) and not self._any(self._mine()):
             return None
         with write(self._engine) as connection:
             mine = connection.execute(sa.select(jobs).where(self._mine())).first()
             if mine is not None:  # the answer to the last claim was lost
-                return _claim(mine)
-            found = [row for need in needs if (row := _first(connection, need)) is not None]
-            if not found:
-                return None
-            return self._take(connection, min(found, key=lambda row: (row.priority, row.number)))
+                if not self._is_foreign(mine):
+                    return _claim(mine)
+                update_job(connection, mine.id, message="left to another worker", state=JobState.queued.value)
+            while found := [row for need in needs if (row := self._first(connection, need)) is not None]:
+                row = min(found, key=lambda row: (row.priority, row.number))
+                if not self._is_foreign(row):
+                    return self._take(connection, row)
+            return None
+
+    def _is_foreign(self, row: Row) -> bool:
+        _, options = spec_of(row)
+        if options:
+            self._foreign.add(row.id)
+            logger.warning("job %s is left to a worker of another version: this one does not know %s", row.id, options)
+        return bool(options)
 
     def _take(self, connection: sa.Connection, row: Row) -> Claim:
         message = "started" if row.attempts == 0 else f"goes on with {self.worker}"
@@ -127,6 +145,15 @@ class JobDesk:
         with self._engine.connect() as connection:
             return connection.execute(sa.select(jobs.c.number).where(condition).limit(1)).first() is not None
 
+    def _waits(self, needs: Sequence[str]) -> sa.ColumnElement[bool]:
+        waiting = [jobs.c.state == JobState.queued.value, jobs.c.needs.in_(needs)]
+        return sa.and_(*waiting, jobs.c.id.not_in(self._foreign)) if self._foreign else sa.and_(*waiting)
+
+    def _first(self, connection: sa.Connection, need: str) -> Row | None:
+        """The next job with this need that nobody else is just taking."""
+        query = sa.select(jobs).where(self._waits([need])).order_by(jobs.c.priority, jobs.c.number).limit(1)
+        return connection.execute(query.with_for_update(skip_locked=True)).first()
+
     def _mine(self) -> sa.ColumnElement[bool]:
         return sa.and_(jobs.c.state == JobState.running.value, jobs.c.worker == self.worker)
 
@@ -142,16 +169,6 @@ def lose(connection: sa.Connection, row: Row, reason: str) -> None:
         update_job(connection, row.id, message=error, state=JobState.failed.value, error=error, **ended)
     else:
         update_job(connection, row.id, message=reason, state=JobState.queued.value, lost=lost)
-
-
-def _waits(needs: Sequence[str]) -> sa.ColumnElement[bool]:
-    return sa.and_(jobs.c.state == JobState.queued.value, jobs.c.needs.in_(needs))
-
-
-def _first(connection: sa.Connection, need: str) -> Row | None:
-    """The next job with this need that nobody else is just taking."""
-    query = sa.select(jobs).where(_waits([need])).order_by(jobs.c.priority, jobs.c.number).limit(1)
-    return connection.execute(query.with_for_update(skip_locked=True)).first()
 
 
 def _held(connection: sa.Connection, claim: Claim) -> Row:

@@ -4,10 +4,11 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 import sqlalchemy as sa
+from pydantic import ValidationError
 
 from trompe_server.database import clock
 from trompe_server.errors import NotFoundError
-from trompe_shared.api import Event, Job
+from trompe_shared.api import Event, Job, JobSpec
 
 __all__ = [
     "LEASES",
@@ -22,7 +23,7 @@ __all__ = [
     "labels",
     "leases",
 ]
-__all__ += ["locked", "metadata", "time_of", "totals", "update_job", "workers"]
+__all__ += ["locked", "metadata", "spec_of", "time_of", "totals", "update_job", "workers"]
 
 PRIORITIES: Final = {"interactive": 10, "normal": 100, "sweep": 1000}
 """Lower numbers go first; they stand here in that order."""
@@ -163,23 +164,42 @@ def time_of(seconds: float | None) -> datetime | None:
 _SAME: Final = (
     "id",
     "state",
-    "spec",
     "labels",
     "needs",
     "worker",
     "progress",
     "attempts",
     "error",
-    "note",
     "artifacts",
 )
 
 
 def job_of(row: Row) -> Job:
-    """A row of ``jobs`` as the API shows it."""
+    """A row of ``jobs`` as the API shows it. What of it only another version of Trompe understands, its note says."""
     times = {name: time_of(getattr(row, name)) for name in ("created", "started", "finished")}
     same = {name: getattr(row, name) for name in _SAME}
-    return Job.model_validate(same | times | {"priority": _priority(row.priority)})
+    spec, foreign = spec_of(row)
+    left_out = f"Not understood by this version of Trompe and not shown: the options {foreign}." if foreign else None
+    note = " ".join(filter(None, [row.note, left_out])) or None
+    return Job.model_validate(same | times | {"spec": spec, "note": note, "priority": _priority(row.priority)})
+
+
+_ALWAYS: Final = {"object", "label"}
+
+
+def spec_of(row: Row) -> tuple[JobSpec, list[str]]:
+    """What a job asks for, and the options that are left out because only another version of Trompe knows them, or
+    knows what they are set to."""
+    given: dict[str, Any] = dict(row.spec)
+    while True:
+        try:
+            return JobSpec.model_validate(given), sorted(row.spec.keys() - given.keys())
+        except ValidationError as error:
+            odd = {str(each["loc"][0]) for each in error.errors() if each["loc"]}
+            left_out = (odd & given.keys() or given.keys()) - _ALWAYS
+            if not left_out:
+                raise
+            given = {name: value for name, value in given.items() if name not in left_out}
 
 
 def _priority(number: int) -> str:
