@@ -29,8 +29,8 @@ __all__ = ["run_service"]
 BACKLOG: Final = 2048
 """Connections that wait until they are accepted."""
 KEEP_ALIVE: Final = 75
-"""Seconds that an idle connection stays open: longer than clients keep theirs (httpx 5, most proxies 60). The client must
-be the first to close one: a request that is sent while the server does is lost."""
+"""Seconds that an idle connection stays open: longer than clients keep theirs (httpx 5, most proxies 60). A request
+that is sent while the server closes the connection is lost, so it must be the client who closes first."""
 OPEN_FILES: Final = 65_536
 CHECKPOINT_PAGES: Final = 10_000
 """Pages of 4 KiB that SQLite's log may have before the API moves them; the workers do at 1000."""

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trompe_server.pages.chart import Point, chart, means_of
-from trompe_server.pages.experiment import points_of
+from trompe_server.pages.experiment import differing_options, points_of
 
 
 def point(object: str, configuration: str, seconds: float, drop: float) -> Point:
@@ -72,7 +72,8 @@ def test_a_configuration_is_what_differs_on_the_same_object_but_the_seed() -> No
         asked = {"label": label, "epsilon": 0.1, "seed": seed, "tau": tau}
         return SimpleNamespace(id="1", object=object), asked, SimpleNamespace(held_out=judged, seconds={"attack": 9.0})
 
-    found = points_of([entry("mug", "cup", 0, None), entry("mug", "cup", 1, 0.2), entry("pot", "pot", 0, 0.2)])
+    entries = [entry("mug", "cup", 0, None), entry("mug", "cup", 1, 0.2), entry("pot", "pot", 0, 0.2)]
+    found = points_of(entries, differing_options(entries))
     assert [one.configuration for one in found] == ["epsilon 0.1, tau –", *["epsilon 0.1, tau 0.2"] * 2]
 
 

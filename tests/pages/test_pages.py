@@ -93,6 +93,35 @@ def test_a_wrong_file_and_a_wrong_class_are_told_in_the_servers_words(
     faults.clear()  # browsers report answers of 422 on the console
 
 
+def asked_when(page: Page, select: str, value: str) -> dict[str, Any]:
+    """What the form asks the server to check once ``value`` was chosen."""
+    with page.expect_request("**/v1/jobs/check") as checked:
+        page.select_option(select, value)
+    asked: dict[str, Any] = json.loads(checked.value.post_data or "")
+    return asked
+
+
+def test_the_scope_of_saliency_is_asked_for_with_a_threshold(service: Any, page: Page, faults: list[str]) -> None:
+    page.goto(f"{service.url}/jobs/new")
+    page.select_option("[name=object]", "mug")
+    page.fill("[name=label]", "mug")
+    page.get_by_text("More options").click()
+    assert "saliency_scope" not in asked_when(page, "[name=saliency_scope]", "each_view")
+
+    page.fill("[name=tau]", "0.2")
+    asked = asked_when(page, "[name=attack_on]", "texture")
+    assert (asked["tau"], asked["saliency_scope"]) == (0.2, "each_view")
+    assert asked_when(page, "[name=saliency_scope]", "all_views")["saliency_scope"] == "all_views"
+    assert {"tau", "saliency_scope"}.isdisjoint(asked_when(page, "[name=attack_on]", "light"))
+    expect(page.locator(".error:visible")).to_have_count(0)
+
+    page.select_option("[name=attack_on]", "texture")
+    page.fill("[name=tau]", "2")
+    asked_when(page, "[name=saliency_scope]", "each_view")
+    expect(page.locator('[data-error="tau saliency_scope"]')).to_contain_text("less than 1")
+    faults.clear()  # browsers report answers of 422 on the console
+
+
 def test_the_divider_and_the_views_are_dragged(service: Any, page: Page, done: str) -> None:
     page.goto(f"{service.url}/jobs/{done}")
     stage = page.locator("trompe-viewer .stage")
@@ -234,7 +263,7 @@ def test_nothing_is_wider_than_a_phone(service: Any, browser: Browser, done: str
 
 
 def test_a_server_that_restarts_in_mid_job_is_waited_for(service: Any, page: Page, faults: list[str]) -> None:
-    job = service.submit(steps=400)
+    job = service.submit(steps=400, epsilon=0.004)  # so little that it does not win all views and end early
     page.goto(f"{service.url}/jobs/{job}")
     expect(page.locator("[data-field=step]")).to_contain_text("of", timeout=120_000)
 

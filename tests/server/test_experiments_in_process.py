@@ -4,6 +4,7 @@ the fake target."""
 import csv
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
+from trompe_server.classifiers import NetworkClassifier, WhiteBoxClassifier, load_classifier
 from trompe_server.experiments import disturbed, suite, variants
 from trompe_server.experiments.disturbed import DisturbedTarget
 from trompe_server.experiments.in_process import run_job
@@ -127,6 +128,31 @@ def test_a_job_in_this_process_attacks_the_network_that_is_put_in(tmp_path: Path
     if done.painted is not None:
         assert load_object(done.painted).textures.keys() == done.scene.obj.textures.keys()
     assert done.result.target.views == 2
+
+
+class Overflowing(torch.nn.Module):
+    """A network whose logits of the last image of a batch are beyond all numbers, or none."""
+
+    def __init__(self, inner: torch.nn.Module, odd: float) -> None:
+        super().__init__()
+        self.inner, self.odd = inner, odd
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        last = torch.arange(len(images))[:, None] == len(images) - 1
+        return self.inner(images).masked_fill(last, self.odd)  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("odd", [float("nan"), float("inf"), -float("inf")])
+def test_a_result_can_be_read_where_the_network_says_what_is_no_number(tmp_path: Path, odd: float) -> None:
+    def overflowing(classifier: WhiteBoxClassifier) -> WhiteBoxClassifier:
+        assert isinstance(classifier, NetworkClassifier)
+        return replace(classifier, network=Overflowing(classifier.network, odd))
+
+    spec = JobSpec.model_validate({"object": "chair", "label": "chair"} | SMALL)
+    result = run_job(spec, FakeTarget(), tmp_path, change=overflowing).result
+    assert [view.before_confidence for view in result.views[-1:]] == pytest.approx([1 / 8])
+    assert result.target.a_before == 0.5
+    assert 0 <= result.views[0].before_confidence <= 1
 
 
 def test_cases_of_the_suite_have_names_of_their_own_and_a_reference() -> None:

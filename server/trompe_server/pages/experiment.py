@@ -8,7 +8,7 @@ from trompe_server.pages.chart import Point
 from trompe_server.pages.present import JobRow, value_text
 from trompe_shared.api import Result
 
-__all__ = ["Entry", "Line", "columns_and_lines", "points_of"]
+__all__ = ["Entry", "Line", "columns_and_lines", "differing_options", "points_of"]
 
 Entry = tuple[JobRow, Mapping[str, Any], Result | None]
 """A job, what was asked, and what came out."""
@@ -26,9 +26,18 @@ class Line:
     cells: Sequence[str]
 
 
-def columns_and_lines(entries: Sequence[Entry]) -> tuple[list[str], list[Line]]:
-    """Columns are epsilon, the other options in which jobs on the same object differ, and what came of them."""
-    options = _that_differ(entries)
+def differing_options(entries: Sequence[Entry]) -> list[str]:
+    """Epsilon, and the other options in which jobs on the same object differ."""
+    first: dict[str, Mapping[str, Any]] = {}
+    differ = {"epsilon"}
+    for row, asked, _ in entries:
+        one = first.setdefault(row.object, asked)
+        differ |= {option for option in asked if asked[option] != one[option]}
+    return [option for option in entries[0][1] if option in differ]
+
+
+def columns_and_lines(entries: Sequence[Entry], options: Sequence[str]) -> tuple[list[str], list[Line]]:
+    """Columns are ``options``, and what came of the jobs."""
     lines = [
         Line(row.id, row.object, row.state, [*(value_text(asked[name]) for name in options), *_outcome(result)])
         for row, asked, result in entries
@@ -36,9 +45,9 @@ def columns_and_lines(entries: Sequence[Entry]) -> tuple[list[str], list[Line]]:
     return [*options, *OUTCOME], lines
 
 
-def points_of(entries: Sequence[Entry]) -> list[Point]:
-    """The jobs that were judged; a configuration is all in which those on the same object differ, but the seed."""
-    options = [option for option in _that_differ(entries) if option != "seed"]
+def points_of(entries: Sequence[Entry], options: Sequence[str]) -> list[Point]:
+    """The jobs that were judged; a configuration is all of ``options`` but the seed."""
+    options = [option for option in options if option != "seed"]
     points = []
     for row, asked, result in entries:
         judged = result and (result.held_out or result.target)
@@ -46,15 +55,6 @@ def points_of(entries: Sequence[Entry]) -> list[Point]:
             words = ", ".join(f"{name} {value_text(asked[name])}" for name in options)
             points.append(Point(row.id, row.object, words, max(sum(result.seconds.values()), 0.1), judged.a_drop))
     return points
-
-
-def _that_differ(entries: Sequence[Entry]) -> list[str]:
-    first: dict[str, Mapping[str, Any]] = {}
-    differ = {"epsilon"}
-    for row, asked, _ in entries:
-        one = first.setdefault(row.object, asked)
-        differ |= {option for option in asked if asked[option] != one[option]}
-    return [option for option in entries[0][1] if option in differ]
 
 
 def _outcome(result: Result | None) -> list[str]:

@@ -19,7 +19,7 @@ from trompe_server.api.services import Services, ServicesDep
 from trompe_server.database import DatabaseDownError
 from trompe_server.errors import NotFoundError
 from trompe_server.pages.chart import chart
-from trompe_server.pages.experiment import columns_and_lines, points_of
+from trompe_server.pages.experiment import columns_and_lines, differing_options, points_of
 from trompe_server.pages.naming import Names
 from trompe_server.pages.pictures import Kind, ViewSet
 from trompe_server.pages.present import TERMS, JobRow, Shown, differences, present
@@ -193,13 +193,14 @@ def show_experiment(request: Request, services: ServicesDep, name: str, cursor: 
     names = Names(services.library)
     entries = [(names.row(job), names.options(job.spec), _result(services, job)) for job in found.jobs]
     states = [row.state for row, _, _ in entries]
-    columns, lines = columns_and_lines(entries)
+    options = differing_options(entries)
+    columns, lines = columns_and_lines(entries, options)
     return page(
         request,
         "experiment.html",
         name=name,
         counts={state: states.count(state) for state in dict.fromkeys(states)},
-        chart=chart(points_of(entries), measure="A_drop in the target (held-out views, if any)"),
+        chart=chart(points_of(entries, options), measure="A_drop in the target (held-out views, if any)"),
         columns=columns,
         lines=lines,
         older=found.next_cursor and f"?{urlencode({'cursor': found.next_cursor})}",

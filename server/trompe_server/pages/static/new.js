@@ -89,6 +89,7 @@ function request() {
   spec.attack_on = given.get("attack_on");
   const numbers = spec.attack_on === "texture" ? ["epsilon", "tau", "distance", "seed"] : ["distance", "seed"];
   for (const name of numbers) if (given.get(name)) spec[name] = Number(given.get(name));
+  if (spec.tau !== undefined) spec.saliency_scope = given.get("saliency_scope");
   if (given.get("background")) spec.background = [given.get("background")];
   return JSON.stringify(spec);
 }
