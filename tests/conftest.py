@@ -14,6 +14,7 @@ import pytest
 import torch
 from hypothesis import settings
 from numpy.typing import ArrayLike, NDArray
+from pretend_device import register
 
 from trompe_server.target import SailenvTarget
 from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files
@@ -31,9 +32,13 @@ settings.load_profile("untimed")
 
 
 def pytest_configure() -> None:
-    """Let Ctrl-C reach what tests start, also where a shell ran us in the background and had it ignored."""
+    """Let Ctrl-C reach what tests start, also where a shell ran us in the background and had it ignored.
+
+    Torch must know of a device before it computes its first gradient.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)
     share_the_cores(int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)))
+    register()
 
 
 def share_the_cores(processes: int) -> None:

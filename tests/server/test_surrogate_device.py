@@ -1,8 +1,9 @@
-"""The surrogate on a graphics card: nothing is made elsewhere by mistake, and the results are those of the CPU."""
+"""The surrogate on another device: nothing is made elsewhere by mistake, and the results are those of the CPU."""
 
 import numpy as np
 import pytest
 import torch
+from pretend_device import pretend_device
 from torch import Tensor
 
 from trompe_server.surrogate import (
@@ -13,7 +14,8 @@ from trompe_server.surrogate import (
     prepare_geometry,
     textures_of,
 )
-from trompe_server.surrogate.calibration import CURVE_GREYS, measure_fidelity, painted_grey, painted_noise
+from trompe_server.surrogate.calibration import CURVE_GREYS, painted_grey, painted_noise
+from trompe_server.surrogate.fidelity import measure_fidelity
 from trompe_server.target import FakeTarget
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D
@@ -54,12 +56,14 @@ def everything(surrogate: Surrogate, obj: Object3D, device: str) -> list[Tensor]
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_nothing_is_made_on_another_device_than_the_one_asked_for(mug: Object3D, model: SamplingModel) -> None:
-    """What forgets to say where, is made where there is no data: it could not be worked with."""
-    expected = [value for surrogate in surrogates(mug, model, "cpu") for value in everything(surrogate, mug, "cpu")]
-    with torch.device("meta"):
-        found = [value for surrogate in surrogates(mug, model, "cpu") for value in everything(surrogate, mug, "cpu")]
-    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
+def test_another_device_gives_the_images_and_gradients_of_the_cpu_and_nothing_is_made_elsewhere(
+    mug: Object3D, model: SamplingModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = pretend_device(monkeypatch)
+    for one, other in zip(surrogates(mug, model, "cpu"), surrogates(mug, model, device), strict=True):
+        expected, found = everything(one, mug, "cpu"), everything(other, mug, device)
+        assert all(each.device.type == device for each in found)
+        assert all(torch.equal(here, there.cpu()) for here, there in zip(expected, found, strict=True))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")

@@ -75,14 +75,20 @@ def attack(
     What is left of the steps is left out once all views are won so safely that more would change nothing.
     ``masks`` (saliency) let only those pixels' gradients through, and only ``texels`` (by default those ``movable``)
     move. Each step looks at all views, or at ``views_per_step`` drawn by ``seed`` and its number, in front of some of
-    ``backgrounds`` drawn likewise (by default their own). Deterministic, in one go or in several. Raises ``SpecError``
-    for options that contradict each other, before any work.
+    ``backgrounds`` drawn likewise (by default their own). After the last step the budget's bound on the images holds
+    for the textures that ``Budget.repaint`` saves. Deterministic, in one go or in several. It computes on the
+    surrogate's device, wherever the rest lies. Raises ``SpecError`` for options that contradict each other, before any
+    work.
     """
+    device = surrogate.geometry.device
+    state, textures = state.to(device), {name: texture.to(device) for name, texture in textures.items()}
+    masks = masks if masks is None else masks.to(device)
     total = state.step + steps if total_steps is None else total_steps
     schedule = Schedule(total, restarts, random_start, seed)
     schedule.check(optimiser, last=state.step + steps)
     members = members_of(classifier, goal)
-    moving = movable(surrogate, budget, masks) if texels is None else texels
+    wanted = movable(surrogate, budget, masks) if texels is None else texels
+    moving = {name: mask.to(device) for name, mask in wanted.items()}
     touched = {name: mask | state.deltas[name].any(2) for name, mask in moving.items()}
     objective = Objective(textures, surrogate, members, goal, masks, surrogate.canvas(textures, touched))
     search = Search(
@@ -95,14 +101,15 @@ def attack(
         views_per_step=views_per_step,
         backgrounds=backgrounds,
     )
-    point = Point(objective.join(state.deltas), _joined(objective, state.memory)).to(objective.source.device)
+    point = Point(objective.join(state.deltas), _joined(objective, state.memory))
     for step in range(state.step, state.step + steps):
         if search.over(point):
             break
         look, point = search.look(search.begin(point, step), step)
         point = search.move(point, look, step)
         on_step(Step(step, look.loss, look.fooled, search.shown(point)))
-    return AttackState(state.step + steps, objective.split(point.delta), _split(objective, point.memory))
+    delta = search.saved(point.delta) if state.step + steps == total else point.delta
+    return AttackState(state.step + steps, objective.split(delta), _split(objective, point.memory))
 
 
 def _joined(objective: Objective, memory: Memory) -> Memory:

@@ -35,6 +35,11 @@ class Budget:
         if self.epsilon_view is not None and not 0 < self.epsilon_view <= 1:
             raise SpecError(f"epsilon_view must be in (0, 1], or left out for no bound, got {self.epsilon_view}.")
 
+    @property
+    def levels(self) -> int:
+        """The largest change of an 8-bit channel."""
+        return math.floor(self.epsilon * 255 + 1e-9)
+
     def project(self, delta: Float[Tensor, "*texels 3"], texture: Float[Tensor, "*texels 3"]) -> Tensor:
         """The nearest change that keeps ``|delta| <= epsilon`` and ``0 <= texture + delta <= 1``."""
         return self._project_(delta.clone(), texture)
@@ -56,8 +61,7 @@ class Budget:
 
     def quantise(self, delta: Float[Tensor, "H W 3"], texture: UInt8[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
         """The 8-bit texture that is saved: ``texture + delta`` rounded, never further than epsilon off."""
-        reach = math.floor(self.epsilon * 255 + 1e-9)
-        change = (delta * 255).round().clamp(-reach, reach).to(torch.int16)
+        change = (delta * 255).round().clamp(-self.levels, self.levels).to(torch.int16)
         return (texture.to(torch.int16) + change).clamp(0, 255).to(torch.uint8)
 
     def repaint(self, obj: Object3D, deltas: Mapping[str, Float[Tensor, "H W 3"]]) -> Object3D:

@@ -53,10 +53,6 @@ class Point:
     delta: Flat
     memory: Memory
 
-    def to(self, device: torch.device) -> "Point":
-        """The same point on a device."""
-        return Point(self.delta.to(device), {name: value.to(device) for name, value in self.memory.items()})
-
 
 @dataclass(frozen=True)
 class Pace:

@@ -169,6 +169,10 @@ class Search:
             point = Point(self._in_view(moved.delta), {**mine, **moved.memory})
         return self._ended(point, step) if pace.done + 1 == pace.length else point
 
+    def saved(self, delta: Flat) -> Flat:
+        """``delta``, or what of it keeps the images within their bound once it is saved in 8 bits."""
+        return delta if self.within is None else self.within.saved(delta, levels=self.box.budget.levels)
+
     def _in_view(self, delta: Flat) -> Flat:
         return delta if self.within is None else self.within.project(delta)
 

@@ -25,6 +25,11 @@ class AttackState:
     deltas: Textures
     memory: Mapping[str, Tensor] = field(default_factory=dict)
 
+    def to(self, device: torch.device) -> "AttackState":
+        """The same state on a device: one that was saved comes back on the CPU."""
+        deltas, memory = ({key: value.to(device) for key, value in each.items()} for each in (self.deltas, self.memory))
+        return AttackState(self.step, deltas, memory)
+
 
 def start(textures: Textures) -> AttackState:
     """No change at all."""

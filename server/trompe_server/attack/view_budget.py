@@ -1,5 +1,6 @@
 """The paper's constraint on the images, |I - I'|_inf <= epsilon_view, enforced on the surrogate's views."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,6 +22,9 @@ AIM: Final = 0.98
 
 LOCAL_ROUNDS: Final = 20
 """Rounds in which only the texels behind the excess shrink; after them the whole change does."""
+
+SAVED_ROUNDS: Final = 100
+"""The same where the change is rounded to whole levels, which takes a few rounds to follow."""
 
 SHARPNESS: Final = 8
 """Exponent of the weighted mean that stands for the maximum over the pixels that read a texel."""
@@ -50,10 +54,24 @@ class ViewBudget:
 
         A texel shrinks by about the most that a pixel which reads it must; texels that no such pixel reads stay.
         """
+        return self._within(delta, lambda change: change, local_rounds=LOCAL_ROUNDS)
+
+    def saved(self, delta: Flat, *, levels: int) -> Flat:
+        """``delta`` where the images are within the bound once it is rounded to 8-bit levels, at most so many, as it is
+        saved; else what of it is, in whole levels."""
+
+        def rounded(change: Flat) -> Flat:
+            return (change * 255).round().clamp(-levels, levels) / 255
+
+        return self._within(delta, rounded, local_rounds=SAVED_ROUNDS)
+
+    def _within(self, delta: Flat, shown: Callable[[Flat], Flat], *, local_rounds: int) -> Flat:
+        """``delta`` where the images of what is ``shown`` of it are within the bound; else what is shown of as much of
+        it as is."""
         rounds = 0
-        while (shrink := self._shrink(delta, local=rounds < LOCAL_ROUNDS)) is not None:
+        while (shrink := self._shrink(shown(delta), local=rounds < local_rounds)) is not None:
             delta, rounds = delta * (1 - shrink), rounds + 1
-        return delta
+        return shown(delta) if rounds else delta
 
     def _shrink(self, delta: Flat, *, local: bool) -> Tensor | None:
         """By how much each texel's channel must shrink, as a share of it; ``None`` where all images are within."""

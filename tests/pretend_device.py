@@ -1,0 +1,143 @@
+"""A device that computes on the CPU, to the same bits, but holds tensors of its own: like a graphics card it refuses to
+work with what lies elsewhere. Code that forgets where a tensor is fails on it on any machine."""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, Final
+
+import pytest
+import torch
+from torch import Tensor
+from torch.library import Library
+from torch.utils import backend_registration
+from torch.utils._python_dispatch import return_and_correct_aliasing
+from torch.utils._pytree import tree_leaves, tree_map_only
+
+__all__ = ["NAME", "pretend_device", "register"]
+
+NAME: Final = "pretend"
+
+AWAY_ALLOWED: Final = {"aten::copy_", "aten::_to_copy"}
+"""What takes tensors from one device to another."""
+
+INDEXING: Final = {"aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_"}
+"""What a graphics card does with indices that lie on the CPU, but not the other way round."""
+
+MADE_BY_HAND: Final = ("tensor", "arange", "linspace")
+"""Functions that write into memory before there is an operator a device could answer."""
+
+
+class PretendTensor(Tensor):
+    """A tensor on the device; ``held`` is the one on the CPU that it stands for."""
+
+    held: Tensor
+
+    @staticmethod
+    def __new__(cls, held: Tensor) -> "PretendTensor":
+        """One that stands for ``held``."""
+        made: PretendTensor = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+            cls,
+            held.size(),
+            strides=held.stride(),
+            storage_offset=held.storage_offset(),
+            dtype=held.dtype,
+            device=torch.device(NAME, 0),
+        )
+        made.held = held
+        return made
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Answer an operator."""
+        return _compute(func, args, kwargs or {})
+
+    def tolist(self) -> Any:
+        """Other devices have it, torch denies it to tensors of Python's own."""
+        return self.held.tolist()
+
+    def __getitem__(self, key: Any) -> Tensor:
+        """Torch would turn lists of numbers into tensors without asking the device."""
+        keys = key if isinstance(key, tuple) else (key,)
+        return super().__getitem__(tuple(torch.tensor(each) if isinstance(each, list) else each for each in keys))
+
+
+def _compute(func: Any, args: Any, kwargs: Any) -> Any:
+    tensors = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
+    here = [each for each in tensors if isinstance(each, PretendTensor)]
+    _check_together(func.name().split(".")[0], tensors, bool(here))
+    device = kwargs.get("device")
+    stays = bool(here) if device is None else torch.device(device).type == NAME
+    if func is torch.ops.aten.copy_.default:
+        stays = isinstance(args[0], PretendTensor)
+    plain_args, plain = tree_map_only(PretendTensor, lambda each: each.held, (args, kwargs))
+    found = func(*plain_args, **plain | ({} if device is None else {"device": torch.device("cpu")}))
+    if stays:
+        return return_and_correct_aliasing(func, args, kwargs, tree_map_only(Tensor, PretendTensor, found))
+    return args[0] if func is torch.ops.aten.copy_.default else found
+
+
+def _check_together(name: str, tensors: list[Tensor], some_here: bool) -> None:
+    """Raise where a graphics card would; numbers (tensors without dimensions) may come from the CPU."""
+    away = any(each.ndim and not isinstance(each, PretendTensor) for each in tensors)
+    indexing = name in INDEXING and isinstance(tensors[0], PretendTensor)
+    if some_here and away and name not in AWAY_ALLOWED and not indexing:
+        raise RuntimeError(f"{name}: tensors on several devices: {[(str(t.device), tuple(t.shape)) for t in tensors]}")
+
+
+class _Module:
+    """What torch asks of a device's module."""
+
+    def is_initialized(self) -> bool:
+        return True
+
+    def is_available(self) -> bool:
+        return True
+
+    def current_device(self) -> int:
+        return 0
+
+    def device_count(self) -> int:
+        return 1
+
+    def _is_in_bad_fork(self) -> bool:
+        return False
+
+    def manual_seed_all(self, seed: int) -> None:
+        """It draws nothing of its own, so that its random state is empty."""
+
+    def get_rng_state(self, device: Any = None) -> Tensor:
+        return torch.empty(0, dtype=torch.uint8)
+
+    def set_rng_state(self, state: Tensor, device: Any = None) -> None:
+        """There is none."""
+
+
+POSSIBLE: Final = hasattr(backend_registration, "_setup_privateuseone_for_python_backend")
+"""Older versions of torch have no devices written in Python."""
+
+
+@cache
+def register() -> Library | None:
+    """Tell torch of the device: before the process computes its first gradient, when torch counts its devices."""
+    if not POSSIBLE:
+        return None
+    backend_registration._setup_privateuseone_for_python_backend(NAME, backend_module=_Module())
+    library = Library("_", "IMPL")
+    library.fallback(lambda func, *args, **kwargs: _compute(func, args, kwargs), "PrivateUse1")
+    return library
+
+
+def _then_moved(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def made(*args: Any, device: Any = None, **kwargs: Any) -> Tensor:
+        return make(*args, **kwargs) if device is None else make(*args, **kwargs).to(device)
+
+    return made
+
+
+def pretend_device(monkeypatch: pytest.MonkeyPatch) -> str:
+    """The device's name for ``device=...``, for the time of one test. Skips where this torch cannot have one."""
+    if register() is None:
+        pytest.skip("this version of torch has no devices written in Python")
+    for name in MADE_BY_HAND:
+        monkeypatch.setattr(torch, name, _then_moved(getattr(torch, name)))
+    return NAME
