@@ -18,13 +18,8 @@ from numpy.typing import NDArray
 from bench._common import BenchObject, bench_objects, machine, running_renderer
 from trompe_server.markdown import markdown_row, markdown_table
 from trompe_server.surrogate import SamplingModel
-from trompe_server.surrogate.calibration import (
-    Calibration,
-    build_surrogate,
-    calibrate,
-    measure_fidelity,
-    painted_noise,
-)
+from trompe_server.surrogate.calibration import Calibration, build_surrogate, calibrate, painted_noise
+from trompe_server.surrogate.fidelity import measure_fidelity
 from trompe_server.target import SailenvTarget
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D

@@ -24,7 +24,8 @@ from trompe_server.markdown import markdown_table
 from trompe_server.memory import keep_freed_memory
 from trompe_server.phased_job import CHUNK
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of
-from trompe_server.surrogate.calibration import CALIBRATED_GREYS, CURVE_GREYS, Calibration, Fidelity, build_surrogate
+from trompe_server.surrogate.calibration import CALIBRATED_GREYS, CURVE_GREYS, Calibration, build_surrogate
+from trompe_server.surrogate.fidelity import Fidelity
 from trompe_server.surrogate.surrogate import BATCH
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D

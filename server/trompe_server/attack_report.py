@@ -45,8 +45,9 @@ from trompe_server.reports import (
 )
 from trompe_server.scene import Scene
 from trompe_server.surrogate import Surrogate, behind, textures_of
-from trompe_server.surrogate.calibration import MAX_ERROR, MIN_EXPLAINED, Calibration
-from trompe_shared.api import Accuracy, JobSpec, Judgement, Result
+from trompe_server.surrogate.calibration import Calibration
+from trompe_server.surrogate.fidelity import MAX_ERROR, MIN_EXPLAINED, ViewFit, compare_views
+from trompe_shared.api import Accuracy, JobSpec, Judgement, Result, ViewFidelity, ViewPrediction
 from trompe_shared.errors import ObjectError
 from trompe_shared.geometry import Camera
 from trompe_shared.object3d import Object3D, encode_png
@@ -91,7 +92,8 @@ class Evidence:
     before: Images
     after: Images | None
     maps: NDArray[np.float32] | None
-    """Saliency of the own views (views, H, W); this and what is made of it: ``None`` without gradients."""
+    """Saliency of the own views (views, H, W), by the job's scope; this and what is made of it: ``None`` without
+    gradients."""
     spent: Spent
     seconds: Mapping[str, float]
     painted: Object3D | None = None
@@ -121,6 +123,15 @@ class Evidence:
         if self.after is None:
             return None
         return {name: self.scene.classifier.predict(images) for name, images in self.after.items()}
+
+    @cached_property
+    def fits(self) -> Sequence[ViewFit | None]:
+        """How well the surrogate predicted each own view and what the attack changed there; empty where it could not be
+        seen."""
+        if self.surrogate is None or self.repainted is None or self.after is None:
+            return ()
+        clean, images = self.before["own"], self.after["own"]
+        return compare_views(self.surrogate, self.scene.obj, clean, self.repainted, images)
 
 
 def public_files(evidence: Evidence, artifacts: Artifacts, *, warnings: Sequence[str]) -> tuple[str, ...]:
@@ -187,11 +198,18 @@ def _result(evidence: Evidence, warnings: Sequence[str]) -> Result:
         warnings=[*warnings, *_warnings(evidence, target, held_out, surrogate)],
         seconds={name: round(seconds, 3) for name, seconds in evidence.seconds.items()},
         versions={name: version(name) for name in ("trompe", "torch", "numpy", "pyrender", "onnxruntime")},
-        views=view_predictions(scene.views, evidence.logits_before["own"], after.get("own"), scene.label),
+        views=_with_fits(
+            view_predictions(scene.views, evidence.logits_before["own"], after.get("own"), scene.label), evidence.fits
+        ),
         held_out_views=view_predictions(
             scene.held_out, evidence.logits_before["held_out"], after.get("held_out"), scene.label
         ),
     )
+
+
+def _with_fits(views: Sequence[ViewPrediction], fits: Sequence[ViewFit | None]) -> list[ViewPrediction]:
+    told = [None if fit is None else ViewFidelity(**_rounded(fit._asdict())) for fit in fits or [None] * len(views)]
+    return [view.model_copy(update={"fidelity": fit}) for view, fit in zip(views, told, strict=True)]
 
 
 def _accuracy(evidence: Evidence, views: str) -> Accuracy:
@@ -247,8 +265,12 @@ def _calibration_fields(evidence: Evidence) -> dict[str, Any]:
         "surrogate_model": calibration.model,
         "surrogate_reason": calibration.reason,
         "probe_renders": calibration.renders,
-        "fidelity": {name: round(value, 5) for name, value in mean.items()},
+        "fidelity": _rounded(mean),
     }
+
+
+def _rounded(figures: Mapping[str, float]) -> dict[str, float]:
+    return {name: round(value, 5) for name, value in figures.items()}
 
 
 def _view_changes(evidence: Evidence) -> dict[str, Any]:
@@ -318,21 +340,35 @@ def _promises(evidence: Evidence, target: Accuracy, surrogate: Accuracy | None) 
 
 
 def _poor_views(evidence: Evidence) -> list[str]:
-    """Names the views on which the surrogate is far off, worst first."""
+    """Names the views on which the surrogate is far off: on the unpainted object, or on what the attack changed."""
     if evidence.surrogate is None:
         return []
-    errors = evidence.surrogate.clean_errors()
-    poor = sorted((index for index, error in enumerate(errors) if error > POOR_VIEW), key=lambda index: -errors[index])
-    if not poor:
-        return []
-    named = []
-    for index in poor[:NAMED_VIEWS]:
-        camera = evidence.scene.views[index].camera
-        named.append(
-            f"{index} (azimuth {camera.azimuth:.0f}, elevation {camera.elevation:.0f}): {255 * errors[index]:.1f}"
+    fits = {index: fit for index, fit in enumerate(evidence.fits) if fit is not None}
+    errors = dict(enumerate(evidence.surrogate.clean_errors())) | {index: fit.error for index, fit in fits.items()}
+    off = {index: 255 * error for index, error in errors.items() if error > POOR_VIEW}
+    unlike = {index: 1 - fit.explained for index, fit in fits.items() if fit.poor}
+    found = []
+    if off:
+        named = _named(evidence.scene, off, "{:.1f}")
+        found.append(f"The surrogate is off by more than {255 * POOR_VIEW:.0f}/255 on views {named}.")
+    if unlike:
+        named = _named(evidence.scene, unlike, "{:.0%}")
+        found.append(
+            f"More than {1 - MIN_EXPLAINED:.0%} of what the attack changed is not as the surrogate predicted it on "
+            f"views {named}."
         )
+    return found
+
+
+def _named(scene: Scene, poor: Mapping[int, float], figure: str) -> str:
+    """Views by number and camera with their figures, the largest first; only the first few of many."""
+    named = []
+    for index in sorted(poor, key=lambda index: -poor[index])[:NAMED_VIEWS]:
+        camera = scene.views[index].camera
+        where = f"azimuth {camera.azimuth:.0f}, elevation {camera.elevation:.0f}"
+        named.append(f"{index} ({where}): {figure.format(poor[index])}")
     more = f", and {len(poor) - NAMED_VIEWS} more" if len(poor) > NAMED_VIEWS else ""
-    return [f"The surrogate is off by more than {255 * POOR_VIEW:.0f}/255 on views {'; '.join(named)}{more}."]
+    return "; ".join(named) + more
 
 
 def saliency_views(scene: Scene) -> NDArray[np.int64]:
@@ -358,8 +394,9 @@ def _saliency(evidence: Evidence, title: str) -> dict[str, Image.Image]:
     if maps is None:
         return {}
     some = saliency_views(scene)
-    own = evidence.before["own"][some]
-    sheets = {"saliency.png": saliency_sheet(own, maps[some], tau=evidence.spec.tau, title=title, columns=3)}
+    own, spec = evidence.before["own"][some], evidence.spec
+    sheet = saliency_sheet(own, maps[some], tau=spec.tau, scope=spec.saliency_scope, title=title, columns=3)
+    sheets = {"saliency.png": sheet}
     if evidence.scores is not None and evidence.hot is not None:
         sheets["saliency_textures.png"] = saliency_texture_sheet(scene.obj.textures, evidence.scores, title=title)
         sheets["saliency_object.png"] = saliency_object_sheet(own, maps[some], evidence.hot, title=title)

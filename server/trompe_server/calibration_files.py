@@ -9,15 +9,16 @@ import numpy as np
 
 from trompe_server.array_files import pack_arrays, unpack_arrays
 from trompe_server.surrogate import SamplingModel
-from trompe_server.surrogate.calibration import Calibration, Fidelity
+from trompe_server.surrogate.calibration import Calibration
+from trompe_server.surrogate.fidelity import Fidelity
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
 __all__ = ["calibration_key", "pack_calibration", "unpack_calibration"]
 
-VERSION = 2
+VERSION = 3
 """Another for each way of calibrating that can find something else from the same answers. 1 knew no anisotropy and no
-shift."""
+shift, 2 overlooked what changes where the surrogate sees no object."""
 
 
 def calibration_key(obj: Object3D, views: Sequence[View], clean: np.ndarray, *, wanted: str, seed: int) -> str:

@@ -19,7 +19,7 @@ from trompe_server.attack import (
     painted_texels,
 )
 from trompe_server.attack.goal import SAFE_MARGIN
-from trompe_server.checks import check_diverse, check_saliency, check_vertices
+from trompe_server.checks import check_diverse, check_keep, check_queries, check_saliency, check_vertices
 from trompe_server.classifiers import (
     Classifier,
     DiverseClassifier,
@@ -33,7 +33,7 @@ from trompe_server.labels import resolve_label
 from trompe_server.library import Library
 from trompe_server.target import BackdropTarget, TargetRenderer, fitted
 from trompe_shared.api import JobSpec
-from trompe_shared.errors import ClassifierError
+from trompe_shared.errors import ClassifierError, SpecError
 from trompe_shared.geometry import View, colour_of, framing_distance
 from trompe_shared.object3d import Object3D, decode_rgb, load_object
 from trompe_shared.shipped import shipped_objects
@@ -165,7 +165,11 @@ def _goal(spec: JobSpec, classifier: Classifier) -> Goal:
 
 def _members(spec: JobSpec, classifier: Classifier, others: Sequence[Classifier]) -> tuple[WhiteBoxClassifier, ...]:
     """What is attacked: the classifier (by its scores where it has no gradients) and the others of its ensemble."""
-    first = classifier if isinstance(classifier, WhiteBoxClassifier) else _by_scores(spec, classifier)
+    if isinstance(classifier, WhiteBoxClassifier):
+        check_queries(spec, classifier.name)
+        first = classifier
+    else:
+        first = _by_scores(spec, classifier)
     blind = [other.name for other in others if not isinstance(other, WhiteBoxClassifier)]
     if blind:
         raise ClassifierError(f"{blind} give scores but no gradients (.onnx), so they cannot be in an ensemble.")
@@ -188,12 +192,19 @@ def _by_scores(spec: JobSpec, classifier: Classifier) -> WhiteBoxClassifier:
 
 
 def _within(spec: JobSpec, obj: Object3D, library: Library) -> tuple[TexelMasks, ...]:
-    """The masks of texels that the options name: materials, painted pictures."""
+    """The masks of texels that the options name: materials, painted pictures. Raises ``SpecError`` where they leave
+    none."""
+    check_keep(spec, n_texels=obj.n_texels)
     masks: list[TexelMasks] = []
     if spec.materials:
         masks.append(material_texels(obj, spec.materials))
     if spec.masks:
         masks.append(painted_texels(obj, {name: _picture(image, library) for name, image in spec.masks.items()}))
+    if masks and not any(torch.stack([mask[name] for mask in masks]).all(0).any() for name in obj.textures):
+        raise SpecError(
+            f"The mask images leave none of the texels of {sorted(spec.materials)}: paint white in their textures, or "
+            "name other materials."
+        )
     return tuple(masks)
 
 

@@ -9,7 +9,8 @@ import pytest
 from trompe_server.array_files import pack_arrays
 from trompe_server.calibration_files import pack_calibration, unpack_calibration
 from trompe_server.surrogate import SamplingModel
-from trompe_server.surrogate.calibration import Calibration, Fidelity
+from trompe_server.surrogate.calibration import Calibration
+from trompe_server.surrogate.fidelity import Fidelity
 
 SAMPLING = SamplingModel(filtered="linear", bias=-0.25, anisotropy=16, elongated="ellipse", shift=(0.25, -0.125))
 PROBES = np.random.default_rng(0).integers(0, 256, (2, 1, 4, 4, 3), dtype=np.uint8)

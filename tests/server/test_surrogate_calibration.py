@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 from trompe_server.surrogate import (
     SamplingModel,
@@ -19,8 +20,6 @@ from trompe_server.surrogate import (
 from trompe_server.surrogate.calibration import (
     CALIBRATED_GREYS,
     CURVE_GREYS,
-    MAX_ERROR,
-    MIN_EXPLAINED,
     SATISFYING,
     Calibration,
     build_surrogate,
@@ -29,11 +28,13 @@ from trompe_server.surrogate.calibration import (
     painted_grey,
     painted_noise,
 )
-from trompe_server.surrogate.shading import decode, encode
+from trompe_server.surrogate.fidelity import MAX_ERROR, MIN_EXPLAINED, Fidelity, measure_fidelity
+from trompe_server.surrogate.shading import ENCODERS, decode
 from trompe_server.target import SailenvTarget
 from trompe_shared.api import SurrogateModel
 from trompe_shared.geometry import Camera, View
-from trompe_shared.object3d import Object3D
+from trompe_shared.object3d import Object3D, encode_png, object_from_files
+from trompe_shared.opacity import opacity_of
 from trompe_shared.shipped import shipped_objects
 
 SIZE = (64, 64)
@@ -84,10 +85,11 @@ class KnownTarget:
 
     def _affine_images(self, surrogate: Surrogate, obj: Object3D) -> Image8:
         images, texels = surrogate.base.numpy().copy(), surrogate.texels(textures_of(obj))
+        encoder = ENCODERS[self.sampling.encoding]
         for batch in surrogate.geometry.batches:
             values = batch.gather.forward(texels)
             light = batch.shade * (values if self.sampling.filtered == "linear" else decode(values))
-            colour = batch.coverage * encode(light.clamp(0, 1)) + (1 - batch.coverage)  # before white
+            colour = batch.coverage * encoder(light.clamp(0, 1)) + (1 - batch.coverage)  # before white
             some = images[batch.views.start : batch.views.stop].reshape(-1, 3)
             some[batch.pixel.numpy()] = colour.mul(255).round().byte().numpy()
         return images
@@ -112,16 +114,66 @@ def busy_mug(mug: Object3D) -> Object3D:
         pytest.param(SamplingModel(filtered="linear", lod="area", bias=0.5), id="linear, area, 0.5"),
         pytest.param(SamplingModel(filtered="linear", bias=-0.5), id="linear, -0.5"),
         pytest.param(SamplingModel(lod="area", samples="centre", bias=0.25), id="area, centre, 0.25"),
+        pytest.param(SamplingModel(encoding="power", shade_at="centroid"), id="power, centroid"),
+        pytest.param(SamplingModel(samples="msaa4-mirrored", mips="rounded"), id="mirrored, rounded"),
     ],
 )
 def test_the_sampling_of_a_known_target_is_recovered(busy_mug: Object3D, truth: SamplingModel) -> None:
     calibration = found(busy_mug, KnownTarget(truth), "curve")
-    for member in ("samples", "shade_at", "lod", "filtered", "cull"):
+    for member in ("samples", "shade_at", "lod", "filtered", "encoding", "mips", "cull"):
         assert getattr(calibration.sampling, member) == getattr(truth, member)
     assert calibration.sampling.bias == pytest.approx(truth.bias, abs=0.1)
     assert calibration.fidelity.mean()["explained"] > 0.98
     assert calibration.fidelity.mean()["slope"] == pytest.approx(1, abs=0.03)
     assert calibration.fidelity.mean()["correlation"] > 0.98
+
+
+def test_a_view_in_which_hardly_anything_changes_does_not_outweigh_all_others(mug: Object3D) -> None:
+    """As in the dark: a single pixel becomes lighter by one of 255, and all else is predicted rightly."""
+    ask = KnownTarget(SamplingModel())
+    surrogate, clean = build_surrogate(found(mug, ask, "calibrated"), mug, VIEWS, ask(mug, VIEWS)), ask(mug, VIEWS)
+    images = clean.copy()
+    images[1, SIZE[0] // 2, SIZE[1] // 2] += 1
+    fidelity = measure_fidelity(surrogate, mug, clean, mug, images)
+    assert len(fidelity.explained) == 1
+    assert fidelity.explained[0] > -1
+
+
+BOTH_SIDES = [View(Camera(0.4, azimuth, 10)) for azimuth in (0, 40, 180, -40, 200, 160)]
+
+
+def test_a_target_that_shows_both_sides_of_a_sheet_is_understood(make_object: Make, make_quad: Make) -> None:
+    texture = np.random.default_rng(0).integers(40, 216, (96, 96, 3), dtype=np.uint8)
+    truth = SamplingModel(cull=False)
+    calibration = found(make_object(make_quad(texture)), KnownTarget(truth), "curve", views=BOTH_SIDES)
+    assert calibration.sampling == truth
+    assert len(calibration.fidelity.correlation) == 4
+    assert min(calibration.fidelity.correlation) > 0.98
+
+
+def test_what_changes_where_the_surrogate_sees_no_object_counts_against_it(mug: Object3D) -> None:
+    ask, noise = KnownTarget(SamplingModel()), painted_noise(mug, np.random.default_rng(1))
+    surrogate = build_surrogate(found(mug, ask, "calibrated"), mug, VIEWS, ask(mug, VIEWS))
+    clean, images = ask(mug, VIEWS), ask(noise, VIEWS)
+    honest = measure_fidelity(surrogate, mug, clean, noise, images)
+    images[1, :8], clean[1, :8] = images[1, 28:36], clean[1, 28:36]  # a reflection
+    fooled = measure_fidelity(surrogate, mug, clean, noise, images)
+    assert honest.good_enough
+    for name in ("correlation", "explained"):
+        one, other = getattr(honest, name), getattr(fooled, name)
+        assert other[1] < one[1] - 0.05
+        assert (other[0], *other[2:]) == (one[0], *one[2:])
+    assert fooled.error == honest.error
+
+
+@pytest.mark.parametrize("wanted", ["auto", "diffuse", "curve"])
+def test_of_views_that_all_see_nothing_nothing_good_is_said(
+    wanted: SurrogateModel, make_object: Make, make_quad: Make
+) -> None:
+    obj = make_object(make_quad(np.full((8, 8, 3), 128, np.uint8)))
+    calibration = found(obj, KnownTarget(SamplingModel()), wanted, views=[View(Camera(0.5, 180, 0))] * 2)
+    assert calibration.fidelity == Fidelity((0.0,), (0.0,), (0.0,), (0.0,))
+    assert not calibration.fidelity.good_enough
 
 
 ASLANT = [View(Camera(0.3, azimuth, elevation)) for azimuth, elevation in ((60, 0), (70, 10), (10, 65), (-72, 5))]
@@ -164,6 +216,11 @@ def test_nothing_rare_is_looked_for_where_the_usual_satisfies() -> None:
 def test_something_rare_that_gains_little_is_not_believed() -> None:
     assert find_sampling(lambda model: 0.5 + 0.019 * (model.anisotropy > 1)) == SamplingModel()
     assert find_sampling(lambda model: 0.5 + 0.021 * (model.anisotropy > 1)).anisotropy > 1
+
+
+def test_a_bias_between_those_that_are_tried_is_read_off_a_parabola() -> None:
+    found = find_sampling(lambda model: 0.99 - 0.2 * (model.bias - 0.38) ** 2)
+    assert found == SamplingModel(bias=pytest.approx(0.38, abs=0.01))
 
 
 def test_two_probes_a_view_are_taken_where_they_are_good_enough(mug: Object3D) -> None:
@@ -274,6 +331,17 @@ def test_painting_grey_or_noise_keeps_the_object(mug: Object3D) -> None:
         free = (mug.textures[name] >= 26) & (mug.textures[name] <= 229)
         assert set(np.unique(change[free])) == {-26, 26}
         assert np.abs(change).max() == 26
+
+
+def test_painting_grey_or_noise_keeps_what_is_cut_out(make_object: Make, make_quad: Make) -> None:
+    opacity = (np.indices((24, 40)).sum(axis=0) % 5 * 60).astype(np.uint8)
+    obj = make_object(make_quad(np.full((24, 40, 3), 100, np.uint8)))
+    picture = Image.fromarray(np.dstack([obj.textures["m0.png"], opacity]))
+    obj = object_from_files({**obj.files, "m0.png": encode_png(picture)})
+    for painted in (painted_grey(obj, 77), painted_noise(obj, np.random.default_rng(3))):
+        kept = opacity_of(painted.files["m0.png"])
+        assert kept is not None
+        assert np.array_equal(kept, opacity)
 
 
 def test_another_generator_paints_other_noise(mug: Object3D) -> None:

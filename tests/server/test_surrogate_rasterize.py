@@ -151,7 +151,9 @@ def test_a_triangle_is_culled_when_it_is_seen_from_behind_and_only_then() -> Non
     assert (seen_faces(mesh, behind, cull=False) == 0).any()
 
 
-def test_a_camera_inside_a_room_sees_a_wall_wherever_it_looks() -> None:
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, 0.5), (-0.5, -0.5), (1.0, -1.0), (-1.0, 1.0)])
+@pytest.mark.parametrize("samples", [CENTRE, MSAA4], ids=["centre", "msaa"])
+def test_a_camera_inside_a_room_sees_a_wall_wherever_it_looks(samples: Samples, shift: tuple[float, float]) -> None:
     x, y, z = np.eye(3)
     walls = []
     for n, u, v in ((x, y, z), (y, z, x), (z, x, y)):
@@ -160,7 +162,8 @@ def test_a_camera_inside_a_room_sees_a_wall_wherever_it_looks() -> None:
             walls += [[a, b, c], [a, c, d]]
     room = mesh_from(np.array(walls))
     for camera in (Camera(0.5, 30, 20), Camera(0.9, 200, -70), Camera(0.01, 45, 90)):
-        assert (seen_faces(room, camera, samples=MSAA4) >= 0).all()
+        shifted = tuple((across + shift[0], down + shift[1]) for across, down in samples)
+        assert (seen_faces(room, camera, samples=shifted) >= 0).all()
 
 
 def test_the_floor_is_seen_up_to_the_horizon_though_it_reaches_behind_the_camera() -> None:

@@ -25,10 +25,10 @@ from trompe_server.surrogate.calibration import (
     CALIBRATED_GREYS,
     CURVE_GREYS,
     Calibration,
-    Fidelity,
     build_surrogate,
     painted_grey,
 )
+from trompe_server.surrogate.fidelity import Fidelity
 from trompe_server.surrogate.surrogate import BATCH
 from trompe_server.target import FakeTarget, SailenvTarget, TargetRenderer
 from trompe_shared.geometry import Camera, Light, View
@@ -311,6 +311,19 @@ def test_the_unpainted_object_is_predicted_as_the_target_shows_it(mug: Object3D,
     images = images_of(surrogate, textures_of(mug)).permute(0, 2, 3, 1) * 255
     torch.testing.assert_close(images, torch.from_numpy(clean).float(), atol=0.51, rtol=0)
     assert surrogate.model == ("calibrated" if len(greys) == 2 else "curve")
+
+
+def test_a_prediction_that_is_rounded_to_what_the_target_shows_is_believed_as_it_is(
+    mug: Object3D, curved: Surrogate
+) -> None:
+    shown = curved.geometry.batches[0].of(curved.base) / 255
+    colours, _ = curved.colours(curved.texels(textures_of(mug)), 0)
+    assert curved.missed is not None
+    (missed,) = curved.missed
+    near = missed.abs() < 0.49 / 255
+    assert 0.05 < near.float().mean() < 0.95
+    torch.testing.assert_close(colours[near], (shown - missed)[near], atol=1e-6, rtol=0)
+    torch.testing.assert_close(colours[~near], shown[~near], atol=0.51 / 255, rtol=0)
 
 
 def test_the_diffuse_surrogate_shows_each_views_own_background(mug: Object3D) -> None:

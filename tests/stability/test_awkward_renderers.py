@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from trompe_server.artifacts import LocalArtifacts
 from trompe_server.attack_job import open_pipeline
 from trompe_server.library import Library
-from trompe_server.surrogate.calibration import MAX_ERROR, MIN_EXPLAINED
+from trompe_server.surrogate.fidelity import MAX_ERROR, MIN_EXPLAINED
 from trompe_server.target import SailenvTarget
 from trompe_shared.api import JobSpec, Result
 from trompe_shared.geometry import View

@@ -15,14 +15,8 @@ from torch import Tensor
 from trompe_server.attack import Budget, Goal, attack, saliency, start
 from trompe_server.classifiers import fake_classifier
 from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
-from trompe_server.surrogate.calibration import (
-    CURVE_GREYS,
-    Calibration,
-    Fidelity,
-    build_surrogate,
-    calibrate,
-    painted_grey,
-)
+from trompe_server.surrogate.calibration import CURVE_GREYS, Calibration, build_surrogate, calibrate, painted_grey
+from trompe_server.surrogate.fidelity import Fidelity
 from trompe_server.target import FakeTarget
 from trompe_shared.errors import ObjectError
 from trompe_shared.geometry import Camera, View
@@ -35,6 +29,8 @@ SAMPLING = [
     pytest.param(SamplingModel(), id="msaa"),
     pytest.param(SamplingModel(samples="centre", filtered="linear", lod="area", cull=False), id="centre, linear"),
     pytest.param(SamplingModel(shade_at="centroid", bias=2.0), id="centroid, biased"),
+    pytest.param(SamplingModel(anisotropy=16, shift=(0.3, -0.2)), id="probes, shifted"),
+    pytest.param(SamplingModel(anisotropy=16, elongated="ellipse"), id="ellipse"),
 ]
 FRONT = [View(Camera(0.5, azimuth, elevation)) for azimuth, elevation in ((0, 0), (25, 20))]
 UNIT_UVS = np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]])
@@ -165,11 +161,11 @@ def test_cameras_inside_the_object_or_on_its_surface_do_no_harm(mug: Object3D, m
     check(mug, [View(Camera(0.001, 10, 10)), View(Camera(0.04, 90, 0)), *INSIDE], model)
 
 
-@pytest.mark.parametrize("model", SAMPLING[:1])
+@pytest.mark.parametrize("model", SAMPLING)
 def test_a_view_that_sees_nothing_shows_its_background_and_changes_no_other_view(
     model: SamplingModel, make_object: Make, make_quad: Make
 ) -> None:
-    obj = make_object(make_quad(noise(16, 16)))
+    obj, model = make_object(make_quad(noise(16, 16))), model.but(cull=True)
     mixed = [FRONT[0], EMPTY, FRONT[1]]
     check(obj, mixed, model)
     for with_empty, without in zip(surrogates(obj, mixed, model), surrogates(obj, FRONT, model), strict=True):
@@ -189,8 +185,9 @@ def test_an_empty_view_neither_pulls_nor_stops_the_attack(make_object: Make, mak
     assert (without["m0.png"] != 0).any()
 
 
-def test_views_that_all_see_nothing_are_survived(make_object: Make, make_quad: Make) -> None:
-    check(make_object(make_quad(noise(16, 16))), [EMPTY, EMPTY], SamplingModel())
+@pytest.mark.parametrize("model", SAMPLING)
+def test_views_that_all_see_nothing_are_survived(model: SamplingModel, make_object: Make, make_quad: Make) -> None:
+    check(make_object(make_quad(noise(16, 16))), [EMPTY, EMPTY], model.but(cull=True))
 
 
 def test_calibration_survives_a_trial_view_that_sees_nothing(make_object: Make, make_quad: Make) -> None:

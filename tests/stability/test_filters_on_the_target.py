@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from trompe_server.surrogate import SamplingModel, curve_surrogate, prepare_geometry
-from trompe_server.surrogate.calibration import CURVE_GREYS, Fidelity, calibrate, measure_fidelity, painted_noise
+from trompe_server.surrogate.calibration import CURVE_GREYS, calibrate, painted_noise
+from trompe_server.surrogate.fidelity import Fidelity, measure_fidelity
 from trompe_server.target import SailenvTarget
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D

@@ -14,13 +14,8 @@ from PIL import Image
 
 from trompe_server.attack_report import POOR_VIEW
 from trompe_server.surrogate import SamplingModel, Surrogate, curve_surrogate, prepare_geometry
-from trompe_server.surrogate.calibration import (
-    CURVE_GREYS,
-    build_surrogate,
-    calibrate,
-    measure_fidelity,
-    painted_noise,
-)
+from trompe_server.surrogate.calibration import CURVE_GREYS, build_surrogate, calibrate, painted_noise
+from trompe_server.surrogate.fidelity import measure_fidelity
 from trompe_server.target import SailenvTarget
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, object_from_files

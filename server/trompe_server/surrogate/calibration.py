@@ -5,7 +5,7 @@ judged by how well it predicts what the noise changes in the target's images.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import product
 from typing import Final
@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from trompe_server.surrogate.fidelity import Fidelity, measure_fidelity
 from trompe_server.surrogate.sampling import SamplingModel
 from trompe_server.surrogate.surrogate import (
     NO_BACKDROPS,
@@ -23,7 +23,6 @@ from trompe_server.surrogate.surrogate import (
     curve_surrogate,
     diffuse_surrogate,
     prepare_geometry,
-    textures_of,
 )
 from trompe_shared.api import SurrogateModel
 from trompe_shared.geometry import View
@@ -33,14 +32,10 @@ from trompe_shared.opacity import opacity_of
 __all__ = [
     "CALIBRATED_GREYS",
     "CURVE_GREYS",
-    "MAX_ERROR",
-    "MIN_EXPLAINED",
     "Calibration",
-    "Fidelity",
     "build_surrogate",
     "calibrate",
     "find_sampling",
-    "measure_fidelity",
     "painted_grey",
     "painted_noise",
 ]
@@ -48,13 +43,6 @@ __all__ = [
 CALIBRATED_GREYS: Final = (0, 128)
 CURVE_GREYS: Final = (0, 64, 128, 191, 255)
 """Encoded greys of the probes of the ``calibrated`` and the ``curve`` model. White would saturate and tell little."""
-
-MAX_ERROR: Final = 1.5 / 255
-"""A colour model is good enough when its mean error on the unpainted object's pixels is at most this, sRGB in [0, 1]
-units."""
-
-MIN_EXPLAINED: Final = 0.8
-"""... and it explains at least this share of the variance of what a random repaint changes."""
 
 NOISE_AMPLITUDE: Final = 0.1
 
@@ -88,71 +76,6 @@ def painted_noise(obj: Object3D, generator: np.random.Generator) -> Object3D:
             for name, image in obj.textures.items()
         }
     )
-
-
-@dataclass(frozen=True)
-class Fidelity:
-    """How well a surrogate predicts the target, per view.
-
-    error: mean |predicted - true| of the unpainted object's pixels, without anchoring, sRGB in [0, 1] units.
-    correlation, slope: of predicted against true change of the image under a random repaint.
-    explained: share of the variance of the true change that the prediction explains; 1 is perfect, 0 is as good as
-    predicting no change.
-    """
-
-    error: tuple[float, ...]
-    correlation: tuple[float, ...]
-    slope: tuple[float, ...]
-    explained: tuple[float, ...]
-
-    def mean(self) -> dict[str, float]:
-        """Means over the views."""
-        return {name: float(np.mean(values)) for name, values in asdict(self).items()}
-
-    @property
-    def score(self) -> float:
-        """What hypotheses are compared by: explained variance, less 1 % for each 0.5/255 of error."""
-        mean = self.mean()
-        return mean["explained"] - 5 * mean["error"]
-
-    @property
-    def good_enough(self) -> bool:
-        """Whether the surrogate is within tolerance on average."""
-        mean = self.mean()
-        return mean["error"] <= MAX_ERROR and mean["explained"] >= MIN_EXPLAINED
-
-
-def measure_fidelity(
-    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8
-) -> Fidelity:
-    """Compare ``surrogate`` with the target's images (views, H, W, 3) of ``obj`` (clean) and of ``repainted``."""
-    device = surrogate.base.device
-    true = [torch.from_numpy(each).to(device) for each in (clean, images)]
-    rows: list[tuple[float, float, float, float]] = []
-    with torch.no_grad():
-        texels = [surrogate.texels(textures_of(each, device=device)) for each in (obj, repainted)]
-        for number, batch in enumerate(surrogate.geometry.batches):
-            before, after = (surrogate.colours(each, number)[0] for each in texels)
-            shown, repainted_shown = (batch.of(each) / 255 for each in true)
-            if surrogate.missed is None:
-                columns = (after - before, before, shown, repainted_shown)
-            else:
-                columns = (after - shown, shown - surrogate.missed[number], shown, repainted_shown)
-            by_view = zip(*(torch.split(column, list(batch.counts)) for column in columns), strict=True)
-            rows += [_compare(*pixels) for pixels in by_view if len(pixels[0])]
-    return Fidelity(*(tuple(column) for column in zip(*rows, strict=True)))
-
-
-def _compare(
-    predicted_change: Tensor, predicted: Tensor, clean: Tensor, after: Tensor
-) -> tuple[float, float, float, float]:
-    """(error, correlation, slope, explained) of one view."""
-    change, guess = (after - clean).flatten().double(), predicted_change.flatten().double()
-    variance, power = float(change.square().mean()), float(guess.square().mean())
-    product = float((change * guess).mean())
-    correlation = product / max((variance * power) ** 0.5, 1e-12)
-    explained = 1 - float((change - guess).square().mean()) / max(variance, 1e-12)
-    return float((predicted - clean).abs().mean()), correlation, product / max(power, 1e-12), explained
 
 
 Score = Callable[[SamplingModel], float]

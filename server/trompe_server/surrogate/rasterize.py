@@ -150,16 +150,17 @@ def _set_up(positions: Float[Tensor, "faces 3 3"], camera: Camera, size: tuple[i
 def _pixel_box(
     corners: Float[Tensor, "faces 3 3"], size: tuple[int, int]
 ) -> tuple[Int[Tensor, "faces 4"], Bool[Tensor, " faces"]]:
-    """Pixels of the image and its margin that each triangle can touch, and whether there are any; the whole image where
-    it reaches behind the camera."""
+    """Pixels of the image and its margin that each triangle can touch, and whether there are any; all of them where it
+    reaches behind the camera."""
     height, width = size
     depth = corners[..., 2]
     points = corners[..., :2] / depth.clamp(min=NEAR)[..., None]
     limit = torch.tensor([width, height], device=corners.device)
     low, high = points.amin(1), points.amax(1)
     behind = (depth < NEAR).any(1)
-    low = torch.where(behind[:, None], torch.zeros_like(low), low.clamp(min=-MARGIN)).floor()
-    high = torch.where(behind[:, None], limit - 1.0, torch.minimum(high, limit - 1.0 + MARGIN)).floor()
+    first, last = torch.full_like(low, -MARGIN), limit - 1.0 + MARGIN
+    low = torch.where(behind[:, None], first, low.maximum(first)).floor()
+    high = torch.where(behind[:, None], last, high.minimum(last)).floor()
     touches = (high >= low).all(1) & (depth >= NEAR).any(1)
     return torch.cat([low, high], 1).nan_to_num(0.0).long(), touches
 

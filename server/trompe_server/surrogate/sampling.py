@@ -312,7 +312,7 @@ def _within(
     first = (centre - reach).floor().long()
     extent = (centre + reach).ceil().long() - first + 1
     counts = extent[:, 0] * extent[:, 1]
-    for begin, end in chunks(counts):
+    for begin, end in chunks(counts) or [(0, 0)]:
         some = counts[begin:end]
         who = torch.arange(begin, end, device=centre.device).repeat_interleave(some)
         number = torch.arange(len(who), device=centre.device) - (some.cumsum(0) - some)[who - begin]
