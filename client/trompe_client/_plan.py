@@ -19,6 +19,7 @@ from trompe_shared.api import (
     Needs,
     Optimiser,
     Priority,
+    SaliencyScope,
     SunRanges,
     SurrogateModel,
     ViewRanges,
@@ -88,6 +89,7 @@ class JobOptions(TypedDict, total=False):
     epsilon: float
     alpha: float
     tau: float | None
+    saliency_scope: SaliencyScope
     keep: float | None
     materials: Sequence[str]
     epsilon_view: float | None

@@ -141,7 +141,8 @@ def _table(*columns: str, right: int = 0) -> Table:
 
 def _headline(result: Result) -> str:
     label = f"{result.label_name} ({result.label})" if result.label_name else str(result.label)
-    tau = "none" if result.tau is None else f"{result.tau:g}"
+    scope = "" if result.spec.saliency_scope == "all_views" else " in each view"
+    tau = "none" if result.tau is None else f"{result.tau:g}{scope}"
     keep = "" if result.spec.keep is None else f", keep {result.spec.keep:g}"
     budget = f"epsilon {result.epsilon:g}, alpha {result.alpha:g}, tau {tau}{keep}"
     what = budget if result.spec.attack_on == "texture" else result.spec.attack_on

@@ -256,7 +256,8 @@ class AttackJob(PhasedJob):
 
     @cached_property
     def _maps(self) -> torch.Tensor | None:
-        """Saliency of the target's images (views, H, W); ``None`` where the classifier gives no gradients."""
+        """Saliency of the target's images (views, H, W), by the job's scope; ``None`` where the classifier gives no
+        gradients."""
         if not self.scene.white_box:
             return None
         return torch.from_numpy(self.files.load("saliency")["maps"].astype(np.float32))

@@ -9,7 +9,17 @@ from typing import Protocol
 from trompe_shared.api import JobSpec
 from trompe_shared.errors import ClassifierError, SpecError
 
-__all__ = ["Classes", "check_diverse", "check_mask_size", "check_saliency", "check_same_classes", "check_vertices"]
+__all__ = [
+    "Classes",
+    "check_diverse",
+    "check_goal",
+    "check_keep",
+    "check_mask_size",
+    "check_queries",
+    "check_saliency",
+    "check_same_classes",
+    "check_vertices",
+]
 
 
 class Classes(Protocol):
@@ -25,10 +35,36 @@ class Classes(Protocol):
     def classes(self) -> Sequence[str] | None: ...
 
 
+def check_goal(loss: str, n_classes: int, *, top_k: int, targeted: bool) -> None:
+    """Refuse what needs more classes than a classifier has: to leave its best ones, and the loss that compares
+    distances of logits."""
+    if top_k >= n_classes:
+        raise SpecError(f"top_k must be less than the {n_classes} classes there are, got {top_k}.")
+    least = 4 if targeted else top_k + 2
+    if loss == "dlr" and n_classes < least:
+        raise SpecError(f"The dlr loss needs {least} classes for this goal, there are {n_classes}: choose margin.")
+
+
 def check_saliency(spec: JobSpec, classifier: str) -> None:
     """Refuse options that need saliency for a classifier (its name) that gives no gradients."""
     if spec.tau is not None or spec.keep is not None:
         raise SpecError(f"tau and keep need saliency, and {classifier!r} gives no gradients: leave them out.")
+
+
+def check_queries(spec: JobSpec, classifier: str) -> None:
+    """Refuse to ask a classifier (its name) that gives gradients for scores in their place."""
+    if spec.queries is not None:
+        raise SpecError(
+            f"queries are for classifiers that only give scores; {classifier!r} gives gradients: leave them out."
+        )
+
+
+def check_keep(spec: JobSpec, *, n_texels: int) -> None:
+    """Refuse a share of an object's texels, ``n_texels`` in all, that is less than half of one."""
+    if spec.keep is not None and round(spec.keep * n_texels) == 0:
+        raise SpecError(
+            f"keep={spec.keep:g} leaves none of the {n_texels} texels to move: keep {1 / n_texels:.1g} or more."
+        )
 
 
 def check_diverse(spec: JobSpec, classifier: str) -> None:

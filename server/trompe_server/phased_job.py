@@ -71,7 +71,8 @@ class PhasedJob(ABC):
         own = ask(scene.obj, scene.views)
         self.files.save(VIEWS_BEFORE, own=own, held_out=ask(scene.obj, scene.held_out))
         if scene.white_box:
-            self.files.save("saliency", maps=saliency(own, scene.members, goal=scene.goal).numpy().astype(np.float16))
+            maps = saliency(own, scene.members, goal=scene.goal, scope=self.spec.saliency_scope)
+            self.files.save("saliency", maps=maps.numpy().astype(np.float16))
         if (scene.classifier.predict(own).argmax(axis=1) != scene.label).all():
             return self._end_without_attack()
         return PhaseReport(self._progress("prepare", 1.0))

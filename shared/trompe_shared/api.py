@@ -4,7 +4,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 __all__ = [
     "FEW_RECOGNISED",
@@ -33,9 +33,11 @@ __all__ = [
     "Progress",
     "RendererInfo",
     "Result",
+    "SaliencyScope",
     "SunRanges",
     "SurrogateModel",
     "VerticesMoved",
+    "ViewFidelity",
     "ViewPrediction",
     "ViewRanges",
     "WorkerInfo",
@@ -45,6 +47,7 @@ AttackOn = Literal["texture", "light", "vertices"]
 SurrogateModel = Literal["auto", "diffuse", "calibrated", "curve"]
 Optimiser = Literal["fgsm", "pgd", "momentum", "nesterov", "adam", "auto"]
 Loss = Literal["margin", "cross_entropy", "dlr"]
+SaliencyScope = Literal["all_views", "each_view"]
 Priority = Literal["interactive", "normal", "sweep"]
 Needs = Literal["any", "cpu", "cuda"]
 Labels = Annotated[
@@ -170,8 +173,8 @@ VIEWS_PER_PLACE: Final = 12
 """Views on which each place of the light is tried, where the job does not say."""
 
 _TEXTURE_ONLY: Final = (
-    *("epsilon", "tau", "keep", "materials", "masks", "epsilon_view", "loss", "optimiser", "restarts", "queries"),
-    *("surrogate", "diverse"),
+    *("epsilon", "tau", "saliency_scope", "keep", "materials", "masks", "epsilon_view", "loss", "optimiser"),
+    *("restarts", "queries", "surrogate", "diverse"),
 )
 _OPTIONS_OF: Final[dict[str, tuple[str, ...]]] = {
     "texture": _TEXTURE_ONLY,
@@ -179,6 +182,15 @@ _OPTIONS_OF: Final[dict[str, tuple[str, ...]]] = {
     "vertices": ("vertex_budget",),
 }
 """Options of a job that mean something for one kind of attack alone."""
+
+
+def _worth_saving(epsilon: float) -> float:
+    if epsilon * 255 + 1e-9 < 1:
+        raise ValueError(
+            f"{epsilon:g} is less than 1/255 (0.0039216), one level of an 8-bit texture, so that nothing could change; "
+            "make it 0.004 or more"
+        )
+    return epsilon
 
 
 def _mean_step(epsilon: float) -> float:
@@ -215,12 +227,17 @@ class JobSpec(_Schema):
     vertex_budget: Annotated[float, Field(gt=0, le=0.5)] = Field(
         0.02, description="of vertices: how far one may move, as a share of the object's radius"
     )
-    epsilon: Annotated[float, Field(gt=0, le=1)] = 0.05
+    epsilon: Annotated[float, Field(gt=0, le=1), AfterValidator(_worth_saving)] = 0.05
     alpha: Annotated[float, Field(gt=0, le=1)] = Field(
         0.01, description="mean step; by default 0.01, or a fifth of epsilon where that is smaller"
     )
     tau: Annotated[float, Field(ge=0, lt=1)] | None = Field(
         None, description="saliency threshold; null attacks all texels"
+    )
+    saliency_scope: SaliencyScope = Field(
+        "all_views",
+        description="of tau: saliency is rescaled over all views together, as in the paper; or every view by its own "
+        "largest, so that a view in which the loss is little sensitive gives pixels too",
     )
     keep: Annotated[float, Field(gt=0, le=1)] | None = Field(
         None,
@@ -323,6 +340,21 @@ class JobSpec(_Schema):
         return self
 
     @model_validator(mode="after")
+    def _steps_for_every_run(self) -> "JobSpec":
+        runs = self.restarts + 1
+        if self.steps < runs:
+            raise ValueError(
+                f"steps ({self.steps}) are too few for {self.restarts} restarts: each run needs one at least; "
+                f"make steps {runs} or more"
+            )
+        if self.optimiser == "fgsm" and self.steps != runs:
+            raise ValueError(
+                f"fgsm is a single step: make steps {runs} (one a run) instead of {self.steps}, or choose another "
+                "optimiser, such as pgd"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _nothing_without_effect(self) -> "JobSpec":
         foreign = [name for kind, names in _OPTIONS_OF.items() if kind != self.attack_on for name in names]
         idle = [name for name in foreign if getattr(self, name) != _default_of(name)]
@@ -332,6 +364,10 @@ class JobSpec(_Schema):
             raise ValueError(
                 f"attack_on is {self.attack_on!r}, and {', '.join(idle)} belong to another kind of attack: leave them "
                 "out, or change attack_on"
+            )
+        if self.tau is None and self.saliency_scope != _default_of("saliency_scope"):
+            raise ValueError(
+                "saliency_scope says how saliency is rescaled for tau, and there is no tau: give one, or leave it out"
             )
         return self
 
@@ -465,6 +501,16 @@ class Accuracy(_Schema):
     a_after_interval: tuple[float, float] | None
 
 
+class ViewFidelity(_Schema):
+    """How well the surrogate predicted the target in one view: the unpainted object, and what the attack changed."""
+
+    error: float = Field(description="mean |difference| on the pixels of the unpainted object, sRGB in [0, 1] units")
+    correlation: float = Field(description="of predicted and true change of the image")
+    slope: float = Field(description="of true over predicted change; 1 where it is as large as predicted")
+    explained: float = Field(description="share of the variance of the true change that the prediction explains")
+    change: float = Field(description="root of the mean squared true change, sRGB in [0, 1] units")
+
+
 class ViewPrediction(_Schema):
     """What the classifier said of one view, before and after; probabilities in [0, 1]."""
 
@@ -484,6 +530,10 @@ class ViewPrediction(_Schema):
     after: int | None = None
     after_confidence: float | None = None
     after_true_confidence: float | None = None
+    fidelity: Annotated[
+        ViewFidelity | None,
+        Field(description="of an attacked view whose image changed, where the texture was attacked"),
+    ] = None
 
 
 class Judgement(_Schema):
@@ -565,7 +615,8 @@ class Result(_Schema):
     )
     queries: int | None = Field(None, description="scores asked of a classifier that gives no gradients")
     fidelity: dict[str, float] = Field(
-        default_factory=dict, description="surrogate against target; see docs/glossary.md"
+        default_factory=dict,
+        description="surrogate against target, of a random repaint on a few trial views; see docs/glossary.md",
     )
     warnings: list[str] = Field(default_factory=list)
     seconds: dict[str, float]

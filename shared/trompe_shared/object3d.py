@@ -157,8 +157,13 @@ def open_image(data: bytes, name: str) -> Iterator[Image.Image]:
 
 
 def decode_rgb(data: bytes, name: str) -> Texture:
-    """Decode an image file to (H, W, 3) uint8. Raises ``ObjectError`` with ``name`` when it cannot be read."""
+    """Decode an image file to (H, W, 3) uint8; of 16 bits the upper 8, as Pillow reads those of colours.
+
+    Raises ``ObjectError`` with ``name`` when it cannot be read.
+    """
     with open_image(data, name) as image:
+        if image.mode.startswith("I;16"):  # Pillow would clip these greys, not scale them
+            return np.repeat((np.array(image) >> 8).astype(np.uint8)[..., None], 3, axis=2)
         return np.array(image.convert("RGB"))
 
 

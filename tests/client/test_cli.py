@@ -74,7 +74,8 @@ def test_every_option_reaches_the_job(server, tmp_path):
     mask, member = tmp_path / "mask.png", tmp_path / "member.torchscript"
     mask.write_bytes(b"mask")
     member.write_bytes(b"script")
-    options = """--epsilon .1 --alpha .02 --tau .2 --surrogate curve --steps 9 --seed 4 --distance 2 --elevation -5 30
+    options = """--epsilon .1 --alpha .02 --tau .2 --saliency-scope each_view --surrogate curve --steps 9 --seed 4
+        --distance 2 --elevation -5 30
         --background #112233 --background black --classifier tiny --label 7 --judge torchvision:vgg16 --judge net
         --keep .3 --material clay --material glaze --epsilon-view .04 --target 2 --loss dlr --optimiser adam
         --restarts 3 --queries 8 --pool 50 --range roll -10 10 --range ambient 0.2 0.6 --held-out 12 --diverse"""
@@ -90,6 +91,7 @@ def test_every_option_reaches_the_job(server, tmp_path):
         epsilon=0.1,
         alpha=0.02,
         tau=0.2,
+        saliency_scope="each_view",
         keep=0.3,
         materials=["clay", "glaze"],
         masks={"a.png": stored_id(b"mask")},
@@ -162,6 +164,26 @@ def test_options_of_texels_are_wrong_usage_where_the_light_is_attacked(tmp_path)
     assert "attack_on is 'light', and tau belong to another kind of attack" in " ".join(done.stderr.split())
 
 
+def test_a_scope_without_a_threshold_is_wrong_usage(tmp_path):
+    done = trompe("attack", "mug", "--label", "mug", "--saliency-scope", "each_view", "--out", tmp_path)
+    assert done.exit_code == 2
+    assert "saliency_scope says how saliency is rescaled for tau, and there is no tau" in " ".join(done.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        pytest.param("", "tau none,", id="none"),
+        pytest.param("--tau .2", "tau 0.2,", id="all views"),
+        pytest.param("--tau .2 --saliency-scope each_view", "tau 0.2 in each view,", id="each view"),
+    ],
+)
+def test_the_headline_says_the_threshold_and_what_it_is_of(server, tmp_path, words, told):
+    done = trompe("attack", "mug", "--label", "mug", *words.split(), "--server", server.url, "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    assert told in done.stdout
+
+
 def test_a_report_says_which_light_was_found_and_how_far_vertices_moved(client):
     result = client.submit(SPEC).wait(timeout=20).result()
     light = LightFound(azimuth=143.2, elevation=44, intensity=None, ambient=0.2, fooled=0.5, tried_on=12)
@@ -177,7 +199,8 @@ def test_the_command_line_knows_every_option_of_a_job_and_says_its_default():
     names = {parameter.name for parameter in attack.params}
     assert names - {"grid", "server", "token", "key", "detach", "out", "json"} == JobRequest.model_fields.keys()
     text = " ".join(trompe("attack", "--help").stdout.split())
-    for option in ("epsilon", "top_k", "loss", "optimiser", "restarts", "surrogate", "steps", "seed", "pool"):
+    options = "epsilon saliency_scope top_k loss optimiser restarts surrogate steps seed pool"
+    for option in options.split():
         words = f"--{option.replace('_', '-')} [^-]*Default: {JobSpec.model_fields[option].default}[. ]"
         assert re.search(words, text), option
 
@@ -270,6 +293,9 @@ def test_a_failed_job_exits_with_6_and_its_reason(server, tmp_path):
         pytest.param(["--pool", "9", "--azimuths", "4"], id="size of no grid"),
         pytest.param(["--target", "vase", "--top-k", "5"], id="two goals"),
         pytest.param(["--queries", "7"], id="odd queries"),
+        pytest.param(["--optimiser", "fgsm"], id="many steps of a single one"),
+        pytest.param(["--restarts", "9", "--steps", "9"], id="more runs than steps"),
+        pytest.param(["--epsilon", "0.001"], id="less than a level"),
     ],
 )
 def test_wrong_usage_exits_with_2_before_any_server_is_asked(words, tmp_path):

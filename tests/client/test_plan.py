@@ -141,6 +141,8 @@ def plan(**options: Any) -> AttackPlan:
     ("option", "words"),
     [
         pytest.param({"tau": 1.5}, "tau: Input should be less than 1", id="out of range"),
+        pytest.param({"saliency_scope": "each_view"}, "there is no tau: give one", id="scope of no threshold"),
+        pytest.param({"saliency_scope": "a_view", "tau": 0.1}, "saliency_scope: Input should be", id="no scope"),
         pytest.param({"ranges": {"colour": (0, 1)}}, "ranges.colour", id="no such range"),
         pytest.param({"ranges": {"roll": 3}}, "ranges.roll", id="no range"),
         pytest.param({"background": []}, "background: Value should have at least 1 item", id="no background"),

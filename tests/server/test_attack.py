@@ -1,13 +1,15 @@
 """The attack's parts, each against its formula, and the loop as a whole on a small scene."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
 from torch import Tensor
 
 from trompe_server.attack import (
@@ -16,10 +18,12 @@ from trompe_server.attack import (
     ViewDistribution,
     grid_views,
     image_gradients,
+    rescale_each_view,
     saliency,
     saliency_masks,
 )
 from trompe_server.classifiers import NetworkClassifier, fake_classifier
+from trompe_shared.api import SaliencyScope
 from trompe_shared.errors import SpecError
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View, framing_distance
 from trompe_shared.object3d import Object3D
@@ -154,6 +158,96 @@ def test_masks_are_the_pixels_of_at_least_tau() -> None:
     maps = torch.tensor([[[0.0, 0.05, 0.2, 1.0]]])
     assert saliency_masks(maps, 0.05).tolist() == [[[False, True, True, True]]]
     assert saliency_masks(maps, 0.0).all()
+
+
+MAPS = (
+    st.integers(1, 5)
+    .flatmap(lambda views: arrays(np.float32, (views, 3, 4), elements=st.floats(0, 1, width=32)))
+    .map(torch.from_numpy)
+)
+TAUS = st.floats(0.01, 0.999)
+
+
+@given(MAPS, TAUS, st.integers(-120, 0))
+@settings(max_examples=100)
+def test_each_view_alone_gives_its_most_sensitive_pixels_however_little_that_is(
+    maps: Tensor, tau: float, exponent: int
+) -> None:
+    maps[0] *= 2.0**exponent
+    rescaled = rescale_each_view(maps)
+    assert ((rescaled >= 0) & (rescaled <= 1)).all()
+    for view, own in zip(maps, rescaled.half().float(), strict=True):  # as jobs keep it
+        assert (own[view == view.max()] >= tau).all() == bool(view.any())
+        assert (own >= tau).any() == bool(view.any())
+
+
+@given(MAPS, TAUS, st.integers(-60, 60))
+@settings(max_examples=100)
+def test_each_view_alone_knows_nothing_of_how_sensitive_the_others_are(maps: Tensor, tau: float, exponent: int) -> None:
+    maps = torch.where(maps < 1e-6, 0, maps)  # what is less may be lost when it is scaled
+    before = rescale_each_view(maps)
+    factors = torch.ones(len(maps), 1, 1)
+    factors[-1] = 2.0**exponent
+    assert torch.equal(rescale_each_view(maps * factors), before)
+    for view, own in zip(maps, before, strict=True):
+        assert torch.equal(rescale_each_view(view[None])[0], own)
+
+
+class Steep(torch.nn.Module):
+    """Logits whose gradient is a high power of the image: dark views are hardly sensitive."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        steep = (images**9).sum((1, 2, 3))
+        return torch.stack([-steep, 0 * steep], 1)
+
+
+STEEP = NetworkClassifier("steep", Steep(), (4, 4), 2)
+GREYS = st.integers(1, 5).flatmap(lambda views: arrays(np.uint8, (views, 4, 4)))
+
+
+def grey_images(levels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.repeat(levels[..., None], 3, axis=3)
+
+
+@given(GREYS, TAUS)
+@settings(max_examples=60)
+def test_saliency_over_all_views_is_what_it_is_where_nothing_is_said(levels: NDArray[np.uint8], tau: float) -> None:
+    gradients = image_gradients(grey_images(levels), STEEP, goal=Goal(0)).abs().mean(3)
+    expected = (gradients - gradients.min()) / (gradients.max() - gradients.min()).clamp(min=1e-30)
+    for found in (
+        saliency(grey_images(levels), STEEP, goal=Goal(0)),
+        saliency(grey_images(levels), STEEP, goal=Goal(0), scope="all_views"),
+    ):
+        assert torch.equal(found, expected)
+
+
+@given(arrays(np.uint8, (1, 4, 4)))
+def test_of_a_single_view_both_scopes_are_the_same(levels: NDArray[np.uint8]) -> None:
+    alone, together = (
+        saliency(grey_images(levels), STEEP, goal=Goal(0), scope=scope) for scope in get_args(SaliencyScope)
+    )
+    assert torch.equal(alone, together)
+
+
+def test_a_dark_view_gives_pixels_in_each_view_alone_where_half_precision_would_lose_them() -> None:
+    levels = np.zeros((3, 4, 4), np.uint8)
+    levels[0, :2], levels[1, 1:3] = 255, 2  # the second view is 255 / 2 to the eighth, 7e16, times less sensitive
+    together, alone = (
+        saliency(grey_images(levels), STEEP, goal=Goal(0), scope=scope).half().float()
+        for scope in get_args(SaliencyScope)
+    )
+    assert saliency_masks(together, 0.2).any(2).tolist() == [[True, True, False, False], [False] * 4, [False] * 4]
+    masks = saliency_masks(alone, 0.2)
+    assert masks.all(2).tolist() == [[True, True, False, False], [False, True, True, False], [False] * 4]
+    assert torch.equal(masks.any(2), masks.all(2))
+
+
+def test_views_that_are_sensitive_nowhere_leave_nothing_in_either_scope() -> None:
+    for scope in get_args(SaliencyScope):
+        maps = saliency(np.zeros((2, 4, 4, 3), np.uint8), STEEP, goal=Goal(0), scope=scope)
+        assert (maps == 0).all()
+        with pytest.raises(SpecError, match=r"tau=0.01.*lower tau"):
+            saliency_masks(maps, 0.01)
 
 
 # The views

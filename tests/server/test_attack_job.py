@@ -2,10 +2,12 @@
 
 import dataclasses
 import io
+import json
 import shutil
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -15,16 +17,16 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trompe_server.array_files import unpack_arrays
-from trompe_server.attack import Budget, Goal, attack, load_state, saliency_masks, start
+from trompe_server.attack import Budget, Goal, attack, load_state, rescale_each_view, saliency, saliency_masks, start
 from trompe_server.attack_job import AttackJob, open_pipeline
 from trompe_server.errors import NotFoundError
 from trompe_server.library import Library
 from trompe_server.meter import Meter
-from trompe_server.pipeline import DamagedFileError, PhaseReport
+from trompe_server.pipeline import VIEWS_BEFORE, DamagedFileError, PhaseReport
 from trompe_server.scene import Scene, open_scene
-from trompe_server.surrogate import SamplingModel, diffuse_surrogate, prepare_geometry, textures_of
+from trompe_server.surrogate import Geometry, SamplingModel, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_server.target import BackdropTarget, FakeTarget, SailenvTarget, TargetRenderer
-from trompe_shared.api import ClassifierInfo, JobSpec, JobState, Progress
+from trompe_shared.api import ClassifierInfo, JobSpec, JobState, Progress, SaliencyScope
 from trompe_shared.errors import ClassifierError, LabelError
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, encode_png, load_object
@@ -324,6 +326,35 @@ def test_a_second_job_on_the_same_object_and_views_spends_no_probe(library: Libr
     assert second.artifacts.result().fidelity == first.artifacts.result().fidelity
 
 
+def test_the_views_are_rasterised_while_the_renderer_is_busy_with_probes(
+    library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A renderer that shows no more than the trial views before all views are rasterised."""
+    done, prepared = threading.Event(), list[tuple[View, ...]]()
+
+    def prepare(obj: Object3D, views: Sequence[View], **options: Any) -> Geometry:
+        geometry = prepare_geometry(obj, views, **options)
+        if len(views) > 4:
+            prepared.append(tuple(views))
+            done.set()
+        return geometry
+
+    class Patient(FakeTarget):
+        def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
+            if obj.textures[next(iter(obj.textures))].shape == (4, 4, 3) and len(views) > 4:
+                assert done.wait(60)
+            return super().render(obj, views, **options)
+
+    for module in ("attack_job", "surrogate.calibration"):
+        monkeypatch.setattr(f"trompe_server.{module}.prepare_geometry", prepare)
+    spec = SPEC.model_copy(update={"azimuths": 5, "elevations": 2, "steps": 1})
+    job = open_pipeline(spec, library=library, artifacts=MemoryArtifacts(), target=Patient())
+    shutil.rmtree(library.calibrations.folder, ignore_errors=True)
+    for phase in ("prepare", "calibrate", "attack-000"):
+        job.run(phase, lambda _: None)
+    assert prepared == [job.scene.views]
+
+
 def test_a_calibration_serves_only_the_renderer_it_was_made_with(library: Library) -> None:
     spec = SPEC.model_copy(update={"steps": 1})
     run(spec, library)
@@ -391,8 +422,9 @@ def test_the_higher_the_threshold_the_fewer_texels_are_altered(library: Library)
     assert shares[-1] > 0
 
 
-def test_the_threshold_stops_the_gradient_of_the_pixels_below_it(library: Library) -> None:
-    spec = QUICK.model_copy(update={"tau": 0.2})
+@pytest.mark.parametrize("scope", get_args(SaliencyScope))
+def test_the_threshold_stops_the_gradient_of_the_pixels_below_it(library: Library, scope: SaliencyScope) -> None:
+    spec = QUICK.model_copy(update={"tau": 0.2, "saliency_scope": scope})
     artifacts, scene = run(spec, library).artifacts, open_scene(spec, library=library, target=FakeTarget())
     maps = torch.from_numpy(unpack_arrays(artifacts.read("saliency.npz"))["maps"].astype(np.float32))
     geometry = prepare_geometry(scene.obj, scene.views, size=scene.size, sampling=SamplingModel())
@@ -412,6 +444,34 @@ def test_the_threshold_stops_the_gradient_of_the_pixels_below_it(library: Librar
     assert done.step == 2
     for name, delta in expected.deltas.items():
         assert torch.equal(done.deltas[name], delta)
+
+
+class DimTarget(FakeTarget):
+    """A target whose first view is nearly black, so that hardly a pixel of it matters."""
+
+    def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
+        images = super().render(obj, views, **options)
+        images[0] //= 32
+        return images
+
+
+def test_each_view_alone_gives_pixels_of_a_view_that_all_views_together_leave_out(library: Library) -> None:
+    together, alone = (
+        run(QUICK.model_copy(update={"tau": 0.5, "saliency_scope": scope}), library, target=DimTarget()).artifacts.files
+        for scope in get_args(SaliencyScope)
+    )
+    over_all, each = (unpack_arrays(files["saliency.npz"])["maps"] for files in (together, alone))
+    assert each.max((1, 2)).tolist() == [1.0] * len(each)
+    assert over_all.max() == 1
+    assert over_all[0].max() < 0.5
+    scene = open_scene(QUICK, library=library, target=FakeTarget())
+    own = unpack_arrays(alone[f"{VIEWS_BEFORE}.npz"])["own"]
+    rescaled = rescale_each_view(saliency(own, scene.members, goal=scene.goal))
+    np.testing.assert_array_equal(each, rescaled.half())  # rounded once, after it was rescaled
+    shares = [json.loads(files["result.json"])["texels_altered"] for files in (together, alone)]
+    assert 0 < shares[0] < shares[1]
+    for name in ("saliency.png", "saliency_textures.png", "saliency_object.png"):
+        assert together[name] != alone[name]
 
 
 def saliency_of(target: TargetRenderer, library: Library) -> NDArray[np.float16]:
@@ -582,6 +642,47 @@ def test_views_on_which_the_surrogate_is_far_off_are_named(library: Library) -> 
     assert f"1 (azimuth {view.azimuth:.0f}, elevation {view.elevation:.0f})" in warning
 
 
+class StubbornTarget(FakeTarget):
+    """A target that shows no repaint to a camera, but probes."""
+
+    def __init__(self, camera: Camera) -> None:
+        super().__init__()
+        self.camera, self.clean = camera, load_object(CHAIR.read())
+
+    def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
+        images = super().render(obj, views, **options)
+        if obj.textures[next(iter(obj.textures))].shape != (4, 4, 3):
+            clean = super().render(self.clean, views, **options)
+            for index, view in enumerate(views):
+                images[index] = clean[index] if view.camera == self.camera else images[index]
+        return images
+
+
+def test_views_on_which_the_attack_changed_something_else_than_predicted_are_named(library: Library) -> None:
+    first = open_scene(SPEC, library=library, target=FakeTarget()).views[0].camera
+    result = run(SPEC, library, target=StubbornTarget(first)).artifacts.result()
+    (warning,) = [found for found in result.warnings if "not as the surrogate predicted" in found]
+    assert f"on views 0 (azimuth {first.azimuth:.0f}, elevation {first.elevation:.0f}): " in warning
+
+
+def test_what_the_surrogate_predicted_of_each_attacked_view_is_told(library: Library, target: SailenvTarget) -> None:
+    result = run(SPEC, library, target=target).artifacts.result()
+    for view in result.views:
+        assert view.fidelity is not None
+        assert view.fidelity.correlation > 0.97
+        assert 0.9 < view.fidelity.slope < 1.1
+        assert view.fidelity.explained > 0.9
+        assert view.fidelity.error < 1.5 / 255
+        assert 0 < view.fidelity.change <= SPEC.epsilon * 1.5
+    assert not any(view.fidelity for view in result.held_out_views)
+    assert not [found for found in result.warnings if "on views" in found]
+
+
+def test_a_surrogate_that_asked_for_no_probes_names_its_views_too(library: Library) -> None:
+    warnings = run(QUICK, library, target=DarkTarget()).artifacts.result().warnings
+    assert [found for found in warnings if "off by more than 3/255 on views" in found]
+
+
 def test_an_attack_that_came_to_little_says_so_and_what_to_try(library: Library) -> None:
     spec = SPEC.model_copy(update={"epsilon": 1 / 255, "alpha": 1 / 255, "steps": 1})
     result = run(spec, library).artifacts.result()
@@ -616,7 +717,7 @@ def test_the_attack_knows_what_its_views_stand_in_front_of(tmp_path: Path, photo
 
 
 class Liar(FakeTarget):
-    """A target that shows noise wherever the result is judged: held-out views, and everything after the attack."""
+    """A target that shows noise wherever the result could be seen: held-out views, and all from the attack's start."""
 
     def __init__(self, own: Sequence[View]) -> None:
         self.own, self.judging = set(own), False
@@ -642,7 +743,7 @@ def test_what_the_result_is_judged_on_cannot_influence_the_texture(library: Libr
     target, artifacts = Liar(open_scene(spec, library=library, target=FakeTarget()).views), MemoryArtifacts()
     job = open_pipeline(spec, library=library, artifacts=artifacts, target=target)
     for phase in job.phases():
-        target.judging = phase == "judge"
+        target.judging = phase not in {"prepare", "calibrate"}
         job.run(phase, lambda _: None)
     assert artifacts.files["adversarial.zip"] == honest.files["adversarial.zip"]
     assert artifacts.result().target.a_after != honest.result().target.a_after or honest.result().target.a_after == 0

@@ -28,7 +28,8 @@ from trompe_server.attack import (
 )
 from trompe_server.attack.goal import SAFE_MARGIN
 from trompe_server.attack.objective import Objective
-from trompe_server.attack.optimiser import ROUND, OptimiserName, Pace
+from trompe_server.attack.optimiser import OPTIMISERS as METHODS
+from trompe_server.attack.optimiser import ROUND, Box, OptimiserName, Pace, Point
 from trompe_server.attack.search import RISE, SAFE_ENOUGH
 from trompe_server.classifiers import NetworkClassifier, fake_classifier, load_classifier
 from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
@@ -423,6 +424,65 @@ def test_auto_ends_at_the_best_point_it_has_seen(square: Object3D, surrogate: Su
     seen: list[Step] = []
     state = run(square, surrogate, steps=9, optimiser="auto", on_step=seen.append)
     assert mean_loss(square, surrogate, state) >= max(step.loss for step in seen) - 1e-5
+
+
+def stepped(name: OptimiserName, gradients: list[Tensor], losses: list[float], *, length: int) -> list[Point]:
+    """Where a method goes, within a budget of 0.5 around grey, along gradients of a run of ``length`` steps."""
+    points = [Point(torch.zeros(4, 3), {})]
+    box = Box(Budget(0.5, 0.01), torch.full((4, 3), 0.5))
+    for done, (gradient, loss) in enumerate(zip(gradients, losses, strict=True)):
+        points.append(METHODS[name].step(points[-1], gradient, loss, Pace(done, length), box))
+    return points
+
+
+def drawn_gradients(count: int) -> list[Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return [torch.randn(4, 3, generator=generator) for _ in range(count)]
+
+
+def test_adam_is_that_of_kingma_and_ba_along_gradients_of_one_size() -> None:
+    gradients, length = drawn_gradients(8), 8
+    points = stepped("adam", gradients, [0.0] * 8, length=length)
+    leaf = torch.zeros(4, 3, requires_grad=True)
+    theirs = torch.optim.Adam([leaf], maximize=True)
+    for done, gradient in enumerate(gradients):
+        theirs.param_groups[0]["lr"] = 0.01 * Pace(done, length).falling
+        leaf.grad = gradient * (4 / gradient.abs().sum())
+        theirs.step()
+        torch.testing.assert_close(points[done + 1].delta, leaf.detach(), atol=1e-6, rtol=1e-4)
+
+
+def test_auto_mixes_three_quarters_of_a_step_with_a_quarter_of_the_last_one() -> None:
+    first, second = drawn_gradients(2)
+    points = stepped("auto", [first, second], [0.0, 1.0], length=100)
+    one = 0.5 * first.sign()
+    torch.testing.assert_close(points[1].delta, one)
+    there = (one + 1.0 * second.sign()).clamp(-0.5, 0.5)
+    expected = (one + 0.75 * (there - one) + 0.25 * (one - 0)).clamp(-0.5, 0.5)
+    torch.testing.assert_close(points[2].delta, expected)
+
+
+RISING = [float(k) for k in range(42)]
+STUCK = [*RISING[:16], *[0.0] * 26]
+OVERTAKEN_BY_NOTHING = [*(100.0 + k for k in range(23)), *RISING[:19]]
+
+
+@pytest.mark.parametrize(
+    ("losses", "sizes"),
+    [
+        pytest.param(RISING, (1.0, 1.0), id="what rises goes on"),
+        pytest.param(STUCK, (0.5, 0.25), id="few rises"),
+        pytest.param(OVERTAKEN_BY_NOTHING, (1.0, 0.5), id="rises that come to nothing new"),
+    ],
+)
+def test_auto_halves_its_step_where_progress_stalls_and_goes_back_to_the_best(
+    losses: list[float], sizes: tuple[float, float]
+) -> None:
+    points = stepped("auto", drawn_gradients(42), losses, length=100)
+    assert [float(points[check + 1].memory["progress"][0]) for check in (22, 41)] == list(sizes)
+    best = points[losses.index(max(losses))].delta
+    assert torch.equal(points[42].memory["best"], best)
+    assert torch.equal(points[42].memory["previous"], best)
 
 
 def test_of_several_runs_the_best_one_wins(square: Object3D, surrogate: Surrogate) -> None:

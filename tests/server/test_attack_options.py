@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from jaxtyping import Float
 from numpy.typing import NDArray
+from pydantic import ValidationError
+from scores_only import Scores
 
 from trompe_server.artifacts import LocalArtifacts
 from trompe_server.attack_job import open_pipeline
@@ -90,6 +90,33 @@ def test_a_mask_of_another_size_is_refused_before_any_work(library: Library, tmp
     assert not (tmp_path / "job").exists()
 
 
+def test_masks_of_which_none_leaves_what_another_does_are_refused_before_any_work(
+    library: Library, tmp_path: Path
+) -> None:
+    mask = library.add_background(encode_png(np.full(CHAIR.textures[WOOD].shape, 255, np.uint8)), "mask.png").id
+    with pytest.raises(SpecError, match=r"leave none of the texels of \['chair_cushion'\]: paint white"):
+        attacked(library, tmp_path / "job", masks={WOOD: mask}, materials=["chair_cushion"])
+    assert not (tmp_path / "job").exists()
+    _, painted = attacked(library, tmp_path / "job", masks={WOOD: mask}, materials=["chair_wood"], steps=1)
+    assert changed(painted)[WOOD].any()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"keep": 9e-7}, r"keep=9e-07 leaves none of the 524288 texels to move: keep 2e-06 or more"),
+        ({"queries": 4}, "'tiny' gives gradients: leave them out"),
+    ],
+    ids=str,
+)
+def test_what_does_not_fit_the_object_or_the_classifier_is_refused_before_any_work(
+    library: Library, tmp_path: Path, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(SpecError, match=message):
+        attacked(library, tmp_path / "job", **options)
+    assert not (tmp_path / "job").exists()
+
+
 def test_a_target_class_is_reached_or_the_result_says_how_often(library: Library, tmp_path: Path) -> None:
     towards, _ = attacked(library, tmp_path / "towards", target_label="table", epsilon=0.3, alpha=0.1, steps=8)
     away, _ = attacked(library, tmp_path / "away", epsilon=0.3, alpha=0.1, steps=8)
@@ -144,6 +171,39 @@ def test_an_ensemble_is_attacked_for_transfer_unless_that_is_impossible_or_unwan
     assert JobSpec(object="mug", label="mug", **options).diverse is diverse
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"optimiser": "fgsm"}, r"single step: make steps 1 \(one a run\) instead of 90, or choose another"),
+        ({"optimiser": "fgsm", "steps": 3, "restarts": 1}, "make steps 2 .one a run. instead of 3"),
+        ({"steps": 3, "restarts": 3}, "too few for 3 restarts.*make steps 4 or more"),
+        ({"epsilon": 0.001}, r"0.001 is less than 1/255.*nothing could change; make it 0.004 or more"),
+        ({"epsilon": 0.0039}, "0.0039 is less than 1/255"),
+        ({"epsilon": 0.0}, "epsilon"),
+        ({"epsilon": 1.1}, "epsilon"),
+        ({"epsilon": float("nan")}, "epsilon"),
+    ],
+    ids=str,
+)
+def test_options_that_cannot_be_are_refused_before_there_is_a_job(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        JobSpec(object="mug", label="mug", **options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"optimiser": "fgsm", "steps": 3, "restarts": 2},
+        {"steps": 3, "restarts": 2},
+        {"epsilon": 1 / 255},
+        {"epsilon": 1},
+    ],
+    ids=str,
+)
+def test_options_that_just_can_be_are_accepted(options: dict[str, Any]) -> None:
+    assert JobSpec.model_validate_json(JobSpec(object="mug", label="mug", **options).model_dump_json())
+
+
 def test_the_view_constraint_is_kept_in_the_surrogate_and_told_of_the_target(library: Library, tmp_path: Path) -> None:
     free, _ = attacked(library, tmp_path / "free")
     bound, _ = attacked(library, tmp_path / "bound", epsilon_view=0.02)
@@ -151,24 +211,6 @@ def test_the_view_constraint_is_kept_in_the_surrogate_and_told_of_the_target(lib
     assert bound.max_view_change is not None
     assert bound.max_view_change < free.max_view_change
     assert free.views_beyond_epsilon is not None
-
-
-class Scores:
-    """``tiny`` as one sees it through an .onnx file: scores, no gradients."""
-
-    def __init__(self, inner: Any) -> None:
-        self.inner: Any = inner
-        self.name, self.classes = "net", inner.classes
-        self.image_size, self.n_classes = inner.image_size, inner.n_classes
-
-    def predict(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-        scores: NDArray[np.float32] = self.inner.predict(images)
-        return scores
-
-    def scores(self, images: Float[torch.Tensor, "n 3 H W"]) -> Float[torch.Tensor, "n classes"]:
-        with torch.no_grad():
-            logits: torch.Tensor = self.inner.logits(images)
-        return logits
 
 
 @pytest.fixture
@@ -224,11 +266,3 @@ def test_an_ensemble_needs_gradients(library: Library, tmp_path: Path, monkeypat
 def test_a_device_that_is_not_there_is_told_before_any_work(library: Library, tmp_path: Path) -> None:
     with pytest.raises(ClassifierError, match="'cuda:7' cannot be used here"):
         open_pipeline(SPEC, library=library, artifacts=LocalArtifacts(tmp_path), target=FakeTarget(), device="cuda:7")
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
-def test_a_whole_job_runs_on_a_graphics_card(library: Library, tmp_path: Path) -> None:
-    job = open_pipeline(SPEC, library=library, artifacts=LocalArtifacts(tmp_path), target=FakeTarget(), device="cuda")
-    for phase in job.phases():
-        job.run(phase, lambda _: None)
-    assert (tmp_path / "result.json").exists()

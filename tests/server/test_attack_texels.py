@@ -12,15 +12,18 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from trompe_server.attack import (
+    AttackState,
     Budget,
     Goal,
     attack,
     best_texels,
+    load_state,
     material_texels,
     movable,
     painted_texels,
     rank_texels,
     saliency_masks,
+    save_state,
     start,
 )
 from trompe_server.classifiers import fake_classifier
@@ -188,15 +191,16 @@ def images_of(surrogate: Surrogate, textures: dict[str, Tensor]) -> Tensor:
 def attacked(
     obj: Object3D, surrogate: Surrogate, epsilon_view: float | None, **options: Any
 ) -> tuple[dict[str, Tensor], float]:
-    """The deltas of an attack, and the largest change of its images."""
+    """The deltas of an attack, and the largest change of its images, of the textures that are saved too."""
     textures = textures_of(obj)
     budget = Budget(0.3, 0.1, epsilon_view)
     state = attack(
         start(textures), textures, surrogate, fake_classifier(), goal=Goal(LABEL), budget=budget, steps=3, **options
     )
     painted = {name: textures[name] + delta for name, delta in state.deltas.items()}
-    change = (images_of(surrogate, painted) - images_of(surrogate, textures)).abs()
-    return dict(state.deltas), float(change.max())
+    clean, saved = images_of(surrogate, textures), textures_of(budget.repaint(obj, state.deltas))
+    change = max(float((images_of(surrogate, each) - clean).abs().max()) for each in (painted, saved))
+    return dict(state.deltas), change
 
 
 @pytest.mark.parametrize("optimiser", ["pgd", "momentum", "nesterov", "adam", "auto"])
@@ -231,6 +235,22 @@ def test_the_bound_holds_for_textures_that_are_seen_from_afar(
     surrogate = diffuse_surrogate(prepare_geometry(obj, views, size=(32, 32), sampling=sampling), views)
     for epsilon_view in (0.01, 0.03):
         assert attacked(obj, surrogate, epsilon_view)[1] <= epsilon_view + 1e-5
+
+
+def test_a_bounded_run_that_was_cut_goes_on_bit_for_bit(square: Object3D, square_surrogate: Surrogate) -> None:
+    textures, budget = textures_of(square), Budget(0.3, 0.1, 0.02)
+
+    def on(state: AttackState, steps: int) -> AttackState:
+        return attack(
+            *(state, textures, square_surrogate, fake_classifier()),
+            goal=Goal(LABEL),
+            budget=budget,
+            steps=steps,
+            total_steps=4,
+        )
+
+    whole, parts = on(start(textures), 4), on(load_state(save_state(on(start(textures), 3))), 1)
+    assert all(torch.equal(whole.deltas[name], parts.deltas[name]) for name in textures)
 
 
 def test_a_bound_that_is_never_reached_changes_nothing(square: Object3D, square_surrogate: Surrogate) -> None:

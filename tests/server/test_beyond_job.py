@@ -314,6 +314,8 @@ def test_the_command_line_of_a_job_asks_for_the_same() -> None:
     assert "--attack-on light" in words
     assert "--sun azimuth -90 90 --sun intensity 0.5 2" in words
     assert "--vertex-budget 0.03" in command(VERTICES, object="chair", classifier="tiny")
+    spec = JobSpec.model_validate({**COMMON, "tau": 0.2, "saliency_scope": "each_view"})
+    assert "--tau 0.2 --saliency-scope each_view" in command(spec, object="chair", classifier="tiny")
 
 
 class Blind:
@@ -357,7 +359,7 @@ def test_vertices_are_not_moved_without_gradients(library: Library, monkeypatch:
     [
         *({"epsilon": 0.1}, {"alpha": 0.001}, {"tau": 0.1}, {"keep": 0.5}, {"materials": ["wood"]}),
         *({"masks": {"a.png": "b"}}, {"epsilon_view": 0.1}, {"loss": "dlr"}, {"optimiser": "pgd"}, {"restarts": 1}),
-        *({"queries": 2}, {"surrogate": "curve"}, {"diverse": True}),
+        *({"queries": 2}, {"surrogate": "curve"}, {"diverse": True}, {"saliency_scope": "each_view"}),
     ],
     ids=lambda option: next(iter(option)),
 )

@@ -16,6 +16,7 @@ import onnx
 import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
+from pretend_device import pretend_device
 from torch import Tensor, nn
 
 from trompe_server.classifiers import (
@@ -30,7 +31,7 @@ from trompe_server.classifiers import (
 )
 from trompe_server.classifiers.archive import read_program
 from trompe_server.classifiers.fold import BATCH_NORM, Formatted, fold_batch_norm
-from trompe_server.classifiers.onnx import load_onnx
+from trompe_server.classifiers.onnx import OnnxClassifier, load_onnx
 from trompe_server.classifiers.protocol import fit_images
 from trompe_shared.errors import ClassifierError
 
@@ -213,6 +214,24 @@ def test_images_of_another_form_are_refused(classifier: Classifier, images: np.n
         classifier.predict(images)
 
 
+class Odd:
+    """An onnxruntime session whose network says what is no number."""
+
+    def get_inputs(self) -> list[Any]:
+        return [self]
+
+    name = "image"
+
+    def run(self, _: None, images: dict[str, np.ndarray]) -> list[np.ndarray]:
+        return [np.tile(np.array([[np.nan, np.inf, -np.inf, 2.0]], np.float32), (len(images["image"]), 1))]
+
+
+def test_what_a_classifier_says_is_finite_whatever_its_network_says() -> None:
+    (logits,) = OnnxClassifier("odd", Odd(), (8, 8), 4, None).predict(np.zeros((1, 8, 8, 3), np.uint8))
+    assert np.isfinite(logits).all()
+    assert np.argsort(logits).tolist() == [2, 0, 3, 1]
+
+
 def test_resizing_averages_what_it_shrinks() -> None:
     stripes = np.zeros((1, 8, 8, 3), np.uint8)
     stripes[:, ::2] = 255
@@ -258,6 +277,23 @@ def test_an_exported_network_is_the_network_it_was(pt2: Path) -> None:
     torch.testing.assert_close(classifier.logits(images), source(images))
     gradients = [torch.autograd.grad(f(images).square().sum(), images)[0] for f in (classifier.logits, source)]
     torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["pt2", "tiny"])
+def test_a_network_on_another_device_gives_the_same_logits_and_gradients_there(
+    kind: str, pt2: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device, path = pretend_device(monkeypatch), pt2 if kind == "pt2" else kind
+    found = []
+    for name in ("cpu", device):
+        network = load_classifier(path, device=name)
+        assert isinstance(network, NetworkClassifier)
+        images = torch.linspace(0, 1, 6 * network.image_size[0] * network.image_size[1]).to(name)
+        images = images.view(2, 3, *network.image_size).requires_grad_()
+        logits = network.logits(images)
+        assert logits.device.type == name
+        found.append([logits.detach().cpu(), *(each.cpu() for each in torch.autograd.grad(logits.sum(), images))])
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 
 
 def batch_norms(graph: Any) -> int:

@@ -1,5 +1,7 @@
 """The pictures of a result."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -42,7 +44,7 @@ from trompe_server.reports.layout import (
     text_width,
 )
 from trompe_server.reports.saliency_sheet import TILE as SALIENCY_TILE
-from trompe_shared.api import Accuracy, Judgement, Result
+from trompe_shared.api import Accuracy, Judgement, Result, SaliencyScope
 
 BLUE = (40, 80, 160)
 BELOW_LEGEND = 120
@@ -195,6 +197,16 @@ def test_saliency_is_outlined_where_it_reaches_tau_and_only_there() -> None:
     side = SALIENCY_TILE // 2
     assert ys.max() - ys.min() + 1 == xs.max() - xs.min() + 1 == side
     assert outlined.sum() == 4 * (side - 1)
+
+
+def test_the_legend_says_which_views_saliency_is_compared_over() -> None:
+    maps = np.zeros((3, 32, 32), np.float32)
+    together, alone = (
+        np.array(saliency_sheet(images(3), maps, tau=0.5, scope=scope, title="t")) for scope in get_args(SaliencyScope)
+    )
+    assert (together[:BELOW_LEGEND] != alone[:BELOW_LEGEND]).any()
+    np.testing.assert_array_equal(alone[BELOW_LEGEND:], together[BELOW_LEGEND:])
+    np.testing.assert_array_equal(together, saliency_sheet(images(3), maps, tau=0.5, title="t"))
 
 
 def test_saliency_without_tau_has_no_outline() -> None:

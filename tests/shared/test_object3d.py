@@ -173,6 +173,18 @@ def test_images_of_every_mode_are_read_as_rgb(mode: str) -> None:
 # What comes back
 
 
+@pytest.mark.parametrize(("form", "mode"), [("PNG", "I;16"), ("TIFF", "I;16"), ("TIFF", "I;16B")])
+def test_greys_of_16_bits_are_scaled_to_8_not_clipped(form: str, mode: str) -> None:
+    grey = np.array([[0, 255, 256, 0x7FFF], [0x8000, 0xFE00, 0xFEFF, 0xFFFF]], np.uint16)
+    buffer = io.BytesIO()
+    big = mode.endswith("B")
+    Image.frombytes(mode, (4, 2), grey.astype(">u2" if big else "<u2").tobytes()).save(buffer, form)
+    read = decode_rgb(buffer.getvalue(), "grey.png")
+    assert read.dtype == np.uint8
+    assert (read == (grey >> 8)[..., None]).all()
+    assert read.shape == (2, 4, 3)
+
+
 def test_every_file_comes_back_byte_for_byte() -> None:
     again = load_object(load_object(zipped(FILES)).to_zip())
     assert dict(again.files) == FILES

@@ -20,6 +20,7 @@ from trompe_shared.api import (
     Needs,
     Optimiser,
     Priority,
+    SaliencyScope,
     SunRanges,
     SurrogateModel,
     ViewRanges,
@@ -96,6 +97,12 @@ GRID: Final = ("azimuths", "elevations")
     help="Largest change of a pixel of a view, 0..1 (the paper's view constraint). Default: no limit.",
 )
 @_change("--tau", type=float, metavar="T", help="Saliency threshold, 0..1. Default: attack all texels.")
+@_change(
+    "--saliency-scope",
+    type=click.Choice(get_args(SaliencyScope)),
+    help="What the threshold is a share of: the largest saliency of all views, or of each view, so that all of them "
+    f"give pixels. Default: {_default('saliency_scope')}.",
+)
 @_change("--keep", type=float, metavar="SHARE", help="Attack this share of the texels, the best ones. Default: all.")
 @_change(
     "--material", "materials", multiple=True, metavar="NAME", help="Attack this material only. Default: all of them. *"

@@ -3,7 +3,16 @@
 import re
 from typing import TypeVar
 
-from trompe_server.checks import check_diverse, check_mask_size, check_saliency, check_same_classes, check_vertices
+from trompe_server.checks import (
+    check_diverse,
+    check_goal,
+    check_keep,
+    check_mask_size,
+    check_queries,
+    check_saliency,
+    check_same_classes,
+    check_vertices,
+)
 from trompe_server.labels import resolve_label
 from trompe_server.library import Library
 from trompe_shared.api import ClassifierInfo, JobSpec, ObjectInfo
@@ -50,15 +59,13 @@ def _check_goal(spec: JobSpec, classifier: ClassifierInfo) -> None:
             f"The target class {spec.target_label!r} is the object's own class: choose another one, or none to have "
             "the object taken for anything else."
         )
-    if spec.top_k >= classifier.n_classes:
-        raise SpecError(f"top_k must be less than the {classifier.n_classes} classes there are, got {spec.top_k}.")
+    check_goal(spec.loss, classifier.n_classes, top_k=spec.top_k, targeted=spec.target_label is not None)
 
 
 def _check_gradients(spec: JobSpec, classifier: ClassifierInfo) -> None:
     """Raise ``SpecError`` where the attack needs gradients that the classifier does not give."""
     if classifier.white_box:
-        if spec.queries is not None:
-            raise SpecError(f"queries are for classifiers that only give scores; {classifier.name!r} gives gradients.")
+        check_queries(spec, classifier.name)
         return
     check_vertices(spec, classifier.name)
     if spec.queries is None and spec.attack_on == "texture":
@@ -74,6 +81,7 @@ def _check_materials(spec: JobSpec, obj: ObjectInfo) -> None:
     unknown = sorted(set(spec.materials) - set(obj.materials))
     if unknown:
         raise SpecError(f"There is no material {unknown}; {obj.name!r} has {obj.materials}.")
+    check_keep(spec, n_texels=sum(height * width for height, width in obj.textures.values()))
     unknown = sorted(set(spec.masks) - set(obj.textures))
     if unknown:
         raise SpecError(f"There is no texture {unknown} to mask; {obj.name!r} has {sorted(obj.textures)}.")

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from trompe_server.checks import check_goal
+from trompe_server.classifiers.protocol import finite
 from trompe_shared.errors import SpecError
 
 __all__ = ["SAFE_MARGIN", "Goal", "Loss"]
@@ -17,9 +19,6 @@ Loss = Literal["margin", "cross_entropy", "dlr"]
 
 SAFE_MARGIN: Final = 1.0
 """A view whose margin is this large is safely won: the margin loss spends no more gradient on it."""
-
-HUGE: Final = 1e30
-"""What stands for an infinite logit."""
 
 EQUAL: Final = 1e-3
 """Logits that differ by less are equal to the DLR loss, which divides by a difference of logits."""
@@ -67,15 +66,11 @@ class Goal:
         for name, index in (("label", self.label), ("target class", self.target)):
             if index is not None and not 0 <= index < n_classes:
                 raise SpecError(f"The {name} {index} is none of the classifier's {n_classes} classes (0..n-1).")
-        if self.top_k >= n_classes:
-            raise SpecError(f"top_k must be less than the {n_classes} classes there are, got {self.top_k}.")
-        least = self._ranks[-1] + 1
-        if self.loss == "dlr" and n_classes < least:
-            raise SpecError(f"The dlr loss needs {least} classes for this goal, there are {n_classes}: choose margin.")
+        check_goal(self.loss, n_classes, top_k=self.top_k, targeted=self.target is not None)
 
     def reached(self, logits: Logits) -> Bool[Tensor, " views"]:
         """Where the classifier is fooled: it says ``target``, or ``label`` is not among its ``top_k`` best."""
-        logits = _finite(logits)
+        logits = finite(logits)
         if self.target is not None:
             return logits.argmax(1) == self.target
         if self.top_k == 1:
@@ -87,14 +82,14 @@ class Goal:
 
         The k-th best other logit minus the true one, or the target's minus the best other one.
         """
-        return self._margins(_finite(logits))
+        return self._margins(finite(logits))
 
     def losses(self, logits: Logits, *, clamped: bool = True) -> PerView:
         """The loss of each view, to be maximised; finite everywhere, and so is its gradient.
 
         ``clamped=False`` leaves out the margin's clamp, so that a view that is safely won has a gradient too.
         """
-        losses = _LOSSES[self.loss](self, _finite(logits))
+        losses = _LOSSES[self.loss](self, finite(logits))
         return losses.clamp(max=self.safe) if clamped and self.loss == "margin" else losses
 
     def settled(self, logits: Logits) -> Bool[Tensor, " views"]:
@@ -131,8 +126,3 @@ _LOSSES: Final[Mapping[str, Callable[[Goal, Logits], PerView]]] = {
     "cross_entropy": Goal._cross_entropy,
     "dlr": Goal._dlr,
 }
-
-
-def _finite(logits: Logits) -> Logits:
-    """Infinite logits as huge ones, undefined ones as 0; no gradient flows through either."""
-    return logits.nan_to_num(nan=0.0, posinf=HUGE, neginf=-HUGE)

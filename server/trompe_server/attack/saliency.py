@@ -11,26 +11,39 @@ from torch import Tensor
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import members_of
 from trompe_server.classifiers import WhiteBoxClassifier
+from trompe_shared.api import SaliencyScope
 from trompe_shared.errors import SpecError
 
-__all__ = ["BATCH", "image_gradients", "saliency", "saliency_masks"]
+__all__ = ["BATCH", "image_gradients", "rescale_each_view", "saliency", "saliency_masks"]
 
 BATCH = 10
 
 
 def saliency(
-    images: NDArray[np.uint8], classifier: WhiteBoxClassifier | Sequence[WhiteBoxClassifier], *, goal: Goal
+    images: NDArray[np.uint8],
+    classifier: WhiteBoxClassifier | Sequence[WhiteBoxClassifier],
+    *,
+    goal: Goal,
+    scope: SaliencyScope = "all_views",
 ) -> Float[Tensor, "views H W"]:
     """|dL/dI| of the target's images (views, H, W, 3), mean over channels, rescaled to [0, 1] over all views (the
-    paper's equation 5).
+    paper's equation 5) or, with ``scope`` each_view, each view once more by itself.
 
     L is the goal's loss, the margin without its clamp, so that a view that is fooled already has a saliency too; of
     several classifiers their mean. Raises ``SpecError`` for a goal that does not fit the classifier.
     """
-    maps = [gradient.abs().mean(3) for gradient in _gradients(images, members_of(classifier, goal), goal)]
-    everything = torch.cat(maps)
+    everything = torch.cat(
+        [gradient.abs().mean(3) for gradient in _gradients(images, members_of(classifier, goal), goal)]
+    )
     low, high = everything.min(), everything.max()
-    return (everything - low) / (high - low).clamp(min=1e-30)
+    maps = (everything - low) / (high - low).clamp(min=1e-30)
+    return maps if scope == "all_views" else rescale_each_view(maps)
+
+
+def rescale_each_view(maps: Float[Tensor, "views H W"]) -> Float[Tensor, "views H W"]:
+    """Saliency, in [0, 1], as a share of the view's own largest; a view that has none stays as it is, all zero."""
+    largest = maps.amax((1, 2), keepdim=True)
+    return maps / torch.where(largest > 0, largest, 1)
 
 
 def image_gradients(

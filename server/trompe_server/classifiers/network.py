@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from trompe_server.classifiers.protocol import Images, Logits, fit_images, in_batches
+from trompe_server.classifiers.protocol import Images, Logits, finite, fit_images, in_batches
 
 __all__ = ["NetworkClassifier"]
 
@@ -41,8 +41,8 @@ class NetworkClassifier:
 
     @torch.no_grad()
     def predict(self, images: Images) -> Logits:
-        """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size."""
+        """Logits (N, n_classes), all finite, of uint8 images (N, H, W, 3) of any size."""
         chunks = [np.zeros((0, self.n_classes), np.float32)]
         for batch in in_batches(images, BATCH):
-            chunks.append(self.logits(fit_images(batch, self.image_size)).numpy())
+            chunks.append(finite(self.logits(fit_images(batch, self.image_size))).numpy())
         return np.concatenate(chunks)

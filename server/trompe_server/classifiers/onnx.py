@@ -15,6 +15,7 @@ from trompe_server.classifiers.protocol import (
     Images,
     Logits,
     check_classes,
+    finite,
     fit_images,
     in_batches,
     refuse_probabilities,
@@ -39,10 +40,10 @@ class OnnxClassifier:
     classes: tuple[str, ...] | None = None
 
     def predict(self, images: Images) -> Logits:
-        """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size."""
+        """Logits (N, n_classes), all finite, of uint8 images (N, H, W, 3) of any size."""
         chunks = [np.zeros((0, self.n_classes), np.float32)]
         for batch in in_batches(images, self.fixed_batch or BATCH):
-            chunks.append(self.scores(fit_images(batch, self.image_size)).numpy())
+            chunks.append(finite(self.scores(fit_images(batch, self.image_size))).numpy())
         return np.concatenate(chunks)
 
     def scores(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:

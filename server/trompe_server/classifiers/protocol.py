@@ -1,7 +1,7 @@
 """What the rest of the server asks of a classifier, and the one way images become its input."""
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -18,12 +18,16 @@ __all__ = [
     "WhiteBoxClassifier",
     "Wrapper",
     "check_classes",
+    "finite",
     "fit_images",
     "in_batches",
     "innermost",
     "refuse_probabilities",
     "resize",
 ]
+
+HUGE: Final = 1e30
+"""What stands for an infinite logit."""
 
 Images = NDArray[np.uint8]
 Logits = NDArray[np.float32]
@@ -54,7 +58,7 @@ class Classifier(Protocol):
         ...
 
     def predict(self, images: Images) -> Logits:
-        """Logits (N, n_classes) of sRGB images (N, H, W, 3), row 0 on top; other sizes are resized."""
+        """Logits (N, n_classes), all finite, of sRGB images (N, H, W, 3), row 0 on top; other sizes are resized."""
         ...
 
 
@@ -97,6 +101,12 @@ def in_batches(images: Images, count: int) -> Iterator[Images]:
             "pass (N, H, W, 3) uint8, sRGB."
         )
     return (images[start : start + count] for start in range(0, len(images), count))
+
+
+def finite(logits: Float[Tensor, "n classes"]) -> Float[Tensor, "n classes"]:
+    """Infinite logits as huge ones, undefined ones as 0: what can be compared and written. No gradient flows through
+    either."""
+    return logits.nan_to_num(nan=0.0, posinf=HUGE, neginf=-HUGE)
 
 
 def check_classes(classes: Sequence[str] | None, n_classes: int, file: str) -> tuple[str, ...] | None:

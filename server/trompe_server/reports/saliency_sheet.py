@@ -9,6 +9,7 @@ from PIL import Image
 
 from trompe_server.reports.heat import OUTLINE, heat_legend, heat_over
 from trompe_server.reports.layout import Images, captioned, sheet, tile
+from trompe_shared.api import SaliencyScope
 
 __all__ = ["saliency_sheet"]
 
@@ -16,11 +17,20 @@ TILE: Final = 336
 
 
 def saliency_sheet(
-    images: Images, saliency: Float[np.ndarray, "n H W"], *, tau: float | None, title: str, columns: int = 3
+    images: Images,
+    saliency: Float[np.ndarray, "n H W"],
+    *,
+    tau: float | None,
+    title: str,
+    scope: SaliencyScope = "all_views",
+    columns: int = 3,
 ) -> Image.Image:
-    """Target images (N, H, W, 3) with their saliency in [0, 1] as heat, the pixels from ``tau`` up outlined."""
+    """Target images (N, H, W, 3) with their saliency in [0, 1] as heat, the pixels from ``tau`` up outlined.
+
+    ``scope``: of which views the largest saliency is 1.
+    """
     cards = [_card(image, heat, tau) for image, heat in zip(images, saliency, strict=True)]
-    legend = heat_legend("saliency, 1 is the largest of all views", tau=tau)
+    legend = heat_legend(f"saliency, 1 is the largest of {scope.replace('_', ' ')}", tau=tau)
     return sheet(cards, columns=columns, title=title, legend=legend)
 
 

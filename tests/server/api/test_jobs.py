@@ -79,6 +79,9 @@ def test_a_light_is_looked_for_with_a_classifier_without_gradients(stocked):
         pytest.param({"target_label": "vaze"}, 422, "did you mean 'vase'?", id="target"),
         pytest.param({"target_label": "mug"}, 422, "is the object's own class", id="target is the label"),
         pytest.param({"top_k": 3}, 422, "less than the 3 classes", id="top k"),
+        pytest.param({"loss": "dlr", "top_k": 2}, 422, "dlr loss needs 4 classes", id="top k of the ratio"),
+        pytest.param({"loss": "dlr", "target_label": 1}, 422, "dlr loss needs 4 classes", id="target of the ratio"),
+        pytest.param({"keep": 0.001}, 422, "leaves none of the 64 texels", id="no texel kept"),
         pytest.param({"queries": 10}, 422, "'net' gives gradients", id="queries of a white box"),
         pytest.param({"classifier": "judge"}, 422, "gives no gradients", id="black box"),
         pytest.param({"classifier": "judge", "queries": 4, "tau": 0.1}, 422, "need saliency", id="its tau"),
@@ -86,6 +89,7 @@ def test_a_light_is_looked_for_with_a_classifier_without_gradients(stocked):
         pytest.param({"classifier": "judge", "queries": 4, "diverse": True}, 422, "diverse needs", id="its places"),
         pytest.param({"classifier": "judge", "attack_on": "vertices"}, 422, "along gradients", id="its vertices"),
         pytest.param({"attack_on": "light", "tau": 0.1}, 422, "tau belong to another kind", id="texels of a light"),
+        pytest.param({"saliency_scope": "each_view"}, 422, "there is no tau", id="scope of no threshold"),
         pytest.param({"ensemble": ["judge"]}, 422, "not in the ensemble", id="black box in the ensemble"),
     ],
 )
