@@ -40,6 +40,7 @@ from trompe_shared.api import (
     Result,
     WorkerInfo,
 )
+from trompe_shared.faults import faults_of
 
 T = TypeVar("T")
 
@@ -238,7 +239,7 @@ def _reader(schema: Any) -> Callable[[bytes], Any]:
             return adapter.validate_json(body)
         except ValidationError as error:
             raise ContractError(
-                f"The server's answer is not what this client expects ({error.errors()[0]['msg']}). "
+                f"The server's answer is not what this client expects ({next(faults_of(error))}). "
                 "Is it a Trompe server? Install the same version of trompe on both sides."
             ) from error
 

@@ -25,6 +25,7 @@ from trompe_shared.api import (
     ViewRanges,
 )
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
+from trompe_shared.faults import faults_of
 
 __all__ = [
     "AttackOptions",
@@ -166,8 +167,8 @@ class AttackPlan:
         try:
             return JobRequest.model_validate(attacked | others | dict(self.options))
         except ValidationError as error:
-            wrong = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" if e["loc"] else e["msg"] for e in error.errors()]
-            raise SpecError("The attack's options are not right. " + "; ".join(wrong) + ".") from error
+            wrong = "; ".join(map(str, faults_of(error)))
+            raise SpecError(f"The attack's options are not right: {wrong}.") from error
 
 
 def plan_attack(

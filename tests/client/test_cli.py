@@ -280,28 +280,30 @@ def test_a_failed_job_exits_with_6_and_its_reason(server, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "words",
+    ("words", "why"),
     [
-        pytest.param(["--epsilon", "7"], id="out of range"),
-        pytest.param(["--surrogate", "magic"], id="no such model"),
-        pytest.param(["--elevation", "50", "0"], id="range upside down"),
-        pytest.param(["--bogus"], id="no such option"),
-        pytest.param(["--mask", "mask.png"], id="mask of no texture"),
-        pytest.param(["--mask", "a.png=missing.png"], id="mask without a file"),
-        pytest.param(["--range", "elevation", "0", "9"], id="no such range"),
-        pytest.param(["--grid", "--pool", "9"], id="grid and pool"),
-        pytest.param(["--pool", "9", "--azimuths", "4"], id="size of no grid"),
-        pytest.param(["--target", "vase", "--top-k", "5"], id="two goals"),
-        pytest.param(["--queries", "7"], id="odd queries"),
-        pytest.param(["--optimiser", "fgsm"], id="many steps of a single one"),
-        pytest.param(["--restarts", "9", "--steps", "9"], id="more runs than steps"),
-        pytest.param(["--epsilon", "0.001"], id="less than a level"),
+        pytest.param(["--epsilon", "7"], "epsilon: Input should be less than or equal to 1", id="out of range"),
+        pytest.param(["--surrogate", "magic"], "'magic' is not one of 'auto', 'diffuse'", id="no such model"),
+        pytest.param(["--elevation", "50", "0"], "not right: elevation must be a range within", id="range upside down"),
+        pytest.param(["--bogus"], "No such option '--bogus'", id="no such option"),
+        pytest.param(["--mask", "mask.png"], "should be a texture and a picture of its size", id="mask of no texture"),
+        pytest.param(["--mask", "a.png=missing.png"], "no mask picture 'missing.png'", id="mask without a file"),
+        pytest.param(["--range", "elevation", "0", "9"], "'elevation' is not one of 'azimuth'", id="no such range"),
+        pytest.param(["--grid", "--pool", "9"], "choose one", id="grid and pool"),
+        pytest.param(["--pool", "9", "--azimuths", "4"], "add --grid", id="size of no grid"),
+        pytest.param(["--target", "vase", "--top-k", "5"], "top_k is about leaving the best classes", id="two goals"),
+        pytest.param(["--queries", "7"], "make it even", id="odd queries"),
+        pytest.param(["--optimiser", "fgsm"], "make steps 1 (one a run)", id="many steps of a single one"),
+        pytest.param(["--restarts", "9", "--steps", "9"], "make steps 10 or more", id="more runs than steps"),
+        pytest.param(["--epsilon", "0.001"], "make it 0.004 or more", id="less than a level"),
     ],
 )
-def test_wrong_usage_exits_with_2_before_any_server_is_asked(words, tmp_path):
+def test_wrong_usage_exits_with_2_and_why_before_any_server_is_asked(words, why, tmp_path):
     done = trompe("attack", "mug", "--label", 0, "--server", "http://127.0.0.1:9", "--out", tmp_path, *words)
     assert done.exit_code == 2
     assert "Usage:" in done.stderr
+    assert why in done.stderr
+    assert "Value error" not in done.stderr
 
 
 def test_without_a_server_the_remedy_is_named_in_one_paragraph():

@@ -163,11 +163,20 @@ def test_a_triangle_without_area_still_has_unit_normals() -> None:
     np.testing.assert_allclose(np.linalg.norm(normals, axis=2), 1, atol=1e-6)
 
 
-@pytest.mark.parametrize("mode", ["L", "LA", "P", "RGBA", "1"])
+@pytest.mark.parametrize("mode", ["L", "LA", "P", "RGB", "RGBA", "1"])
 def test_images_of_every_mode_are_read_as_rgb(mode: str) -> None:
-    decoded = decode_rgb(encode_png(Image.fromarray(PAINT).convert(mode)), "paint.png")
-    assert decoded.shape == (4, 6, 3)
+    """Transparent pixels keep the colour that they have beneath."""
+    colours = np.array([[[0, 0, 0], [255, 255, 255], [90, 90, 90]], [[200, 10, 30], [10, 200, 30], [10, 30, 200]]])
+    if mode in {"L", "LA"}:
+        colours = colours[:1]
+    if mode == "1":
+        colours = colours[:1, :2]
+    picture = Image.fromarray(colours.astype(np.uint8)).convert(mode, palette=Image.Palette.ADAPTIVE)
+    if "A" in mode:
+        picture.putalpha(0)
+    decoded = decode_rgb(encode_png(picture), "paint.png")
     assert decoded.dtype == np.uint8
+    np.testing.assert_array_equal(decoded, colours)
 
 
 # What comes back

@@ -23,6 +23,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from trompe_shared.api import JobRequest
 from trompe_shared.errors import SpecError
+from trompe_shared.faults import Fault, faults_of
 from trompe_shared.presets import PRESETS
 
 __all__ = ["AssetsFolder", "Experiment", "expanded", "experiment_file", "load_experiment", "shipped_experiments"]
@@ -152,7 +153,7 @@ def load_experiment(source: str | Path) -> Experiment:
     try:
         return Experiment.model_validate({**read, "folder": path.parent.absolute()})
     except ValidationError as error:
-        raise SpecError(f"{str(path)!r}: " + "; ".join(_told(each) for each in error.errors())) from error
+        raise SpecError(f"{str(path)!r}: " + "; ".join(map(_told, faults_of(error)))) from error
 
 
 def expanded(text: str) -> str:
@@ -163,10 +164,8 @@ def expanded(text: str) -> str:
     return os.path.expandvars(text)
 
 
-def _told(error: Any) -> str:
-    """One error of pydantic's in words: where and what."""
-    place = ".".join(str(step) for step in error["loc"] if not str(step).startswith(("function-", "dict[", "literal[")))
-    if error["type"] == "extra_forbidden":
+def _told(fault: Fault) -> str:
+    if fault.kind == "extra_forbidden":
         known = [name for name in Experiment.model_fields if name != "folder"]
-        return f"there is no {place!r}; there are {', '.join(known)}"
-    return f"{place}: {error['msg'].removeprefix('Value error, ')}"
+        return f"there is no {fault.place!r}; there are {', '.join(known)}"
+    return str(fault)

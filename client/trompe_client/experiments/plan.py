@@ -21,6 +21,7 @@ from trompe_shared.api import JobRequest
 from trompe_shared.asset_objects import asset_objects
 from trompe_shared.errors import ObjectError, SpecError
 from trompe_shared.experiment_table import RowId, job_key
+from trompe_shared.faults import faults_of
 from trompe_shared.presets import PRESETS
 from trompe_shared.shipped import shipped_objects
 
@@ -138,9 +139,7 @@ def _row(place: RowId, name: str, fields: Fields, files: "_Files") -> Row:
     try:
         request = JobRequest.model_validate({"priority": "sweep"} | named)
     except ValidationError as error:
-        wrong = "; ".join(
-            f"{'.'.join(map(str, e['loc']))}: {e['msg']}" if e["loc"] else e["msg"] for e in error.errors()
-        )
+        wrong = "; ".join(map(str, faults_of(error)))
         raise SpecError(f"The job {name}, {place.configuration or 'base'}, cannot be: {wrong}.") from error
     key = job_key(place.experiment, request.spec())
     return Row(place.model_copy(update={"key": key}), name, request, uploads)

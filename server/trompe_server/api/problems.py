@@ -3,7 +3,6 @@
 import errno
 import logging
 import sqlite3
-from collections.abc import Sequence
 from http import HTTPStatus
 from typing import Any, Final
 
@@ -17,6 +16,7 @@ from trompe_server.database import DatabaseDownError
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_shared.api import Problem
 from trompe_shared.errors import TrompeError
+from trompe_shared.faults import faults_of
 
 __all__ = ["PROBLEMS", "REQUEST_ID", "answer_with_problems", "failure_response", "problem_response"]
 
@@ -91,7 +91,7 @@ async def _trompe_error(request: Request, error: Exception) -> JSONResponse:
 
 async def _validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    errors = [{"field": _field(each["loc"]), "message": each["msg"]} for each in error.errors()]
+    errors = [{"field": _field(fault.place), "message": fault.message} for fault in faults_of(error)]
     detail = "; ".join(f"{each['field']}: {each['message']}" for each in errors)
     return problem_response(request, 422, code="validation", detail=detail, errors=errors)
 
@@ -145,7 +145,7 @@ def _is_disk_full(error: BaseException | None) -> bool:
     )
 
 
-def _field(location: Sequence[int | str]) -> str:
-    """Name of a field without the part of the request it came in: ("body", "epsilon") -> "epsilon"."""
-    inner = location[1:] if location and location[0] in {"body", "query", "path", "header"} else location
-    return ".".join(map(str, inner)) or "body"
+def _field(place: str) -> str:
+    """Name of a field without the part of the request it came in: body.epsilon -> epsilon."""
+    part, _, inner = place.partition(".")
+    return (inner if part in {"body", "query", "path", "header"} else place) or "body"

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from trompe_server.formats.gltf_schema import READ_EXTENSIONS, Document
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
+from trompe_shared.faults import faults_of
 
 __all__ = ["Container", "at", "open_container", "split_glb"]
 
@@ -139,9 +140,8 @@ def _document(text: bytes) -> Document:
     try:
         document = Document.model_validate_json(text.removeprefix(b"\xef\xbb\xbf"))
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        where = ".".join(map(str, first["loc"])) or "the JSON"
-        raise ObjectError(f"The glTF is not valid at {where}: {first['msg']}.") from error
+        first = next(faults_of(error))
+        raise ObjectError(f"The glTF is not valid at {first.place or 'the JSON'}: {first.message}.") from error
     if not document.asset.version.startswith("2."):
         raise ObjectError(f"The glTF has version {document.asset.version[:20]!r}; export it as glTF 2.0.")
     unread = [name for name in document.extensions_required if not name.startswith(READ_EXTENSIONS)]
