@@ -76,10 +76,10 @@ def written(folder: Path, **file: Any) -> Path:
 
 @pytest.fixture
 def assets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder like that of the paper's objects: two objects and three classifiers."""
+    """A folder like that of the paper's objects: some of its objects and three classifiers."""
     folder = tmp_path / "assets"
     table = {}
-    for number, name in enumerate(("candle", "pot")):
+    for number, name in enumerate(("candle", "pot", "plunger", "table_living_room")):
         (folder / "objects" / name).mkdir(parents=True)
         (folder / "objects" / name / f"{name}.obj").write_text(f"o {name}")
         row = {"imagenet_class": 470 + number, "distance": 0.5, "elevation_range": [-10, 40], "background": "black"}
@@ -232,7 +232,7 @@ def test_files_are_named_by_their_bytes_and_then_by_what_the_server_called_them(
     assert stored.labels == {"experiment": "small"}
 
 
-@pytest.mark.parametrize("name", ["paper", "quick", "speed_accuracy", "stability"])
+@pytest.mark.parametrize("name", ["paper", "quick", "speed_accuracy", "speed_accuracy_real", "stability"])
 def test_what_comes_with_trompe_can_be_planned(name: str, assets: Path) -> None:
     assert name in shipped_experiments()
     experiment = load_experiment(name)
@@ -271,7 +271,7 @@ def test_a_job_that_contradicts_itself_is_told_before_anything_is_asked() -> Non
 
 
 def test_what_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(SpecError, match="one of paper, quick, speed_accuracy, stability"):
+    with pytest.raises(SpecError, match="one of paper, quick, speed_accuracy, speed_accuracy_real, stability"):
         load_experiment("nothing")
     (tmp_path / "bad.yaml").write_text("name: [")
     with pytest.raises(SpecError, match="is not YAML"):
@@ -287,7 +287,7 @@ def test_what_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_unknown_objects_of_the_assets_are_told(assets: Path) -> None:
-    with pytest.raises(ObjectError, match="has no mug; there are candle, pot"):
+    with pytest.raises(ObjectError, match="has no mug; there are candle, pot, plunger, table_living_room"):
         planned(objects={"assets": "$TROMPE_ASSETS", "only": ["mug"]})
     (assets / "objects" / "objects.json").unlink()
     with pytest.raises(ObjectError, match=r"must hold an objects\.json"):

@@ -389,6 +389,7 @@ def test_the_shipped_files_are_listed() -> None:
         "paper",
         "quick",
         "speed_accuracy",
+        "speed_accuracy_real",
         "stability",
     ]
 
