@@ -125,6 +125,49 @@ def test_with_masks_only_texels_that_masked_pixels_read_move(square: Object3D, s
     assert moved.sum() < (run(square, surrogate).deltas["m0.png"] != 0).any(dim=2).sum()
 
 
+class Askew(torch.nn.Module):
+    """Says class 1 the more, the brighter a small part of the image is, and the darker all the rest."""
+
+    def __init__(self, rows: slice, columns: slice) -> None:
+        super().__init__()
+        weights = torch.full((1, 1, *SIZE), -0.003)
+        weights[..., rows, columns] = 0.001
+        self.weights = torch.nn.Parameter(weights)
+
+    def forward(self, images: Tensor) -> Tensor:
+        said = (images * self.weights).sum((1, 2, 3))
+        return torch.stack([torch.zeros_like(said), said], 1)
+
+
+@pytest.mark.parametrize("restarts", [0, 1])
+def test_an_attack_through_masks_never_ends_below_the_unpainted_object(
+    square: Object3D, surrogate: Surrogate, restarts: int
+) -> None:
+    """The pixels that are let through pull their texels up; the other views, that see them too, would lose by it."""
+    rows, columns = slice(12, 18), slice(20, 26)
+    masks = torch.zeros(surrogate.n_views, *SIZE, dtype=torch.bool)
+    masks[0, rows, columns] = True
+    classifier, textures, seen = NetworkClassifier("askew", Askew(rows, columns), SIZE, 2), textures_of(square), []
+    state = attack(
+        start(textures),
+        textures,
+        surrogate,
+        classifier,
+        goal=Goal(0),
+        budget=Budget(0.06, 0.02),
+        steps=6,
+        restarts=restarts,
+        masks=masks,
+        on_step=seen.append,
+    )
+    objective = Objective(textures, surrogate, (classifier,), Goal(0), None)
+    unpainted = objective.loss(torch.zeros_like(objective.source))
+    assert min(step.loss for step in seen) < unpainted - 1e-4
+    assert objective.loss(objective.join(state.deltas)) >= unpainted
+    compared = 2 + restarts
+    assert seen[-1].evaluations == (6 + compared) * surrogate.n_views
+
+
 def test_masks_that_let_nothing_through_are_refused(square: Object3D, surrogate: Surrogate) -> None:
     masks = torch.zeros(surrogate.n_views, *SIZE, dtype=torch.bool)
     with pytest.raises(SpecError, match="Lower tau"):

@@ -2,7 +2,8 @@
 
 A run begins at the unpainted textures or at random, and takes its share of the steps. Of several runs, and of a method
 that goes back and forth, the change with the highest loss over all of the attack's own views in the surrogate wins;
-nothing else is looked at.
+nothing else is looked at. Through masks a run may even lead downhill, for texels behind them are seen by other pixels
+too: there no change at all is among those that are compared.
 
 The margin from which a view counts as safely won is the goal's at first. It is small by default, so that the gradient
 is that of the views still to be won. It rises with each step that finds nearly all of its views fooled, for what is won
@@ -186,6 +187,8 @@ class Search:
     def _ended(self, point: Point, step: int) -> Point:
         """A run is over: keep the better of what it found and what was found before."""
         found = [point.delta, point.memory["best"]] if "best" in point.memory else [point.delta]
+        if self.objective.masks is not None and BEST not in point.memory:
+            found.append(torch.zeros_like(point.delta))
         if len(found) == 1 and not self.schedule.restarts:
             return point
         losses = [self.objective.loss(delta) for delta in found]
