@@ -1,5 +1,6 @@
 """The HTTP contract: what client and server send each other. Needs pydantic alone."""
 
+import math
 from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Any, Final, Literal
@@ -41,6 +42,7 @@ __all__ = [
     "ViewPrediction",
     "ViewRanges",
     "WorkerInfo",
+    "levels_within",
 ]
 
 AttackOn = Literal["texture", "light", "vertices"]
@@ -184,8 +186,13 @@ _OPTIONS_OF: Final[dict[str, tuple[str, ...]]] = {
 """Options of a job that mean something for one kind of attack alone."""
 
 
+def levels_within(epsilon: float) -> int:
+    """The largest change of an 8-bit channel that is within a budget."""
+    return math.floor(epsilon * 255 + 1e-9)
+
+
 def _worth_saving(epsilon: float) -> float:
-    if epsilon * 255 + 1e-9 < 1:
+    if levels_within(epsilon) < 1:
         raise ValueError(
             f"{epsilon:g} is less than 1/255 (0.0039216), one level of an 8-bit texture, so that nothing could change; "
             "make it 0.004 or more"

@@ -11,25 +11,13 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from documentation import DOCS, blocks
 
 import trompe_client
 from trompe_client._embedded import embedded_server
 from trompe_client.cli import main
 from trompe_client.cli.exits import EXITS
 from trompe_client.cli.group import OWN
-
-DOCS = Path(__file__).parents[2] / "docs"
-
-
-def blocks(page: str, language: str) -> list[tuple[str, str]]:
-    """(heading, code) of the blocks of a page that are in ``language``."""
-    heading, found = "", []
-    for match in re.finditer(r"^#+ ([^\n]+)$|^```(\w+)\n(.*?)^```", (DOCS / page).read_text(), re.M | re.S):
-        heading = match[1] or heading
-        if match[2] == language:
-            found.append((heading, match[3]))
-    return found
-
 
 QUICKSTART = {heading: code for language in ("python", "sh") for heading, code in blocks("quickstart.md", language)}
 
@@ -127,7 +115,7 @@ def test_the_page_on_the_sdk_names_every_error():
     assert {name for name in errors if f"`{name}`" not in text} <= bases
 
 
-@pytest.mark.parametrize("page", ["quickstart.md", "sdk.md", "cli.md"])
+@pytest.mark.parametrize("page", ["quickstart.md", "sdk.md", "cli.md", "library.md"])
 def test_links_lead_somewhere(page):
     links = re.findall(r"\]\(([^)#:]+)\)", (DOCS / page).read_text())
     assert [link for link in links if not (DOCS / link).exists()] == []

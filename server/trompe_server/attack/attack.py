@@ -8,6 +8,8 @@ It needs no server. With an object, views of it and a classifier that gives grad
     state = attack(start(textures), textures, surrogate, classifier, goal=Goal(label), budget=budget, steps=20)
     painted = budget.repaint(obj, state.deltas)
     Path("adversarial.zip").write_bytes(painted.to_zip())
+
+The whole of it, with a target: docs/library.md.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,6 +1,5 @@
 """How far a texture may move: an L-infinity ball around the original, inside the colours that exist."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -8,6 +7,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from trompe_shared.api import levels_within
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D
 
@@ -38,7 +38,7 @@ class Budget:
     @property
     def levels(self) -> int:
         """The largest change of an 8-bit channel."""
-        return math.floor(self.epsilon * 255 + 1e-9)
+        return levels_within(self.epsilon)
 
     def project(self, delta: Float[Tensor, "*texels 3"], texture: Float[Tensor, "*texels 3"]) -> Tensor:
         """The nearest change that keeps ``|delta| <= epsilon`` and ``0 <= texture + delta <= 1``."""

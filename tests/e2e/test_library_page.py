@@ -1,0 +1,36 @@
+"""The page on use without a server is true: its code runs, on a real renderer, and does what it says."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from documentation import blocks
+
+from trompe_shared.object3d import load_object
+from trompe_shared.shipped import shipped_objects
+
+
+def test_the_page_runs_from_its_beginning_to_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for heading, code in blocks("library.md", "python"):
+        exec(compile(code, f"library.md, {heading}", "exec"), names)
+    said = capsys.readouterr().out
+
+    recognised = re.search(r"recognised in (\d+)% before, in (\d+)% after", said)
+    assert recognised is not None, said
+    before, after = map(int, recognised.groups())
+    assert before >= 50
+    assert after <= before / 3
+    clean, painted = load_object(shipped_objects()["mug"].path), load_object(tmp_path / "adversarial.zip")
+    change = max(np.abs(painted.textures[name].astype(int) - texture).max() for name, texture in clean.textures.items())
+    assert 0 < change <= 0.1 * 255
+
+    texels = re.search(r"(\d+) texels may move", said)
+    assert texels is not None, said
+    assert 0 < int(texels[1]) <= 0.05 * sum(texture[..., 0].size for texture in clean.textures.values()) + 1
+    assert "curve two probes a view are not enough" in said
+    assert said.endswith("2 steps\n")
