@@ -58,10 +58,11 @@ def _no_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
         disturbed.flicker(0.2),
         disturbed.brighter_when_dark(0.3),
         disturbed.bounce(0.3),
+        disturbed.filmic,
         disturbed.jpeg(50),
         disturbed.resized_twice(0.5),
     ],
-    ids=["grain", "flicker", "exposure", "bounce", "jpeg", "resize"],
+    ids=["grain", "flicker", "exposure", "bounce", "tone", "jpeg", "resize"],
 )
 def test_what_is_seen_otherwise_is_another_image_of_the_same_size(see: disturbed.See, mug: Object3D) -> None:
     plain = FakeTarget().render(mug, VIEWS, size=SIZE)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from trompe_server.classifiers import WhiteBoxClassifier
 from trompe_server.classifiers.protocol import Images, Logits, Wrapper, fit_images, in_batches
+from trompe_server.surrogate.shading import decode, encode
 from trompe_server.target import TargetRenderer
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
@@ -26,6 +27,7 @@ __all__ = [
     "bfloat16_gradients",
     "bounce",
     "brighter_when_dark",
+    "filmic",
     "flicker",
     "grain",
     "jittered",
@@ -100,6 +102,13 @@ def flicker(strength: float) -> See:
 def brighter_when_dark(strength: float) -> See:
     """Exposure that depends on the whole picture."""
     return lambda image, _: image * (1 - strength * (image.mean() / 255 - 0.5))
+
+
+def filmic(image: Images, _: int) -> NDArray[np.float64]:
+    """A tone curve as engines put over their pictures, the same for every pixel: Narkowicz's fit of ACES."""
+    light = decode(torch.from_numpy(image / 255))
+    toned = light * (2.51 * light + 0.03) / (light * (2.43 * light + 0.59) + 0.14)
+    return np.asarray(255 * encode(toned.clamp(0, 1)).numpy(), np.float64)
 
 
 def bounce(strength: float) -> See:
