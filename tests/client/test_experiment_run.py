@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -408,6 +409,40 @@ def test_what_was_kept_by_another_version_is_asked_for_again(service: FakeServic
     (tmp_path / "jobs" / key / "job.json").write_text(json.dumps({"other": "version"}))
     _, show = ran(plan_of(), service, tmp_path)
     assert show.began == {"total": 4, "done": 3}
+
+
+def test_where_only_the_tables_were_kept_their_rows_stay_and_count_as_done(
+    service: FakeService, tmp_path: Path
+) -> None:
+    """As in a checkout of published results: the same command must not wipe them out."""
+    service.failing = {"chair"}
+    ran(plan_of(), service, tmp_path)
+    shutil.rmtree(tmp_path / "jobs")
+    tables = {name: (tmp_path / name).read_bytes() for name in (RESULTS, PREDICTIONS)}
+    outcome, show = ran(plan_of(), service, tmp_path)
+    assert show.began == {"total": 4, "done": 4}
+    assert {name: (tmp_path / name).read_bytes() for name in tables} == tables
+    assert len(outcome.failed) == 2
+
+    service.failing = set()
+    wider, show = ran(plan_of(grid={"epsilon": [0.02, 0.05, 0.1]}), service, tmp_path, retry_failed=True)
+    assert show.began == {"total": 6, "done": 2}
+    assert [row.state for row in wider.rows] == ["succeeded"] * 6
+    assert len({each.key for each in read_table(tmp_path / PREDICTIONS, PredictionRow)}) == 6
+
+
+def test_rows_of_other_jobs_that_nothing_else_is_left_of_are_never_overwritten(
+    service: FakeService, tmp_path: Path
+) -> None:
+    ran(plan_of(), service, tmp_path)
+    narrower = plan_of(grid={"epsilon": [0.02]})
+    assert len(ran(narrower, service, tmp_path)[0].rows) == 2
+    ran(plan_of(), service, tmp_path)
+    shutil.rmtree(tmp_path / "jobs")
+    table = (tmp_path / RESULTS).read_bytes()
+    with pytest.raises(SpecError, match=r"rows of 2 jobs .* mug, epsilon 0.05, .* choose another --out"):
+        ran(narrower, service, tmp_path)
+    assert (tmp_path / RESULTS).read_bytes() == table
 
 
 def test_the_jobs_of_an_experiment_are_found_on_a_server(server: Any) -> None:

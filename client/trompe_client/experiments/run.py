@@ -1,11 +1,13 @@
 """Running an experiment: submit what is missing, follow it, keep what comes out.
 
 In the folder of an experiment, ``jobs/KEY/`` holds what came of one job (``job.json``, ``result.json``, artifacts);
-``results.csv`` and ``predictions.csv`` are made from all of them, anew with every job that ends.
+``results.csv`` and ``predictions.csv`` are made from all of them, anew with every job that ends. Where only the tables
+were kept, what they say of a job stays, and it is not run again.
 """
 
 import time
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
@@ -16,12 +18,14 @@ from trompe_client._errors import APIError
 from trompe_client.experiments.plan import Plan, Row
 from trompe_client.experiments.service import Service
 from trompe_shared.api import Job, JobState, Result
+from trompe_shared.errors import SpecError
 from trompe_shared.experiment_table import (
     PREDICTIONS,
     RESULTS,
     PredictionRow,
     ResultRow,
     prediction_rows,
+    read_table,
     write_table,
 )
 
@@ -39,13 +43,15 @@ TO_RETRY: Final = {JobState.failed.value, JobState.cancelled.value, REFUSED}
 
 @dataclass(frozen=True)
 class Finished:
-    """What came of one job. ``result`` is ``None`` where it came to none; ``error`` says why."""
+    """What came of one job. ``result`` is ``None`` where it came to none; ``error`` says why. ``row``: its row, where
+    that is all that was kept."""
 
     state: str
     job: str
     error: str = ""
     result: Result | None = None
     predictions: tuple[PredictionRow, ...] = ()
+    row: ResultRow | None = None
 
     @property
     def failed(self) -> bool:
@@ -88,7 +94,8 @@ def run_experiment(plan: Plan, service: Service, folder: Path, *, show: Show, re
     again. Raises ``ServerUnreachable`` when the server goes away.
     """
     jobs, collected = plan.jobs(), _Collected(folder)
-    known = {key: found for key in jobs if (found := collected.load(key)) is not None}
+    tables = _Tables.of(plan, folder)
+    known = {key: found for key in jobs if (found := collected.load(key) or tables.told(key)) is not None}
     missing = [row for key, row in jobs.items() if key not in known or (retry_failed and known[key].failed)]
     show.begin(total=len(jobs), done=len(jobs) - len(missing))
     rows = write_tables(plan, known, folder)
@@ -200,6 +207,42 @@ class _Collected:
         return outcome
 
 
+@dataclass(frozen=True)
+class _Tables:
+    """What the tables of an earlier run say, by job, of jobs of which nothing else was kept."""
+
+    rows: Mapping[str, ResultRow]
+    predictions: Mapping[str, Sequence[PredictionRow]]
+
+    @classmethod
+    def of(cls, plan: Plan, folder: Path) -> "_Tables":
+        """The tables in ``folder``, if there are any. Raises ``SpecError`` where they cannot be read, and for rows of
+        other jobs of which there is nothing else: the new tables would lack them."""
+        if not (folder / RESULTS).exists():
+            return cls({}, {})
+        table = {row.key: row for row in read_table(folder / RESULTS, ResultRow)}
+        rows = {key: row for key, row in table.items() if not (folder / "jobs" / key).exists()}
+        lost = [row for key, row in rows.items() if key not in plan.jobs()]
+        if lost:
+            raise SpecError(
+                f"{str(folder / RESULTS)!r} has rows of {len(lost)} jobs that this experiment does not ask for, "
+                f"such as {lost[0].object}, {lost[0].configuration}, and nothing else is left of them: choose another "
+                "--out, or move the table away."
+            )
+        predictions = defaultdict(list)
+        if (folder / PREDICTIONS).exists():
+            for each in read_table(folder / PREDICTIONS, PredictionRow):
+                predictions[each.key].append(each)
+        return cls(rows, predictions)
+
+    def told(self, key: str) -> Finished | None:
+        """What they say of a job."""
+        row = self.rows.get(key)
+        if row is None:
+            return None
+        return Finished(row.state, row.job, row.error, predictions=tuple(self.predictions.get(key, ())), row=row)
+
+
 class _Kept(BaseModel):
     """``job.json``."""
 
@@ -221,6 +264,8 @@ def write_tables(plan: Plan, known: Mapping[str, Finished], folder: Path) -> tup
 
 
 def _result_row(row: Row, finished: Finished) -> ResultRow:
+    if finished.row is not None:
+        return finished.row.model_copy(update=row.place.model_dump())
     if finished.result is not None:
         return ResultRow.of_result(row.place, finished.result, state=finished.state, job=finished.job)
     names = {"object": row.object, "classifier": _classifier_name(row)}
