@@ -83,7 +83,7 @@ def test_what_is_found_by_trying_gets_an_attack_further_than_a_blind_ranking(
             texels=moving,
         )
         objective = Objective(textures, square_surrogate, (fake_classifier(),), goal, None)
-        losses.append(objective.loss(objective.join(state.deltas)))
+        losses.append(objective.standing(objective.join(state.deltas)).loss)
     assert losses[1] > losses[0]
 
 

@@ -7,6 +7,7 @@ surrogate's canvas.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,7 +18,7 @@ from trompe_server.classifiers import WhiteBoxClassifier
 from trompe_server.surrogate import Canvas, Surrogate
 from trompe_shared.errors import SpecError
 
-__all__ = ["Look", "Objective", "Textures", "members_of"]
+__all__ = ["Look", "Objective", "Standing", "Textures", "members_of"]
 
 Textures = Mapping[str, Float[Tensor, "H W 3"]]
 Flat = Float[Tensor, "texels 3"]
@@ -49,6 +50,14 @@ class Look:
     fooled: float
     settled: Int[Tensor, " _"]
     images: int
+
+
+class Standing(NamedTuple):
+    """How well a change does on all views: the share of them that every classifier is fooled on, and the mean loss.
+    Compared by the share first."""
+
+    fooled: float
+    loss: float
 
 
 @dataclass(frozen=True)
@@ -157,14 +166,15 @@ class Objective:
         return gradient.nan_to_num_(0, 0, 0)
 
     @torch.no_grad()
-    def loss(self, change: Flat) -> float:
-        """Mean loss at ``change`` over all views; no gradient."""
-        texels, total = self.texels(change), 0.0
+    def standing(self, change: Flat) -> Standing:
+        """How well a ``change`` does on all views, masks or not; no gradient."""
+        texels, won, total = self.texels(change), 0, 0.0
         for batch in range(len(self.surrogate.batches)):
             images = self.surrogate.render(texels, batch)
-            losses = [self.goal.losses(member.logits(images)).sum() for member in self.members]
-            total += float(torch.stack(losses).mean())
-        return total / self.surrogate.n_views
+            logits = [member.logits(images) for member in self.members]
+            won += int(torch.stack([self.goal.reached(each) for each in logits]).all(0).sum())
+            total += float(torch.stack([self.goal.losses(each).sum() for each in logits]).mean())
+        return Standing(won / self.surrogate.n_views, total / self.surrogate.n_views)
 
 
 def _rows(images: Float[Tensor, "n 3 H W"], chosen: Int[Tensor, " chosen"]) -> Float[Tensor, "chosen 3 H W"]:

@@ -2,8 +2,8 @@
 
 A run begins at the unpainted textures or at random, and takes its share of the steps. Of several runs, and of a method
 that goes back and forth, the change with the highest loss over all of the attack's own views in the surrogate wins;
-nothing else is looked at. Through masks a run may even lead downhill, for texels behind them are seen by other pixels
-too: there no change at all is among those that are compared.
+nothing else is looked at. Through masks runs may lead downhill, for texels behind them are seen by other pixels too:
+there no change at all wins where it fools more views.
 
 The margin from which a view counts as safely won is the goal's at first. It is small by default, so that the gradient
 is that of the views still to be won. It rises with each step that finds nearly all of its views fooled, for what is won
@@ -168,7 +168,11 @@ class Search:
             mine, its = _mine(point.memory), _its(point.memory)
             moved = OPTIMISERS[self.optimiser].step(Point(point.delta, its), pull, look.loss, pace, self.box)
             point = Point(self._in_view(moved.delta), {**mine, **moved.memory})
-        return self._ended(point, step) if pace.done + 1 == pace.length else point
+        if pace.done + 1 < pace.length:
+            return point
+        point = self._ended(point, step)
+        masked = self.objective.masks is not None
+        return self._no_worse(point) if masked and step + 1 == self.schedule.total else point
 
     def saved(self, delta: Flat) -> Flat:
         """``delta``, or what of it keeps the images within their bound once it is saved in 8 bits."""
@@ -187,11 +191,9 @@ class Search:
     def _ended(self, point: Point, step: int) -> Point:
         """A run is over: keep the better of what it found and what was found before."""
         found = [point.delta, point.memory["best"]] if "best" in point.memory else [point.delta]
-        if self.objective.masks is not None and BEST not in point.memory:
-            found.append(torch.zeros_like(point.delta))
         if len(found) == 1 and not self.schedule.restarts:
             return point
-        losses = [self.objective.loss(delta) for delta in found]
+        losses = [self.objective.standing(delta).loss for delta in found]
         shown = self.shown(point) + len(losses) * self.objective.surrogate.n_views
         if BEST in point.memory:
             found, losses = [point.memory[BEST], *found], [float(point.memory[BEST_LOSS]), *losses]
@@ -199,6 +201,13 @@ class Search:
         told = {BEST: best, BEST_LOSS: torch.tensor(loss, dtype=torch.float64), SHOWN: torch.tensor(shown)}
         kept = {**_mine(point.memory), **told}
         return Point(best, kept) if step + 1 == self.schedule.total else Point(point.delta, kept)
+
+    def _no_worse(self, point: Point) -> Point:
+        """The point, or no change at all where that fools more views."""
+        nothing = torch.zeros_like(point.delta)
+        best = max(point.delta, nothing, key=self.objective.standing)
+        shown = self.shown(point) + 2 * self.objective.surrogate.n_views
+        return Point(best, {**point.memory, SHOWN: torch.tensor(shown)})
 
 
 def _mine(memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
