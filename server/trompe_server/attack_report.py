@@ -321,15 +321,22 @@ _REMEDIES: Final[Mapping[str, str]] = {
 }
 
 
+_UNALTERED: Final = (
+    "No texel was altered: the classifier's gradient is zero on every view (a saturated softmax, or a step that hides "
+    "gradients). Try --loss margin, or attack it by its scores (--queries)."
+)
+_UNALTERED_THROUGH_MASKS: Final = (
+    "No texel was altered: through the pixels that --tau leaves nothing was found that fools more views than the "
+    "unpainted object. Try a smaller --tau, or choose texels by --keep instead."
+)
+
+
 def _promises(evidence: Evidence, target: Accuracy, surrogate: Accuracy | None) -> list[str]:
     """What to know of an attack that came to nothing, or to less than the surrogate promised."""
     found = []
     painted = evidence.repainted
     if painted is not None and texels_altered(evidence.scene.obj.textures, painted.textures) == 0:
-        found.append(
-            "No texel was altered: the classifier's gradient is zero on every view (a saturated softmax, or a step "
-            "that hides gradients). Try --loss margin, or attack it by its scores (--queries)."
-        )
+        found.append(_UNALTERED if evidence.spec.tau is None else _UNALTERED_THROUGH_MASKS)
     gap = transfer_gap(surrogate, target)
     if gap is not None and gap > LARGE_GAP:
         found.append(
