@@ -16,6 +16,7 @@ from memory_files import MemoryArtifacts
 from numpy.typing import NDArray
 from PIL import Image
 
+from trompe_server import attack_job
 from trompe_server.array_files import unpack_arrays
 from trompe_server.attack import Budget, Goal, attack, load_state, rescale_each_view, saliency, saliency_masks, start
 from trompe_server.attack_job import AttackJob, open_pipeline
@@ -690,6 +691,17 @@ def test_an_attack_that_came_to_little_says_so_and_what_to_try(library: Library)
     assert [
         warning for warning in result.warnings if "came to little: A_drop 0.00" in warning and "--epsilon" in warning
     ]
+
+
+@pytest.mark.parametrize(("tau", "why"), [(None, "gradient is zero on every view"), (0.05, "through the pixels")])
+def test_an_attack_that_altered_nothing_says_so_and_why(
+    tau: float | None, why: str, library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(attack_job, "attack", lambda state, *_, steps, **__: dataclasses.replace(state, step=steps))
+    done = run(QUICK.model_copy(update={"tau": tau}), library)
+    warnings = json.loads(done.artifacts.read("result.json"))["warnings"]
+    (unaltered,) = [warning for warning in warnings if "No texel was altered" in warning]
+    assert why in unaltered
 
 
 def test_views_draw_their_backgrounds_from_several(tmp_path: Path, photo: Image8) -> None:
