@@ -1,7 +1,9 @@
 """What pydantic found wrong, in words for whoever wrote it."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
+
+from pydantic import ValidationError
 
 __all__ = ["Fault", "faults_of"]
 
@@ -23,14 +25,17 @@ class Fault(NamedTuple):
         return f"{self.place}: {self.message}" if self.place else self.message
 
 
-class _Refusal(Protocol):
-    """pydantic's ``ValidationError``, and FastAPI's of the same shape."""
+def faults_of(refusal: ValidationError | Sequence[Mapping[str, Any]]) -> Iterator[Fault]:
+    """All that is wrong, in the order of the fields, by pydantic's error or by what FastAPI keeps of one.
 
-    def errors(self) -> Sequence[Mapping[str, Any]]: ...
-
-
-def faults_of(error: _Refusal) -> Iterator[Fault]:
-    """All that is wrong, in the order of the fields."""
-    for each in error.errors():
+    What was given is not asked for: it may be a whole document.
+    """
+    if isinstance(refusal, ValidationError):
+        details: Sequence[Mapping[str, Any]] = refusal.errors(
+            include_url=False, include_input=False, include_context=False
+        )
+    else:
+        details = refusal
+    for each in details:
         place = ".".join(step for step in map(str, each["loc"]) if not step.startswith(INNER_STEPS))
         yield Fault(place, each["msg"].removeprefix(OWN_WORDS), each["type"])

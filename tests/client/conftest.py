@@ -39,6 +39,7 @@ from trompe_shared.api import (
     Result,
     WorkerInfo,
 )
+from trompe_shared.faults import faults_of
 
 NOW = datetime(2025, 1, 2, 3, 4, tzinfo=UTC)
 MUG = ObjectInfo(
@@ -325,7 +326,7 @@ class Handler(BaseHTTPRequestHandler):
         try:
             request = JobRequest.model_validate_json(body)
         except ValidationError as error:
-            wrong = [{"field": ".".join(map(str, e["loc"])), "message": e["msg"]} for e in error.errors()]
+            wrong = [{"field": fault.place, "message": fault.message} for fault in faults_of(error)]
             return self.problem(422, "Invalid", errors=wrong)
         if request.object not in {key for one in self.fake.objects for key in (one.id, one.name)}:
             return self.problem(404, "No such object", detail=f"{request.object!r} is not stored")

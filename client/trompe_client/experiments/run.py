@@ -7,7 +7,7 @@ were kept, what they say of a job stays, and it is not run again.
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
@@ -94,7 +94,7 @@ def run_experiment(plan: Plan, service: Service, folder: Path, *, show: Show, re
     again. Raises ``ServerUnreachable`` when the server goes away.
     """
     jobs, collected = plan.jobs(), _Collected(folder)
-    tables = _Tables.of(plan, folder)
+    tables = _Tables.of(jobs, folder)
     known = {key: found for key in jobs if (found := collected.load(key) or tables.told(key)) is not None}
     missing = [row for key, row in jobs.items() if key not in known or (retry_failed and known[key].failed)]
     show.begin(total=len(jobs), done=len(jobs) - len(missing))
@@ -215,14 +215,14 @@ class _Tables:
     predictions: Mapping[str, Sequence[PredictionRow]]
 
     @classmethod
-    def of(cls, plan: Plan, folder: Path) -> "_Tables":
+    def of(cls, wanted: Collection[str], folder: Path) -> "_Tables":
         """The tables in ``folder``, if there are any. Raises ``SpecError`` where they cannot be read, and for rows of
-        other jobs of which there is nothing else: the new tables would lack them."""
+        other jobs than those ``wanted`` of which there is nothing else: the new tables would lack them."""
         if not (folder / RESULTS).exists():
             return cls({}, {})
         table = {row.key: row for row in read_table(folder / RESULTS, ResultRow)}
         rows = {key: row for key, row in table.items() if not (folder / "jobs" / key).exists()}
-        lost = [row for key, row in rows.items() if key not in plan.jobs()]
+        lost = [row for key, row in rows.items() if key not in wanted]
         if lost:
             raise SpecError(
                 f"{str(folder / RESULTS)!r} has rows of {len(lost)} jobs that this experiment does not ask for, "

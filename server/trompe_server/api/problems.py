@@ -91,7 +91,7 @@ async def _trompe_error(request: Request, error: Exception) -> JSONResponse:
 
 async def _validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    errors = [{"field": _field(fault.place), "message": fault.message} for fault in faults_of(error)]
+    errors = [{"field": _field(fault.place), "message": fault.message} for fault in faults_of(error.errors())]
     detail = "; ".join(f"{each['field']}: {each['message']}" for each in errors)
     return problem_response(request, 422, code="validation", detail=detail, errors=errors)
 
