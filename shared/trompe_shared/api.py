@@ -236,7 +236,8 @@ class JobSpec(_Schema):
     )
     epsilon: Annotated[float, Field(gt=0, le=1), AfterValidator(_worth_saving)] = 0.05
     alpha: Annotated[float, Field(gt=0, le=1)] = Field(
-        0.01, description="mean step; by default 0.01, or a fifth of epsilon where that is smaller"
+        0.01,
+        description="mean step; by default 0.01, or a fifth of epsilon where that is smaller; fgsm and auto have none",
     )
     tau: Annotated[float, Field(ge=0, lt=1)] | None = Field(
         None, description="saliency threshold; null attacks all texels"
@@ -376,7 +377,31 @@ class JobSpec(_Schema):
             raise ValueError(
                 "saliency_scope says how saliency is rescaled for tau, and there is no tau: give one, or leave it out"
             )
+        if self.optimiser in _CHOOSE_THEIR_STEP and self.alpha != _mean_step(self.epsilon):
+            raise ValueError(
+                f"alpha ({self.alpha:g}) is a step's size, and {self.optimiser} chooses its own: leave it out, or "
+                "choose another optimiser, such as nesterov"
+            )
         return self
+
+    @model_validator(mode="after")
+    def _no_views_without_effect(self) -> "JobSpec":
+        if self.pool and (self.azimuths, self.elevations) != (_default_of("azimuths"), _default_of("elevations")):
+            raise ValueError(
+                f"azimuths and elevations shape the paper's grid, and {self.pool} random views (pool) are attacked in "
+                "its place: ask for the grid (pool 0, or --grid), or leave them out"
+            )
+        drawn = self.pool or self.held_out or self.attack_on == "light"
+        if not drawn and self.ranges != _default_of("ranges"):
+            raise ValueError(
+                "ranges say what random views are drawn from, and there are none: pool and held_out are 0. Ask for "
+                "some, or leave the ranges out"
+            )
+        return self
+
+
+_CHOOSE_THEIR_STEP: Final = ("fgsm", "auto")
+"""Optimisers without ``alpha``."""
 
 
 def _default_of(option: str) -> Any:

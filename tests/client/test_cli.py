@@ -290,7 +290,7 @@ def test_a_failed_job_exits_with_6_and_its_reason(server, tmp_path):
         pytest.param(["--mask", "a.png=missing.png"], "no mask picture 'missing.png'", id="mask without a file"),
         pytest.param(["--range", "elevation", "0", "9"], "'elevation' is not one of 'azimuth'", id="no such range"),
         pytest.param(["--grid", "--pool", "9"], "choose one", id="grid and pool"),
-        pytest.param(["--pool", "9", "--azimuths", "4"], "add --grid", id="size of no grid"),
+        pytest.param(["--pool", "9", "--azimuths", "4"], "or --grid", id="size of no grid"),
         pytest.param(["--target", "vase", "--top-k", "5"], "top_k is about leaving the best classes", id="two goals"),
         pytest.param(["--queries", "7"], "make it even", id="odd queries"),
         pytest.param(["--optimiser", "fgsm"], "make steps 1 (one a run)", id="many steps of a single one"),

@@ -142,6 +142,11 @@ def plan(**options: Any) -> AttackPlan:
     [
         pytest.param({"tau": 1.5}, "tau: Input should be less than 1", id="out of range"),
         pytest.param({"saliency_scope": "each_view"}, "there is no tau: give one", id="scope of no threshold"),
+        pytest.param({"azimuths": 12}, "and 240 random views", id="columns of no grid"),
+        pytest.param({"elevations": 2, "pool": 3}, "and 3 random views", id="rows of no grid"),
+        pytest.param({"pool": 0, "held_out": 0, "ranges": {"roll": (0, 9)}}, "there are none", id="ranges of no views"),
+        pytest.param({"optimiser": "auto", "alpha": 0.02}, "auto chooses its own", id="step of auto"),
+        pytest.param({"optimiser": "fgsm", "steps": 1, "alpha": 0.02}, "fgsm chooses its own", id="step of fgsm"),
         pytest.param({"saliency_scope": "a_view", "tau": 0.1}, "saliency_scope: Input should be", id="no scope"),
         pytest.param({"ranges": {"colour": (0, 1)}}, "ranges.colour", id="no such range"),
         pytest.param({"ranges": {"roll": 3}}, "ranges.roll", id="no range"),

@@ -55,7 +55,6 @@ _views = partial(click.option, cls=SectionOption, section="Views")
 
 CLASSIFIER: Final = "FILE_OR_NAME"
 RANGES: Final = [name for name in ViewRanges.model_fields if name != "light_colours"]
-GRID: Final = ("azimuths", "elevations")
 
 
 @click.command(cls=Sectioned)
@@ -272,6 +271,4 @@ def _job_options(
     given |= {"masks": dict(masks), "ranges": _ranges(ranges), "sun": _ranges(sun)}
     if grid and given.setdefault("pool", 0):
         raise SpecError("--grid attacks the paper's grid and --pool random views in its place: choose one.")
-    if given.get("pool", JobRequest.model_fields["pool"].get_default()) and any(name in given for name in GRID):
-        raise SpecError("--azimuths and --elevations shape the paper's grid of views: add --grid.")
     return given
