@@ -280,6 +280,21 @@ def test_a_run_that_was_cut_off_goes_on_where_it_was(service: FakeService, tmp_p
     assert len(outcome.rows) == 4
 
 
+def test_a_second_run_in_a_folder_where_one_is_at_work_is_refused(service: FakeService, tmp_path: Path) -> None:
+    refused = []
+
+    class Impatient(Silent):
+        def end(self, row: Row, finished: Any) -> None:
+            with pytest.raises(SpecError) as caught:
+                ran(plan_of(), FakeService(), tmp_path)
+            refused.append(str(caught.value))
+
+    outcome = run_experiment(plan_of(), service, tmp_path, show=Impatient())
+    assert len(outcome.rows) == len(refused) == 4
+    assert f"at work in {str(tmp_path)!r}: wait until it has ended, or choose another --out" in refused[0]
+    ran(plan_of(), service, tmp_path)
+
+
 def test_a_wider_grid_runs_only_what_is_new(service: FakeService, tmp_path: Path) -> None:
     ran(plan_of(), service, tmp_path)
     _, show = ran(plan_of(grid={"epsilon": [0.02, 0.05, 0.1]}), service, tmp_path)

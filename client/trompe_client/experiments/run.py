@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
+from filelock import FileLock, Timeout
 from pydantic import BaseModel
 
 from trompe_client._errors import APIError
@@ -33,6 +34,8 @@ __all__ = ["Finished", "Outcome", "Show", "run_experiment"]
 
 PAUSE: Final = 1.0
 """Seconds between two looks at the jobs."""
+LOCK: Final = ".lock"
+"""Held by the run that is at work in a folder."""
 LOOK_AT: Final = 12
 """Waiting jobs that are looked at each time, beside those that run: the next ones in turn, for workers may take them in
 any order."""
@@ -91,8 +94,21 @@ def run_experiment(plan: Plan, service: Service, folder: Path, *, show: Show, re
     """Run all jobs of ``plan`` that ``folder`` has no result of yet, and write the tables.
 
     A job that failed before is left so, or submitted anew with ``retry_failed``. May be stopped at any time and called
-    again. Raises ``ServerUnreachable`` when the server goes away.
+    again. Raises ``ServerUnreachable`` when the server goes away, and ``SpecError`` where another run is at work in
+    ``folder``: each would overwrite the other's tables.
     """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder / LOCK, blocking=False):
+            return _run(plan, service, folder, show, retry_failed=retry_failed)
+    except Timeout as error:
+        raise SpecError(
+            f"Another run of an experiment is at work in {str(folder)!r}: wait until it has ended, or choose another "
+            "--out."
+        ) from error
+
+
+def _run(plan: Plan, service: Service, folder: Path, show: Show, *, retry_failed: bool) -> Outcome:
     jobs, collected = plan.jobs(), _Collected(folder)
     tables = _Tables.of(jobs, folder)
     known = {key: found for key in jobs if (found := collected.load(key) or tables.told(key)) is not None}
@@ -255,7 +271,6 @@ class _Kept(BaseModel):
 
 def write_tables(plan: Plan, known: Mapping[str, Finished], folder: Path) -> tuple[ResultRow, ...]:
     """Write both tables; gives the rows of the results."""
-    folder.mkdir(parents=True, exist_ok=True)
     rows = tuple(_result_row(row, known[row.key]) for row in plan.rows if row.key in known)
     write_table(folder / RESULTS, rows)
     predictions = [each for key in plan.jobs() if key in known for each in known[key].predictions]
