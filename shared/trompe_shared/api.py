@@ -377,15 +377,32 @@ class JobSpec(_Schema):
             raise ValueError(
                 "saliency_scope says how saliency is rescaled for tau, and there is no tau: give one, or leave it out"
             )
+        return self
+
+
+def _default_of(option: str) -> Any:
+    return JobSpec.model_fields[option].get_default(call_default_factory=True)
+
+
+_CHOOSE_THEIR_STEP: Final = ("fgsm", "auto")
+"""Optimisers without ``alpha``."""
+
+
+class JobRequest(JobSpec):
+    """A job to be queued: what to attack, and what the queue must know. The latter changes no result."""
+
+    priority: Priority = Field("normal", description="interactive jobs come first, sweeps last")
+    labels: Labels = Field(default_factory=dict)
+    needs: Needs = Field("any", description="what the worker that takes it must compute on")
+
+    @model_validator(mode="after")
+    def _nothing_is_ignored(self) -> "JobRequest":
+        """Options that would change nothing. Of a request alone: jobs that were taken before stay what they were."""
         if self.optimiser in _CHOOSE_THEIR_STEP and self.alpha != _mean_step(self.epsilon):
             raise ValueError(
                 f"alpha ({self.alpha:g}) is a step's size, and {self.optimiser} chooses its own: leave it out, or "
                 "choose another optimiser, such as nesterov"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _no_views_without_effect(self) -> "JobSpec":
         if self.pool and (self.azimuths, self.elevations) != (_default_of("azimuths"), _default_of("elevations")):
             raise ValueError(
                 f"azimuths and elevations shape the paper's grid, and {self.pool} random views (pool) are attacked in "
@@ -398,22 +415,6 @@ class JobSpec(_Schema):
                 "some, or leave the ranges out"
             )
         return self
-
-
-_CHOOSE_THEIR_STEP: Final = ("fgsm", "auto")
-"""Optimisers without ``alpha``."""
-
-
-def _default_of(option: str) -> Any:
-    return JobSpec.model_fields[option].get_default(call_default_factory=True)
-
-
-class JobRequest(JobSpec):
-    """A job to be queued: what to attack, and what the queue must know. The latter changes no result."""
-
-    priority: Priority = Field("normal", description="interactive jobs come first, sweeps last")
-    labels: Labels = Field(default_factory=dict)
-    needs: Needs = Field("any", description="what the worker that takes it must compute on")
 
     def spec(self) -> JobSpec:
         """The job alone."""

@@ -49,10 +49,6 @@ SPEC = JobSpec.model_validate(
     }
 )
 QUICK = SPEC.model_copy(update={"surrogate": "diffuse", "steps": 2})
-NO_GRID = {"azimuths": 6, "elevations": 10}
-"""What a job with a pool has here: it refuses another shape of a grid that is not attacked."""
-AUTO = {"optimiser": "auto", "alpha": 0.01}
-"""Chooses its own steps, and refuses others."""
 PICTURES = {
     "predictions.png",
     "saliency_object.png",
@@ -286,9 +282,9 @@ def test_a_meter_sees_networks_behind_wrappers(library: Library) -> None:
         {"tau": 0.05, "keep": 0.1},
         {"diverse": True},
         {"restarts": 2, "optimiser": "pgd"},
-        AUTO | {"restarts": 1},
-        AUTO | {"diverse": True},
-        NO_GRID | {"pool": 12, "background": ["white", "black"], "keep": 0.1},
+        {"restarts": 1, "optimiser": "auto"},
+        {"optimiser": "auto", "diverse": True},
+        {"pool": 12, "background": ["white", "black"], "keep": 0.1},
     ],
     ids=str,
 )
@@ -377,7 +373,7 @@ def test_a_damaged_calibration_is_made_anew(library: Library) -> None:
 
 
 def test_a_pool_of_random_views_takes_the_place_of_the_grid(library: Library) -> None:
-    pool = run(SPEC.model_copy(update=NO_GRID | {"pool": 50, "steps": 2, "surrogate": "diffuse"}), library)
+    pool = run(SPEC.model_copy(update={"pool": 50, "steps": 2, "surrogate": "diffuse"}), library)
     result = pool.artifacts.result()
     assert result.target.views == len(result.views) == 50
     assert len({view.azimuth for view in result.views}) == 50
@@ -749,7 +745,7 @@ class Liar(FakeTarget):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"tau": 0.05}, {"keep": 0.2}, {"diverse": True}, AUTO | {"restarts": 1}, NO_GRID | {"pool": 12}],
+    [{}, {"tau": 0.05}, {"keep": 0.2}, {"diverse": True}, {"restarts": 1, "optimiser": "auto"}, {"pool": 12}],
     ids=str,
 )
 def test_what_the_result_is_judged_on_cannot_influence_the_texture(library: Library, options: dict[str, Any]) -> None:

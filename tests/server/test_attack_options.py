@@ -132,9 +132,9 @@ CLASSES = sorted({shipped.label for shipped in shipped_objects().values()})
     "options",
     [
         {"optimiser": "pgd", "restarts": 1},
-        {"optimiser": "fgsm", "steps": 1, "alpha": 0.01},
+        {"optimiser": "fgsm", "steps": 1},
         {"optimiser": "adam"},
-        {"optimiser": "auto", "alpha": 0.01, "loss": "dlr"},
+        {"optimiser": "auto", "loss": "dlr"},
         {"loss": "cross_entropy", "top_k": 2},
         {"ensemble": ["tiny"]},
         {"ensemble": ["tiny"], "diverse": True},

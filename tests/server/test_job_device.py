@@ -25,15 +25,14 @@ SIZE = (128, 128)
 MUG_VIEWS = [View(Camera(0.25, 60.0 * k, 20), Light(0, 60), (255, 255, 255)) for k in range(3)]
 
 VIEWS = {"object": "chair", "label": "chair", "pool": 0, "azimuths": 2, "elevations": 2, "held_out": 3}
-NO_GRID = {"azimuths": 6, "elevations": 10}
 PAINT = VIEWS | {"epsilon": 0.1, "alpha": 0.03, "surrogate": "calibrated", "steps": CHUNK + 1}
 WAYS = {
     "paint": PAINT,
     "curve, saliency": PAINT | {"surrogate": "curve", "tau": 0.05},
     "few texels": PAINT | {"keep": 0.2},
-    "restarts": PAINT | {"restarts": 1, "optimiser": "auto", "alpha": 0.01, "loss": "dlr"},
+    "restarts": PAINT | {"restarts": 1, "optimiser": "auto", "loss": "dlr"},
     "view budget": PAINT | {"epsilon_view": 0.05, "optimiser": "adam", "loss": "cross_entropy"},
-    "pool": PAINT | NO_GRID | {"pool": 12, "views_per_step": 6, "background": ["white", "black"]},
+    "pool": PAINT | {"pool": 12, "views_per_step": 6, "background": ["white", "black"]},
     "ensemble": PAINT | {"ensemble": ["tiny"], "judges": ["tiny"]},
     "scores": PAINT | {"queries": 20},
     "light": VIEWS | {"attack_on": "light", "steps": CHUNK + 1, "views_per_step": 2},

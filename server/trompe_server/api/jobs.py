@@ -18,7 +18,7 @@ from trompe_server.jobs.store import JobStore
 from trompe_shared.api import Job, JobList, JobRequest, JobState, Result
 from trompe_shared.errors import SpecError
 
-__all__ = ["Cursor", "Limit", "labels_of", "router"]
+__all__ = ["RESULT", "Cursor", "Limit", "labels_of", "router"]
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=PROBLEMS)
 
@@ -111,7 +111,8 @@ def retry_job(services: ServicesDep, job: str, response: Response, idempotency_k
     old = services.store.get(job)
     if not old.state.final:
         raise ConflictError(f"Job {job} is {old.state} and goes on by itself; cancel it first to start it anew.")
-    request = JobRequest(**old.spec.model_dump(), priority=old.priority, labels=old.labels, needs=old.needs)
+    # Not checked anew: what was taken before is taken again.
+    request = JobRequest.model_construct(**dict(old.spec), priority=old.priority, labels=old.labels, needs=old.needs)
     return _create(services.store, request, response, idempotency_key)
 
 

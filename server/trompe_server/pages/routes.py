@@ -10,11 +10,12 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Form, Query, Request
 from fastapi import Path as PathParam
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from pydantic import ValidationError
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from trompe_server.access import hash_secret
 from trompe_server.api.experiments import LABEL
-from trompe_server.api.jobs import Cursor, labels_of
+from trompe_server.api.jobs import RESULT, Cursor, labels_of
 from trompe_server.api.services import Services, ServicesDep
 from trompe_server.database import DatabaseDownError
 from trompe_server.errors import NotFoundError
@@ -129,7 +130,8 @@ def compare(request: Request, services: ServicesDep, a: str, b: str) -> HTMLResp
         job = services.store.get(each)
         result = _result(services, job)
         if result is None:
-            raise NotFoundError(f"Job {each} is {job.state} and has no result to compare.")
+            lacks = "a result of another version of Trompe" if RESULT in job.artifacts else "no result"
+            raise NotFoundError(f"Job {each} is {job.state} and has {lacks}: there is nothing to compare.")
         row = names.row(job)
         asked.append(names.options(job.spec))
         results.append(result)
@@ -143,7 +145,8 @@ def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
     found = services.store.get(job)
     row, result = _row(services, found), _result(services, found)
     shown = _shown(services, row, result) if result else None
-    return page(request, "job.html", job=row, shown=shown, terms=TERMS)
+    foreign = shown is None and RESULT in found.artifacts
+    return page(request, "job.html", job=row, shown=shown, foreign=foreign, terms=TERMS)
 
 
 @router.get("/jobs/{job}/preview.png")
@@ -281,11 +284,13 @@ async def _changes(look: Any) -> AsyncIterator[ServerSentEvent]:
 
 
 def _result(services: Services, job: Job) -> Result | None:
-    if "result.json" not in job.artifacts:
+    """What came of a job; ``None`` where there is nothing, or another version of Trompe wrote what this one does not
+    understand."""
+    if RESULT not in job.artifacts:
         return None
     try:
-        return Result.model_validate_json(services.artifacts(job.id).read("result.json"))
-    except FileNotFoundError:
+        return Result.model_validate_json(services.artifacts(job.id).read(RESULT))
+    except (FileNotFoundError, ValidationError):
         return None
 
 
