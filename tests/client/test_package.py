@@ -14,7 +14,7 @@ import trompe_server
 import trompe_shared
 
 HEAVY = {"torch", "numpy", "PIL", "trimesh", "fastapi", "sqlalchemy", "pyrender", "trompe_server", "trompe_renderer"}
-LATER = {"httpx", "rich", "click", "IPython"}
+LATER = {"httpx", "rich", "click", "filelock", "IPython"}
 """What an import of the SDK leaves for those who need it."""
 
 
@@ -55,9 +55,16 @@ def test_httpx_is_imported_in_one_module_only():
     assert users == ["_http.py"]
 
 
-def test_an_installation_without_extras_brings_five_small_libraries_and_a_few_megabytes_of_ours():
+def test_an_installation_without_extras_brings_six_small_libraries_and_a_few_megabytes_of_ours():
     needs = [text for text in metadata.requires("trompe") or [] if "extra ==" not in text]
-    assert {re.match(r"[\w-]+", need)[0] for need in needs} == {"click", "httpx", "pydantic", "pyyaml", "rich"}
+    assert {re.match(r"[\w-]+", need)[0] for need in needs} == {
+        "click",
+        "filelock",
+        "httpx",
+        "pydantic",
+        "pyyaml",
+        "rich",
+    }
     roots = [Path(module.__file__).parent for module in (trompe_client, trompe_renderer, trompe_server, trompe_shared)]
     files = [file for root in roots for file in root.rglob("*") if file.is_file() and file.suffix != ".pyc"]
     assert sum(file.stat().st_size for file in files) < 8e6
