@@ -122,7 +122,7 @@ def new_key() -> str:
 
 def submit(spec: JobSpec, *, key: str) -> Request[Job]:
     """A job, made once for ``key``; all that a ``JobSpec`` leaves open has ``JobRequest``'s defaults."""
-    body = JobRequest.model_validate(spec.model_dump()).model_dump_json()
+    body = JobRequest.of(spec).model_dump_json()
     return Request("POST", "/v1/jobs", _reader(Job), headers={"Idempotency-Key": key}, json=body)
 
 

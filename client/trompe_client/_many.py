@@ -125,7 +125,7 @@ class _Files:
     async def request(self, attack: Attack) -> JobRequest:
         """The job, its files uploaded."""
         if isinstance(attack, JobSpec):
-            return JobRequest.model_validate(attack.model_dump())
+            return JobRequest.of(attack)
         known = {name: self._known(name, value) for name, value in attack.items()}
         request = await uploaded(self._port, await self._port.off(lambda: plan_attack(**known)))
         for name in KINDS.keys() & attack.keys():

@@ -416,6 +416,12 @@ class JobRequest(JobSpec):
             )
         return self
 
+    @classmethod
+    def of(cls, spec: JobSpec) -> "JobRequest":
+        """``spec`` as a request, with the defaults of what it leaves open. It is not checked anew: a job that was taken
+        before may have what is refused today."""
+        return cls.model_construct(**dict(spec))
+
     def spec(self) -> JobSpec:
         """The job alone."""
         return JobSpec.model_validate(self.model_dump(include=set(JobSpec.model_fields)))

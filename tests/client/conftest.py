@@ -319,7 +319,7 @@ class Handler(BaseHTTPRequestHandler):
         if what == "retry":
             old = self.fake.jobs[job_id]
             more = {"priority": old.priority, "labels": old.labels, "needs": old.needs}
-            return self.make(JobRequest(**old.spec.model_dump(), **more))
+            return self.make(JobRequest.of(old.spec).model_copy(update=more))
         return self.store(what, *self.multipart(body))
 
     def submit(self, body: bytes) -> None:

@@ -22,7 +22,7 @@ from trompe_client import (
     Outcome,
 )
 from trompe_client._embedded import embedded_server
-from trompe_shared.api import JobRequest, JobState
+from trompe_shared.api import JobRequest, JobSpec, JobState
 
 FEW = {"pool": 0, "azimuths": 2, "elevations": 1, "held_out": 1, "steps": 1}
 """Options of a job of seconds."""
@@ -152,9 +152,12 @@ def test_jobs_are_found_by_state_label_object_and_classifier(client, name):
 def test_many_jobs_come_back_with_results_and_errors(client, name):
     one = {"object": "mug", "label": "mug", **FEW}
     attacks = [one | {"seed": 1}, one | {"object": "no such"}, JobRequest(**one, labels={"own": "label"})]
+    attacks.append(JobSpec(object="mug", label="mug", azimuths=2))
     outcomes = {outcome.index: outcome for outcome in client.map(attacks, batch=name)}
-    assert sorted(outcomes) == [0, 1, 2]
+    assert sorted(outcomes) == [0, 1, 2, 3]
     assert isinstance(outcomes[1].error, NotFound)
+    assert isinstance(outcomes[3].error, BadRequest)
+    assert "azimuths and elevations shape the paper's grid" in str(outcomes[3].error)
     assert [outcomes[index].result.seed for index in (0, 2)] == [1, 0]
     assert outcomes[2].job.status.labels == {"own": "label", "batch": name}
     again = {outcome.index: outcome for outcome in client.map(attacks, batch=name)}

@@ -111,8 +111,13 @@ def retry_job(services: ServicesDep, job: str, response: Response, idempotency_k
     old = services.store.get(job)
     if not old.state.final:
         raise ConflictError(f"Job {job} is {old.state} and goes on by itself; cancel it first to start it anew.")
-    # Not checked anew: what was taken before is taken again.
-    request = JobRequest.model_construct(**dict(old.spec), priority=old.priority, labels=old.labels, needs=old.needs)
+    foreign = services.store.not_understood(job)
+    if foreign:
+        raise ConflictError(
+            f"Job {job} has the options {foreign}, which only another version of Trompe understands: start it there."
+        )
+    queued = {"priority": old.priority, "labels": old.labels, "needs": old.needs}
+    request = JobRequest.of(old.spec).model_copy(update=queued)
     return _create(services.store, request, response, idempotency_key)
 
 

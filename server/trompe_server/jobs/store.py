@@ -1,7 +1,7 @@
 """The record of jobs as those see it who submit and watch them. What workers do with it is in ``desk``."""
 
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final
@@ -22,6 +22,7 @@ from trompe_server.jobs.tables import (
     jobs,
     labels,
     locked,
+    spec_of,
     time_of,
     totals,
     update_job,
@@ -81,7 +82,6 @@ class JobStore:
     def create(
         self,
         request: JobRequest,
-        enqueue: Callable[[sa.Connection, str], None] | None = None,
         *,
         idempotency_key: str | None = None,
     ) -> tuple[Job, bool]:
@@ -112,6 +112,11 @@ class JobStore:
         """The job with this id. Raises ``NotFoundError``."""
         with self.engine.connect() as connection:
             return job_of(fresh(connection, job))
+
+    def not_understood(self, job: str) -> list[str]:
+        """The options of a job that only another version of Trompe understands. Raises ``NotFoundError``."""
+        with self.engine.connect() as connection:
+            return spec_of(fresh(connection, job))[1]
 
     def page(
         self,

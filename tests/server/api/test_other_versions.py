@@ -30,3 +30,12 @@ def test_what_was_taken_when_less_was_refused_stays_as_it_was_and_is_taken_again
     stocked.end(old, JobState.failed)
     again = stocked.post(f"/v1/jobs/{old}/retry")
     assert (again.status_code, again.json()["spec"]) == (201, spec)
+
+
+def test_a_job_that_is_not_understood_is_not_repeated_as_another_one(stocked):
+    job = stocked.job()
+    spec = stocked.get(f"/v1/jobs/{job}").json()["spec"]
+    stocked.tell(job, "from another version", spec=spec | {"glitter": 3})
+    stocked.end(job, JobState.failed)
+    assert "options ['glitter']" in stocked.problem(stocked.post(f"/v1/jobs/{job}/retry"), 409)["detail"]
+    assert len(stocked.get("/v1/jobs").json()["jobs"]) == 1
