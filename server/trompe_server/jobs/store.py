@@ -79,12 +79,7 @@ class JobStore:
         """Let go of the database."""
         self.engine.dispose()
 
-    def create(
-        self,
-        request: JobRequest,
-        *,
-        idempotency_key: str | None = None,
-    ) -> tuple[Job, bool]:
+    def create(self, request: JobRequest, *, idempotency_key: str | None = None) -> tuple[Job, bool]:
         """A new queued job, and whether it is new: the same ``idempotency_key`` gives the job that it gave before.
 
         Raises ``ConflictError`` where the key came with another request.
