@@ -1,7 +1,7 @@
 # The images of Trompe: renderer (no torch), server (REST API, migration), worker (attacks).
 #
-#   TORCH_INDEX  where torch comes from. By default its builds for CPUs; empty takes PyPI's, which bring CUDA.
-#   WHEELS       an image whose root folder holds wheels that are to be had nowhere else; by default none.
+#   TORCH_INDEX  index of torch. Default: its builds for CPUs; empty: PyPI's, which include CUDA.
+#   WHEELS       image with additional wheels in its root folder. Default: none.
 ARG WHEELS=scratch
 
 FROM ${WHEELS} AS wheels
@@ -13,12 +13,12 @@ RUN groupadd --gid 10001 trompe \
  && useradd --uid 10001 --gid trompe --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin trompe \
  && python -m venv --without-pip /opt/trompe
 
-# Others' packages go below ours, so that an edit of ours makes a small layer anew. pip asks for them by a wheel of
-# Trompe that holds its requirements and no code.
+# Requirements are a layer below our code, so that an edit rebuilds only a small layer. pip reads them from a wheel of
+# Trompe without code.
 FROM python AS requirements
 WORKDIR /requirements
 COPY pyproject.toml deploy/image/constraints.txt ./
-RUN mkdir -p client/trompe_client server/trompe_server renderer_worker/trompe_renderer shared/trompe_shared \
+RUN mkdir -p client/trompe_client experiments/trompe_experiments server/trompe_server renderer_worker/trompe_renderer shared/trompe_shared \
  && touch README.md client/trompe_client/__init__.py \
  && pip wheel --no-deps --wheel-dir . .
 
@@ -56,7 +56,7 @@ RUN --mount=type=cache,target=/root/.cache/pip --mount=type=bind,from=requiremen
     pip --python /opt/trompe/bin/python install -c /requirements/constraints.txt \
       "$(echo /requirements/*.whl)[vision,s3]" \
  && pip --python /opt/trompe/bin/python uninstall --yes trompe
-# FBX files are read by assimp.
+# assimp reads FBX files.
 RUN apt-get update \
  && apt-get install --yes --no-install-recommends assimp-utils \
  && apt-get clean && rm -rf /var/lib/apt/lists/*

@@ -5,13 +5,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test chaos compose check audit format clean egl
+.PHONY: help demo test chaos compose check scoreboard audit format clean egl
 
 help:
 	@echo "make demo    attack an object that comes with Trompe; results in trompe-demo/"
 	@echo "make test    run the tests (those with real objects too, if TROMPE_ASSETS names their folder)"
 	@echo "make chaos   kill, freeze and stop the service's processes while it works (6 minutes)"
 	@echo "make compose build the images and test the stack of docker-compose.yml (needs Docker)"
+	@echo "make scoreboard ROW=name  measure speed and accuracy (under 20 minutes; needs TROMPE_ASSETS)"
 	@echo "make audit   look for known faults in what is installed, and write its list to out/sbom.json"
 	@echo "make check   format, lint, types, import rules"
 	@echo "make format  put the code into its form"
@@ -34,6 +35,10 @@ check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Finished jobs stay in out/scoreboard: a stopped run goes on.
+scoreboard: $(VENV)/.installed-dev egl
+	$(BIN)/python -m bench.scoreboard --row "$(or $(ROW),$(error make scoreboard ROW=name))"
 
 # The auditors have an environment of their own, so that they do not find themselves.
 audit: $(VENV)/.installed-dev

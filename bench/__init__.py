@@ -1,8 +1,5 @@
-"""Benches of the surrogate: fidelity, speed, growth. Run them from the repository's root: `python -m bench.fidelity`.
+"""Benches, listed in bench/README.md. They compute with two threads, prepared as in attack workers."""
 
-They have two threads, prepared as those of attack workers are.
-"""
-
-from trompe_server.threads import prepare_threads
+from trompe_server.system.threads import prepare_threads
 
 prepare_threads(2)

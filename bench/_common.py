@@ -15,12 +15,12 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from trompe_server.experiments.library_objects import LibraryObject as BenchObject
-from trompe_server.experiments.library_objects import loaded
-from trompe_server.experiments.own_renderer import running_renderer
-from trompe_shared.asset_objects import asset_objects
-from trompe_shared.object3d import Object3D
-from trompe_shared.shipped import shipped_objects
+from trompe_experiments.asset_objects import AssetObject, asset_objects
+from trompe_server.attack import grid_views
+from trompe_server.renderers import local_renderer
+from trompe_shared.geometry import COLOURS, View
+from trompe_shared.object3d import Object3D, load_object
+from trompe_shared.shipped import ShippedObject, shipped_objects
 
 __all__ = [
     "BenchObject",
@@ -28,11 +28,32 @@ __all__ = [
     "assets",
     "bench_objects",
     "in_rounds",
+    "local_renderer",
     "machine",
     "painted_at_random",
     "rescaled",
-    "running_renderer",
 ]
+
+
+@dataclass(frozen=True)
+class BenchObject:
+    """An object, the camera's distance (metres), its range of elevations (degrees), and the background (sRGB)."""
+
+    name: str
+    obj: Object3D
+    distance: float
+    elevation: tuple[float, float]
+    background: tuple[int, int, int]
+
+    def views(self, *, azimuths: int = 6, elevations: int = 10) -> list[View]:
+        """The paper's grid of views."""
+        return grid_views(
+            distance=self.distance,
+            elevation=self.elevation,
+            azimuths=azimuths,
+            elevations=elevations,
+            background=self.background,
+        )
 
 
 def assets() -> Path | None:
@@ -49,7 +70,12 @@ def bench_objects(names: Sequence[str] = ()) -> list[BenchObject]:
     unknown = sorted(set(wanted) - set(table))
     if unknown:
         sys.exit(f"There is no object {', '.join(unknown)}; there are {', '.join(table)}. Is TROMPE_ASSETS set?")
-    return [loaded(table[name]) for name in wanted]
+    return [_loaded(table[name]) for name in wanted]
+
+
+def _loaded(each: ShippedObject | AssetObject) -> BenchObject:
+    background = COLOURS[each.background if isinstance(each, AssetObject) else "white"]
+    return BenchObject(each.name, load_object(each.path), each.distance, each.elevation, background)
 
 
 def rescaled(obj: Object3D, factor: float) -> Object3D:

@@ -23,7 +23,7 @@ from typing import Any
 import httpx
 
 from bench._common import machine
-from trompe_server.markdown import markdown_table
+from trompe_experiments.markdown import markdown_table
 
 MARKS = {"reads": 0.050, "submits": 0.150}
 """Seconds that 99 of 100 must be answered in."""
@@ -35,7 +35,7 @@ QUEUED = {"object": "mug", "label": "mug", "needs": "cuda", "labels": {"bench": 
 @contextmanager
 def serving(folder: Path, workers: int) -> Iterator[str]:
     """The URL of a service with so many attack workers, its log in ``folder``."""
-    command = [sys.executable, "-m", "trompe_server.jobs.leash", "serve", "--port", "0", "--workers", str(workers)]
+    command = [sys.executable, "-m", "trompe_server.system.child", "serve", "--port", "0", "--workers", str(workers)]
     with (folder / "serve.log").open("w") as log:
         process = subprocess.Popen(
             [*command, "--data", str(folder)],

@@ -27,15 +27,16 @@ from torch.nn import functional as F
 from torch.optim.lr_scheduler import OneCycleLR
 
 from bench._common import machine
+from trompe_experiments.in_process import Change, run_job
+from trompe_experiments.markdown import markdown_table
+from trompe_experiments.variants import ATTACK, Variant, clean, photographs
 from trompe_server.classifiers import NetworkClassifier, WhiteBoxClassifier
 from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, TinyNet, load_tiny
-from trompe_server.experiments.in_process import Change
-from trompe_server.experiments.own_renderer import running_renderer
-from trompe_server.experiments.variants import Variant, clean, make_variants, photographs
-from trompe_server.markdown import markdown_table
+from trompe_server.renderers import TargetRenderer, local_renderer
 from trompe_server.surrogate import Surrogate, textures_of
 from trompe_server.surrogate.calibration import build_surrogate, calibrate
-from trompe_server.target import TargetRenderer
+from trompe_shared.api import JobSpec
+from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
 TRAIN_VIEWS, TEST_VIEWS, SURROGATE_VIEWS = 96, 40, 80
@@ -189,14 +190,18 @@ class Bench:
     """Where variants are made and pictures are taken."""
 
     target: TargetRenderer
-    folder: Path
     epsilon: float
 
     def attacked(self, network: TinyNet, *, seed: int) -> list[Variant]:
         """A variant of each object that the network recognises, made against it."""
-        options = {"per_object": 1, "epsilon": self.epsilon, "seed": seed}
-        names, change = list(shipped_objects()), as_change(network)
-        return list(make_variants(names, self.target, self.folder, change=change, **options))  # type: ignore[arg-type]
+        variants = []
+        for name, shipped in shipped_objects().items():
+            spec = JobSpec.of(name, label=shipped.label, seed=seed, epsilon=self.epsilon, **ATTACK)
+            with tempfile.TemporaryDirectory(prefix="trompe-") as folder:
+                done = run_job(spec, self.target, Path(folder), change=as_change(network))
+            if done.painted is not None:
+                variants.append(Variant(shipped, f"{name}-{seed}", self.epsilon, load_object(done.painted)))
+        return variants
 
     def sitter(self, name: str) -> Sitter:
         """A shipped object with a surrogate measured on the target."""
@@ -241,8 +246,8 @@ def main() -> None:
     torch.manual_seed(0)
     print(machine() + "\n")
     rows: list[list[str]] = []
-    with running_renderer() as target, tempfile.TemporaryDirectory(prefix="trompe-") as scratch:
-        bench, shipped = Bench(target, Path(scratch), options.epsilon), load_tiny()
+    with local_renderer() as target:
+        bench, shipped = Bench(target, options.epsilon), load_tiny()
         plain, old = [clean(name) for name in shipped_objects()], bench.attacked(shipped, seed=JUDGES)
         for name, network in bench.networks(shipped, steps=options.steps).items():
             anew = old if network is shipped else bench.attacked(network, seed=JUDGES)

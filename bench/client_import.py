@@ -22,7 +22,7 @@ import trompe_renderer
 import trompe_server
 import trompe_shared
 from bench._common import machine
-from trompe_server.markdown import markdown_table
+from trompe_experiments.markdown import markdown_table
 
 CONTENDERS = {
     "python, nothing imported": ["-c", ""],

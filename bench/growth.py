@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench._common import BenchObject, bench_objects, machine, painted_at_random
-from trompe_server.markdown import markdown_table
-from trompe_server.memory import keep_freed_memory
+from trompe_experiments.markdown import markdown_table
 from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
 from trompe_server.surrogate.calibration import CURVE_GREYS, Calibration, build_surrogate
 from trompe_server.surrogate.fidelity import Fidelity
+from trompe_server.system.memory import keep_freed_memory
 from trompe_shared.object3d import Object3D, Part
 
 TEXTURE_SIDES = (256, 512, 1024, 2048, 4096)

@@ -11,10 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from bench.job_list import size
-from trompe_server.jobs.desk import JobDesk
-from trompe_server.jobs.runner import JobRunner, OpenedJob
-from trompe_server.jobs.store import JobStore
-from trompe_server.pipeline import OnProgress, PhaseReport
+from trompe_server.executor.runner import JobRunner, OpenedJob
+from trompe_server.job.protocol import OnProgress, PhaseReport
+from trompe_server.queue.claims import Claims
+from trompe_server.queue.store import JobStore
 from trompe_shared.api import JobRequest, Progress
 
 PHASES = [f"phase-{number}" for number in range(9)]
@@ -34,9 +34,9 @@ class Idle:
 
 def work(store: JobStore, name: str) -> int:
     """Run jobs until there are none; how many it were."""
-    runner = JobRunner(JobDesk(store.engine, name), lambda _: OpenedJob(Idle(), lambda: None))
+    runner = JobRunner(Claims(store.engine, name), lambda _: OpenedJob(Idle(), lambda: None))
     count = 0
-    while (claim := runner.desk.claim(("any",))) is not None:
+    while (claim := runner.claims.claim(("any",))) is not None:
         runner.run(claim)
         count += 1
     return count
@@ -48,7 +48,7 @@ def bench(url: str, count: int, workers: int) -> None:
     store.migrate()
     before, began = size(store), time.perf_counter()
     for _ in range(count):
-        store.create(JobRequest.model_validate({"object": "mug", "label": "mug", "labels": {"run": "1"}}))
+        store.create(JobRequest.of("mug", label="mug", labels={"run": "1"}))
     submitted, began = time.perf_counter() - began, time.perf_counter()
     with ThreadPoolExecutor(workers) as pool:
         done = sum(pool.map(lambda number: work(store, f"w{number}"), range(workers)))

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from trompe_server.database import write
-from trompe_server.jobs.desk import Ending, JobDesk
-from trompe_server.jobs.store import JobStore
-from trompe_server.jobs.tables import jobs, labels
+from trompe_server.queue.claims import Claims, Ending
+from trompe_server.queue.store import JobStore
+from trompe_server.queue.tables import jobs, labels
+from trompe_server.storage.database import write
 from trompe_shared.api import JobRequest, JobSpec, JobState, Progress
 
 BATCH = 1000
@@ -27,7 +27,7 @@ STATES = [JobState.succeeded] * 96 + [JobState.failed, JobState.cancelled, JobSt
 
 def fill(store: JobStore, count: int) -> None:
     """Make ``count`` jobs: 96 % have succeeded, 1 % each have failed, were cancelled, are n.a., are queued."""
-    spec = JobSpec.model_validate({"object": "mug", "label": "mug"}).model_dump(mode="json")
+    spec = JobSpec.of("mug", label="mug").model_dump(mode="json")
     progress = Progress().model_dump(mode="json")
     for first in range(0, count, BATCH):
         rows, pairs = [], []
@@ -93,16 +93,16 @@ def cases(store: JobStore, count: int) -> Iterator[tuple[str, Callable[[], objec
     yield "object", lambda: store.page(object="object-7")
     yield "counts", store.counts
     yield "statistics", store.statistics
-    desk = JobDesk(store.engine, "bench")
-    yield "claim and finish", lambda: take(desk)
-    yield "submit", lambda: store.create(JobRequest.model_validate({"object": "mug", "label": "mug"}))
+    claims = Claims(store.engine, "bench")
+    yield "claim and finish", lambda: take(claims)
+    yield "submit", lambda: store.create(JobRequest.of("mug", label="mug"))
 
 
-def take(desk: JobDesk) -> None:
+def take(claims: Claims) -> None:
     """Take a job and end it."""
-    claim = desk.claim(("any", "cpu"))
+    claim = claims.claim(("any", "cpu"))
     assert claim is not None
-    desk.finish(claim, Ending(JobState.succeeded))
+    claims.finish(claim, Ending(JobState.succeeded))
 
 
 def size(store: JobStore) -> int:

@@ -19,15 +19,15 @@ import uvicorn
 from fastapi import FastAPI
 
 from bench.job_list import fill, measured
-from trompe_server.access import Tokens
+from trompe_experiments.markdown import markdown_table
 from trompe_server.api.services import Services
-from trompe_server.app import create_app
-from trompe_server.artifacts import open_folder
-from trompe_server.jobs.store import JobStore
-from trompe_server.jobs.worker import prepare_data
+from trompe_server.executor.worker import prepare_data
 from trompe_server.library import Library
-from trompe_server.markdown import markdown_table
+from trompe_server.queue.store import JobStore
+from trompe_server.service.app import create_app
 from trompe_server.settings import Settings
+from trompe_server.storage.folders import open_folder
+from trompe_server.storage.tokens import Tokens
 
 PATHS = ("/", "/jobs", "/jobs?state=failed", "/jobs?cursor=5000", "/jobs/new", "/experiments")
 

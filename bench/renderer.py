@@ -27,17 +27,18 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from bench._common import BenchObject, bench_objects, in_rounds, machine, running_renderer
-from trompe_renderer.engine import Engine
-from trompe_renderer.model import Library
-from trompe_renderer.options import Quality
-from trompe_renderer.passes import ObjectRenderer
-from trompe_renderer.platform import GL
-from trompe_renderer.scenery import Scenery
-from trompe_renderer.session import Session
-from trompe_server.markdown import markdown_table
-from trompe_server.target import SailenvTarget
-from trompe_server.target import sailenv as client
+from bench._common import BenchObject, bench_objects, in_rounds, local_renderer, machine
+from trompe_experiments.markdown import markdown_table
+from trompe_renderer.engines.pyrender import PyrenderEngine, PyrenderOptions
+from trompe_renderer.engines.pyrender.passes import ObjectRenderer
+from trompe_renderer.engines.pyrender.platform import GL
+from trompe_renderer.protocol.limits import Limits
+from trompe_renderer.protocol.session import Session
+from trompe_renderer.protocol.upload import ModelCache
+from trompe_renderer.world.snapshot import Snapshot
+from trompe_server.renderers import SailenvTarget
+from trompe_shared import sailenv_client as client
+from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import View, sailenv_pose
 from trompe_shared.object3d import Object3D
 
@@ -70,8 +71,8 @@ class Stopwatch:
 class StagedRenderer(ObjectRenderer):
     """Splits drawing from reading back."""
 
-    def __init__(self, quality: Quality, watch: Stopwatch) -> None:
-        super().__init__(quality)
+    def __init__(self, options: PyrenderOptions, watch: Stopwatch) -> None:
+        super().__init__(options)
         self._watch = watch
 
     def _read_main_framebuffer(self, scene: Any, flags: int) -> Picture:
@@ -82,22 +83,22 @@ class StagedRenderer(ObjectRenderer):
         return image
 
 
-class StagedEngine(Engine):
+class StagedEngine(PyrenderEngine):
     """An engine that draws with and without shadows, stage by stage."""
 
     def __init__(self, watch: Stopwatch) -> None:
-        super().__init__(Quality())
+        super().__init__(PyrenderOptions())
         self.watch = watch
-        self._staged = {shadows: StagedRenderer(Quality(shadows=shadows), watch) for shadows in (True, False)}
+        self._staged = {shadows: StagedRenderer(PyrenderOptions(shadows=shadows), watch) for shadows in (True, False)}
 
-    def staged(self, scenery: Callable[[], Scenery], *, side: int, shadows: bool) -> Picture:
+    def staged(self, snapshot: Callable[[], Snapshot], *, side: int, shadows: bool) -> Picture:
         """A picture; the watch has its laps."""
         self.watch.start()
-        seen = scenery()
+        seen = snapshot()
         scene = self._scene(seen)
         self.watch.lap("scene")
-        image = self._staged[shadows].picture(scene, width=side, height=side, backdrop=seen.backdrop)
-        self._uploads.trim()
+        image = self._staged[shadows].picture(scene, width=side, height=side, background=seen.background)
+        self._cache.trim()
         return image
 
 
@@ -118,7 +119,7 @@ class Case:
 
 def case_of(entry: BenchObject, n_views: int) -> Case:
     """The object, uploaded and spawned."""
-    session = Session(Library())
+    session = Session(ModelCache(Limits()), EngineInfo("pyrender", ""))
     (path,) = session.send_obj_zip(file=("object.zip", entry.obj.to_zip()))
     origin = (0.0, 0.0, 0.0)
     session.spawn_object(name=f"file:{path}", position=origin, rotation=origin, scale=(1.0, 1.0, 1.0))
@@ -140,7 +141,7 @@ def stages(cases: Sequence[Case], rounds: int) -> list[list[object]]:
                 engine.watch.laps = laps[number].laps if turn else defaultdict(list)
                 for view in case.views[: None if turn else 1]:
                     case.look(view)
-                    image = engine.staged(case.session.scenery, side=side, shadows=shadows)
+                    image = engine.staged(case.session.snapshot, side=side, shadows=shadows)
                     first.setdefault(number, time.perf_counter() - started)
                     engine.watch.start()
                     data = png(image, 1)
@@ -303,7 +304,7 @@ def main() -> None:
     rows = stages([case_of(entry, options.views) for entry in entries], options.rounds)
     print(GL.glGetString(GL.GL_RENDERER).decode(), "\n")
     print(markdown_table(["object", "side", "shadows", "first", *STAGES, "all", "a second"], rows))
-    with running_renderer() as target:
+    with local_renderer() as target:
         print("\nOver the loopback, milliseconds a picture; the ratio is that of texture change + picture to a picture")
         print(f"(wanted on candle at 224: <= {WANTED_RATIO}).\n")
         titles = ["ours", "new texture", "ratio", "ours, 60 at once", "published", "new texture", "ratio"]

@@ -18,15 +18,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bench._common import BenchObject, Times, assets, bench_objects, in_rounds, machine, painted_at_random, rescaled
+from trompe_experiments.markdown import markdown_table
 from trompe_server.attack import Budget, Goal, attack, movable, start
 from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
-from trompe_server.markdown import markdown_table
-from trompe_server.memory import keep_freed_memory
-from trompe_server.phased_job import CHUNK
+from trompe_server.job.texture_attack import CHUNK
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate.calibration import CALIBRATED_GREYS, CURVE_GREYS, Calibration, build_surrogate
 from trompe_server.surrogate.fidelity import Fidelity
+from trompe_server.surrogate.sampling import Gather
 from trompe_server.surrogate.surrogate import BATCH
+from trompe_server.system.memory import keep_freed_memory
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
@@ -171,7 +172,7 @@ def preparation(entries: Sequence[BenchObject], size: tuple[int, int], n_views: 
 
         times = in_rounds({"prepare": prepare}, rounds)["prepare"]
         wanted = f"<= {WANTED_SECONDS:g}" if entry.name == "toilet" else "-"
-        taps = sum(len(batch.gather.index) for batch in made[0].batches)
+        taps = sum(len(batch.gather.index) for batch in made[0].batches if isinstance(batch.gather, Gather))
         pixels = sum(len(batch.pixel) for batch in made[0].batches)
         rows.append(
             [

@@ -17,10 +17,10 @@ from typing import Final
 
 from bench._common import assets, bench_objects, in_rounds, machine
 from bench.surrogate_speed import fastest_classifier, outside_share, work_of
-from trompe_server.markdown import markdown_table
-from trompe_server.memory import keep_freed_memory
-from trompe_server.phased_job import CHUNK
-from trompe_server.threads import SPINS
+from trompe_experiments.markdown import markdown_table
+from trompe_server.job.texture_attack import CHUNK
+from trompe_server.system.memory import keep_freed_memory
+from trompe_server.system.threads import SPINS
 
 AWAKE: Final = {"not at all": 0, "for a moment, as attack workers have it": SPINS, "for 300 times as long": 300 * SPINS}
 """Looks for new work before a thread sleeps."""

@@ -10,17 +10,17 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from trompe_server.artifacts import LocalArtifacts
-from trompe_server.attack_job import open_pipeline
-from trompe_server.experiments.own_renderer import running_renderer
+from trompe_server.job.texture_attack import open_job
 from trompe_server.library import Library
 from trompe_server.pages.pictures import Kind, Pictures
 from trompe_server.pages.present import viewer_record
+from trompe_server.renderers import local_renderer
+from trompe_server.storage.folders import LocalArtifacts
 from trompe_shared.api import JobSpec, Result
 from trompe_shared.shipped import shipped_objects
 
 PAGES: Final = Path(__file__).parents[1] / "server" / "trompe_server" / "pages"
-SPEC: Final = JobSpec(object="mug", label="mug", classifier="tiny", steps=100)
+SPEC: Final = JobSpec.of("mug", label="mug", classifier="tiny", steps=100)
 """What `trompe demo` asks for."""
 SHOWN: Final = 8
 KINDS: Final[tuple[Kind, ...]] = ("before", "after", "difference")
@@ -38,8 +38,8 @@ def main() -> None:
 
 def run(artifacts: LocalArtifacts, library: Library) -> None:
     """The job, from beginning to end."""
-    with running_renderer() as target:
-        job = open_pipeline(SPEC, library=library, artifacts=artifacts, target=target)
+    with local_renderer() as target:
+        job = open_job(SPEC, library=library, artifacts=artifacts, target=target)
         for phase in job.phases():
             print(phase)
             job.run(phase, lambda _: None)
@@ -59,7 +59,7 @@ def write(result: Result, artifacts: LocalArtifacts) -> None:
         for kind in KINDS:
             (place / f"{kind}.png").write_bytes(pictures.one(artifacts, "held_out", view, kind))
         address = f"/static/gallery/{number}"
-        views.append(viewer_record(result.held_out_views[view], result.label, CLASSES.__getitem__, address))
+        views.append(viewer_record(result.held_out_views[view], result.labels, CLASSES.__getitem__, address))
     gallery = {
         "object": result.object,
         "epsilon": f"{result.epsilon:.0%}",

@@ -19,25 +19,17 @@ from numpy.typing import NDArray
 from objects.brushes import clouds, mix, rgb, smooth, wood
 from objects.mesh import Texels
 
+from trompe_renderer.check.probes import FACES
 from trompe_shared.object3d import encode_png, load_object, pack_zip
 from trompe_shared.shipped import shipped_objects
 
-FOLDER: Final = Path(__file__).parents[1] / "renderer_worker" / "trompe_renderer" / "room_01"
+FOLDER: Final = Path(__file__).parents[1] / "renderer_worker" / "trompe_renderer" / "world" / "room_01"
 LOW: Final = np.array([-2.0, 0.0, -1.8])
 HIGH: Final = np.array([2.0, 2.5, 1.8])
 WINDOW: Final = ((-0.6, 0.6), (0.95, 2.05))
 """The opening in the wall at -z: range of x, range of y, metres."""
 RUG_TOP: Final = 0.013
 TABLE_TOP: Final = RUG_TOP + 0.74
-SIDES: Final = {
-    "right": ((1, 0, 0), (0, 1, 0)),
-    "left": ((-1, 0, 0), (0, 1, 0)),
-    "top": ((0, 1, 0), (0, 0, -1)),
-    "bottom": ((0, -1, 0), (0, 0, 1)),
-    "front": ((0, 0, 1), (0, 1, 0)),
-    "back": ((0, 0, -1), (0, 1, 0)),
-}
-"""Outward normal of each side of a box, and the direction of growing v on it."""
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -63,11 +55,11 @@ class Mesh:
         self.faces.setdefault(material, []).append((corners, uvs, normal / np.linalg.norm(normal)))
 
     def box(
-        self, material: str, low: Sequence[float], high: Sequence[float], sides: Sequence[str] = tuple(SIDES)
+        self, material: str, low: Sequence[float], high: Sequence[float], sides: Sequence[str] = tuple(FACES)
     ) -> None:
         """A box between two corners, closed or with only some of its sides."""
         center, half = (np.array(low) + high) / 2, (np.array(high) - low) / 2
-        for normal, up in (SIDES[side] for side in sides):
+        for normal, up in (FACES[side] for side in sides):
             across = np.cross(up, normal)
             self.rectangle(material, center + half * normal, half * across, half * np.array(up))
 
@@ -327,7 +319,7 @@ def scene() -> dict[str, Any]:
         "walls": {"low": LOW.tolist(), "high": HIGH.tolist()},
         "ambient": [105, 107, 112],
         "lights": {"Main Light": sun, "Rim Light": rim, "Ceiling Light": {**hanging, "kind": "Point"}},
-        "fixtures": structure + furniture(),
+        "static_objects": structure + furniture(),
     }
 
 

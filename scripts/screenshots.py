@@ -1,8 +1,8 @@
-"""Take the pictures of the pages that the documentation shows, of a server that has some finished jobs.
+"""Take the documentation's pictures of the pages of a running server.
 
     python scripts/screenshots.py --server http://127.0.0.1:8000 [--out docs/images/pages]
 
-Needs Chromium. The result that is shown is that of the latest job that has succeeded.
+Needs Chromium. Shows the latest two jobs that succeeded, and their experiment if they have one.
 """
 
 import argparse
@@ -24,14 +24,13 @@ WIDTH, HEIGHT = 1100, 1250
 
 
 def main() -> None:
-    """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--server", default="http://127.0.0.1:8000")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args()
     chromium = shutil.which("chromium")
     if chromium is None:
-        sys.exit("There is no Chromium here; on Debian: apt-get install chromium")
+        sys.exit("Chromium is missing; on Debian: apt-get install chromium")
     options.out.mkdir(parents=True, exist_ok=True)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
@@ -44,11 +43,11 @@ def main() -> None:
 
 
 def pages(server: str) -> Mapping[str, str]:
-    """What is shown, by name."""
+    """Paths of the pages by the name of their picture."""
     with Client(server) as client:
         done = [handle.status for handle in islice(client.jobs(state="succeeded"), 2)]
     if len(done) < 2:
-        sys.exit("Two jobs must have succeeded on the server, to show them.")
+        sys.exit("The server needs two jobs that succeeded; submit some with trompe attack.")
     experiments = {job.labels["experiment"] for job in done if "experiment" in job.labels}
     grid = {"experiment": f"/experiments/{quote(experiments.pop())}"} if experiments else {}
     compared = f"/jobs/compare?a={done[0].id}&b={done[1].id}"
@@ -63,7 +62,7 @@ def pages(server: str) -> Mapping[str, str]:
 
 
 def shoot(page: Page, address: str, file: Path) -> None:
-    """One picture, once what it shows has come."""
+    """Save a picture of the page at ``address``, two seconds after it was opened."""
     page.goto(address)
     page.wait_for_timeout(2000)
     page.screenshot(path=file)

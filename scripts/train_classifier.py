@@ -24,11 +24,11 @@ from torch.nn import functional as F
 
 from trompe_server.attack.views import grid_views
 from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, WEIGHTS, TinyNet, load_tiny, save_tiny
-from trompe_server.experiments.own_renderer import running_renderer
+from trompe_server.renderers import local_renderer
 from trompe_server.surrogate import SamplingModel, diffuse_surrogate, prepare_geometry
-from trompe_server.target.sailenv import SailenvTarget
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D, load_object
+from trompe_shared.sailenv_client import SailenvTarget
 from trompe_shared.shipped import ShippedObject, shipped_objects
 
 PAINTS: Final = 12
@@ -253,7 +253,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--epochs", type=int, default=9)
     options = parser.parse_args(arguments)
-    with running_renderer() as target:
+    with local_renderer() as target:
         network = train(collect(target, options.seed, options.cache), epochs=options.epochs, seed=options.seed)
         save_tiny(network, options.out)
         judge(target, load_tiny(options.out))

@@ -1,30 +1,31 @@
-"""What tests of several packages share: a real renderer worker, and objects made from a few numbers."""
+"""Fixtures shared by the packages: a renderer worker, a running service, and objects made from a few numbers."""
 
 import json
 import os
 import re
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import settings
 from numpy.typing import ArrayLike, NDArray
-from pretend_device import register
 
-from trompe_server.target import SailenvTarget
+from tests.pretend_device import register
+from tests.served import Served
+from tests.worker_process import started
+from trompe_server.renderers import SailenvTarget
 from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files
 from trompe_shared.shipped import shipped_objects
 
 Surface = tuple[ArrayLike, ArrayLike, NDArray[np.uint8]]
-"""Corners (F, 3, 3) in metres, their texture coordinates (F, 3, 2), and the texture (H, W, 3) they are painted with."""
+"""Corners (F, 3, 3) in metres, texture coordinates (F, 3, 2), and texture (H, W, 3)."""
 
 INSTALLABLE = re.compile("install|NOT TESTED")
-"""What the reason says of a test that is skipped for want of something that could be installed."""
+"""Matches the reason of a test skipped because something is not installed."""
 
 
 settings.register_profile("untimed", deadline=None)
@@ -32,9 +33,9 @@ settings.load_profile("untimed")
 
 
 def pytest_configure() -> None:
-    """Let Ctrl-C reach what tests start, also where a shell ran us in the background and had it ignored.
+    """Restore Ctrl-C for child processes, which a background shell ignores, and register the pretend device.
 
-    Torch must know of a device before it computes its first gradient.
+    Torch must know a device before its first gradient.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)
     share_the_cores(int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)))
@@ -42,7 +43,7 @@ def pytest_configure() -> None:
 
 
 def share_the_cores(processes: int) -> None:
-    """Of several test processes, each has its share of the threads, and so have those that it starts."""
+    """Give each of several test processes, and their children, a share of the threads."""
     if processes > 1:
         threads = max(1, len(os.sched_getaffinity(0)) // processes)
         os.environ.setdefault("OMP_NUM_THREADS", str(threads))
@@ -53,7 +54,7 @@ def share_the_cores(processes: int) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """With TROMPE_REQUIRE_ALL nothing is skipped that could be run here: it fails, saying what to install."""
+    """With TROMPE_REQUIRE_ALL, fail instead of skipping a test that needs something installable."""
     report = yield
     if report.skipped and "TROMPE_REQUIRE_ALL" in os.environ and INSTALLABLE.search(str(report.longrepr)):
         report.outcome = "failed"
@@ -61,36 +62,21 @@ def pytest_runtest_makereport(
     return report
 
 
-def start_worker(*options: str) -> tuple[subprocess.Popen[str], str]:
-    """A worker process on a free port and the one line that says it is ready."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "trompe_renderer", "--port", "0", *options], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    return process, process.stdout.readline()
-
-
 @contextmanager
 def _running_worker(*options: str) -> Iterator[tuple[str, int]]:
-    process, line = start_worker(*options)
-    try:
-        ready = re.fullmatch(r"trompe renderer listening on (127\.0\.0\.1):(\d+)\n", line)
-        assert ready, line
-        yield ready[1], int(ready[2])
-    finally:
-        process.kill()
-        process.communicate()
+    with started(*options) as worker:
+        yield worker.address
 
 
 @pytest.fixture(scope="session")
 def running_worker() -> Callable[..., AbstractContextManager[tuple[str, int]]]:
-    """Runs a worker with the options given, for the time of a ``with``; gives its address."""
+    """Runs a renderer worker with the given options during a block, which gets its address."""
     return _running_worker
 
 
 @pytest.fixture(scope="session")
 def worker() -> Iterator[tuple[str, int]]:
-    """The address of the worker that all tests share."""
+    """The address of a renderer worker shared by all tests."""
     with _running_worker() as address:
         yield address
 
@@ -102,6 +88,13 @@ def target(worker: tuple[str, int]) -> Iterator[SailenvTarget]:
     target.close()
 
 
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Served]:
+    """A running ``trompe serve`` whose worker runs fake jobs."""
+    with Served(tmp_path / "data") as running:
+        yield running
+
+
 @pytest.fixture(scope="session")
 def mug() -> Object3D:
     return load_object(shipped_objects()["mug"].read())
@@ -109,7 +102,7 @@ def mug() -> Object3D:
 
 @pytest.fixture(scope="session")
 def make_object() -> Callable[..., Object3D]:
-    """Makes an object of ``Surface``s, each a material of its own (m0, m1, ... painted with m0.png, m1.png, ...)."""
+    """Makes an object of ``Surface``s with a material each (m0, m1, ... with textures m0.png, m1.png, ...)."""
     return _object_of
 
 
@@ -133,12 +126,12 @@ def _object_of(*surfaces: Surface) -> Object3D:
 
 @pytest.fixture(scope="session")
 def make_quad() -> Callable[..., Surface]:
-    """Makes a square that faces a camera at azimuth 0, the texture upright on it."""
+    """Makes a square that faces a camera at azimuth 0, with the texture upright."""
     return _quad
 
 
 def _quad(texture: NDArray[np.uint8], *, half: float = 0.1, z: float = 0.0, repeat: float = 1.0) -> Surface:
-    """Half side in metres; the texture is repeated ``repeat`` times each way."""
+    """``half``: half a side in metres. The texture repeats ``repeat`` times each way."""
     square = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
     uvs = repeat * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     rows = [0, 1, 2, 0, 2, 3]

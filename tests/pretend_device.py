@@ -1,5 +1,7 @@
-"""A device that computes on the CPU, to the same bits, but holds tensors of its own: like a graphics card it refuses to
-work with what lies elsewhere. Code that forgets where a tensor is fails on it on any machine."""
+"""A device that computes on the CPU, to the same bits, but holds its own tensors.
+
+Like a graphics card it refuses tensors of other devices, so a tensor on the wrong device is an error on any machine.
+"""
 
 from collections.abc import Callable
 from functools import cache
@@ -13,29 +15,26 @@ from torch.utils import backend_registration
 from torch.utils._python_dispatch import return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-__all__ = ["NAME", "pretend_device", "register"]
-
 NAME: Final = "pretend"
 
 AWAY_ALLOWED: Final = {"aten::copy_", "aten::_to_copy"}
-"""What takes tensors from one device to another."""
+"""Operators that move tensors between devices."""
 
 INDEXING: Final = {"aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_"}
-"""What a graphics card does with indices that lie on the CPU, but not the other way round."""
+"""Operators to which a graphics card accepts indices on the CPU, but not the other way round."""
 
 MADE_BY_HAND: Final = ("tensor", "arange", "linspace")
-"""Functions that write into memory before there is an operator a device could answer."""
+"""Functions that write into memory before any operator reaches the device."""
 
 
 class PretendTensor(Tensor):
-    """A tensor on the device; ``held`` is the one on the CPU that it stands for."""
+    """A tensor on the device; ``held`` is its copy on the CPU."""
 
     held: Tensor
 
     @staticmethod
     def __new__(cls, held: Tensor) -> "PretendTensor":
-        """One that stands for ``held``."""
-        made: PretendTensor = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+        made: PretendTensor = torch.Tensor._make_wrapper_subclass(
             cls,
             held.size(),
             strides=held.stride(),
@@ -47,16 +46,15 @@ class PretendTensor(Tensor):
         return made
 
     @classmethod
-    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Answer an operator."""
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
         return _compute(func, args, kwargs or {})
 
     def tolist(self) -> Any:
-        """Other devices have it, torch denies it to tensors of Python's own."""
+        """Torch refuses it for wrapper tensors."""
         return self.held.tolist()
 
     def __getitem__(self, key: Any) -> Tensor:
-        """Torch would turn lists of numbers into tensors without asking the device."""
+        """Torch would make tensors of lists of numbers without the device."""
         keys = key if isinstance(key, tuple) else (key,)
         return super().__getitem__(tuple(torch.tensor(each) if isinstance(each, list) else each for each in keys))
 
@@ -72,12 +70,13 @@ def _compute(func: Any, args: Any, kwargs: Any) -> Any:
     plain_args, plain = tree_map_only(PretendTensor, lambda each: each.held, (args, kwargs))
     found = func(*plain_args, **plain | ({} if device is None else {"device": torch.device("cpu")}))
     if stays:
-        return return_and_correct_aliasing(func, args, kwargs, tree_map_only(Tensor, PretendTensor, found))
+        moved = tree_map_only(Tensor, PretendTensor, found)
+        return return_and_correct_aliasing(func, args, kwargs, moved)  # type: ignore[no-untyped-call]
     return args[0] if func is torch.ops.aten.copy_.default else found
 
 
 def _check_together(name: str, tensors: list[Tensor], some_here: bool) -> None:
-    """Raise where a graphics card would; numbers (tensors without dimensions) may come from the CPU."""
+    """Raise as a graphics card would; tensors without dimensions may come from the CPU."""
     away = any(each.ndim and not isinstance(each, PretendTensor) for each in tensors)
     indexing = name in INDEXING and isinstance(tensors[0], PretendTensor)
     if some_here and away and name not in AWAY_ALLOWED and not indexing:
@@ -85,7 +84,7 @@ def _check_together(name: str, tensors: list[Tensor], some_here: bool) -> None:
 
 
 class _Module:
-    """What torch asks of a device's module."""
+    """A device's module, as torch expects it."""
 
     def is_initialized(self) -> bool:
         return True
@@ -103,13 +102,13 @@ class _Module:
         return False
 
     def manual_seed_all(self, seed: int) -> None:
-        """It draws nothing of its own, so that its random state is empty."""
+        """The random state is empty."""
 
     def get_rng_state(self, device: Any = None) -> Tensor:
         return torch.empty(0, dtype=torch.uint8)
 
     def set_rng_state(self, state: Tensor, device: Any = None) -> None:
-        """There is none."""
+        """The random state is empty."""
 
 
 POSSIBLE: Final = hasattr(backend_registration, "_setup_privateuseone_for_python_backend")
@@ -118,12 +117,12 @@ POSSIBLE: Final = hasattr(backend_registration, "_setup_privateuseone_for_python
 
 @cache
 def register() -> Library | None:
-    """Tell torch of the device: before the process computes its first gradient, when torch counts its devices."""
+    """Register the device. Call before the first gradient of the process, when torch counts its devices."""
     if not POSSIBLE:
         return None
     backend_registration._setup_privateuseone_for_python_backend(NAME, backend_module=_Module())
-    library = Library("_", "IMPL")
-    library.fallback(lambda func, *args, **kwargs: _compute(func, args, kwargs), "PrivateUse1")
+    library = Library("_", "IMPL")  # type: ignore[no-untyped-call]
+    library.fallback(lambda func, *args, **kwargs: _compute(func, args, kwargs), "PrivateUse1")  # type: ignore[no-untyped-call]
     return library
 
 
@@ -135,7 +134,7 @@ def _then_moved(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
 
 def pretend_device(monkeypatch: pytest.MonkeyPatch) -> str:
-    """The device's name for ``device=...``, for the time of one test. Skips where this torch cannot have one."""
+    """Name of the device for one test. Skips the test if this torch cannot have one."""
     if register() is None:
         pytest.skip("this version of torch has no devices written in Python")
     for name in MADE_BY_HAND:

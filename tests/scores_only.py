@@ -1,4 +1,4 @@
-"""A classifier that keeps its gradients to itself."""
+"""A classifier without gradients."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class Scores:
-    """A network as one sees it through an .onnx file: scores, no gradients."""
+    """A network seen through an .onnx file: scores, no gradients."""
 
     def __init__(self, inner: Any) -> None:
         self.inner: Any = inner

@@ -1,14 +1,18 @@
-"""A textured triangle in the formats that it takes more than a line to write."""
+"""A textured triangle in several formats."""
 
 import json
 import struct
+import zlib
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
+from trompe_server.formats import read_object
 from trompe_server.formats.fbx_tree import Node, Tree
-from trompe_shared.object3d import encode_png
+from trompe_shared.errors import ObjectError
+from trompe_shared.object3d import Object3D, encode_png
 
 Json = dict[str, Any]
 
@@ -19,7 +23,7 @@ CORNERS = struct.pack("<15f", 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 0, 0)
 
 
 def gltf_json() -> Json:
-    """The triangle as glTF: positions, texture coordinates and the picture in one buffer, ``gltf_buffer``."""
+    """The triangle as glTF, with positions, texture coordinates and picture in ``gltf_buffer``."""
     return {
         "asset": {"version": "2.0"},
         "scene": 0,
@@ -43,12 +47,12 @@ def gltf_json() -> Json:
 
 
 def gltf_buffer() -> bytes:
-    """What ``gltf_json`` describes."""
+    """The buffer of ``gltf_json``."""
     return CORNERS + PICTURE
 
 
 def gltf_files(picture: bytes = PICTURE, **changes: Any) -> dict[str, bytes]:
-    """The triangle as glTF with its buffer and its picture in files of their own; ``changes`` to the JSON."""
+    """The triangle as glTF with buffer and picture in separate files, and ``changes`` to the JSON."""
     document = gltf_json()
     document |= {
         "images": [{"uri": "tex/t.png"}],
@@ -80,3 +84,40 @@ def with_picture_inside(fbx: Tree, picture: bytes) -> bytes:
         return replace(node, children=tuple(map(filled, children))) if node.name == b"Objects" else node
 
     return replace(fbx, nodes=tuple(map(filled, fbx.nodes))).to_bytes()
+
+
+def large_png(width: int, height: int, *, chunks: tuple[tuple[bytes, bytes], ...] = (), data: bytes = b"") -> bytes:
+    """A PNG file with that size in its header and, unless ``data`` is given, no pixels."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    pixels = (b"IDAT", data or zlib.compress(b""))
+    file = b"\x89PNG\r\n\x1a\n"
+    for kind, body in ((b"IHDR", header), *chunks, pixels, (b"IEND", b"")):
+        file += struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+    return file
+
+
+def corners(obj: Object3D) -> np.ndarray:
+    """Positions of all corners (F, 3, 3), part by part."""
+    return np.concatenate([part.vertices[part.faces] for part in obj.parts])
+
+
+def painted(obj: Object3D) -> Object3D:
+    """``obj`` with every texel changed a little."""
+    return obj.with_textures(
+        {name: np.where(t > 127, t - 9, t + 9).astype(np.uint8) for name, t in obj.textures.items()}
+    )
+
+
+def same_paint(one: Object3D, other: Object3D) -> None:
+    """Assert that two objects have the same triangles, texture coordinates and texels."""
+    assert (corners(one) == corners(other)).all()
+    for mine, theirs in zip(one.parts, other.parts, strict=True):
+        np.testing.assert_allclose(mine.uvs[mine.faces], theirs.uvs[theirs.faces], atol=1e-7)
+        assert (one.textures[one.albedo_of(mine)] == other.textures[other.albedo_of(theirs)]).all()
+
+
+def refusal(data: bytes, name: str) -> str:
+    """The message of the error that reading an upload raises."""
+    with pytest.raises(ObjectError) as raised:
+        read_object(data, name=name)
+    return str(raised.value)

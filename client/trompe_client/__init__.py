@@ -1,7 +1,6 @@
-"""Thin client of a Trompe server: ``Client().attack(...)`` gives a job to wait for. Needs no torch and no numpy."""
+"""Thin client of a Trompe server. ``Client().attack(...)`` returns a job to wait for. Needs no torch and no numpy."""
 
-from trompe_client._async_client import AsyncClient
-from trompe_client._client import Client
+from trompe_client._client import AsyncClient, Client
 from trompe_client._errors import (
     APIError,
     BadRequest,
@@ -23,7 +22,6 @@ from trompe_client._errors import (
 )
 from trompe_client._job import AsyncJobHandle, JobHandle
 from trompe_client._many import Attack, Outcome
-from trompe_client._plan import AttackOptions
 from trompe_client._retry import Retries
 
 __all__ = [
@@ -31,7 +29,6 @@ __all__ = [
     "AsyncClient",
     "AsyncJobHandle",
     "Attack",
-    "AttackOptions",
     "BadRequest",
     "BrokenDownload",
     "Client",

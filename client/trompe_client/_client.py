@@ -1,43 +1,33 @@
-"""The client that blocks."""
+"""The blocking and the asynchronous client."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Self, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 from trompe_client import _core
 from trompe_client._core import JobFilter, Request
-from trompe_client._job import JobHandle
+from trompe_client._job import AsyncJobHandle, JobHandle
 from trompe_client._many import Attack, Outcome, run_all
-from trompe_client._operations import pages, planned, send, uploaded, uploaded_file
-from trompe_client._plan import (
-    AttackOptions,
-    AttackPlan,
-    background_upload,
-    classifier_upload,
-    named_object_upload,
-    plan_attack,
-)
-from trompe_client._port import finish, iterate
+from trompe_client._operations import pages, planned, send, stored, uploaded
+from trompe_client._plan import AttackPlan, background_upload, classifier_upload, named_object_upload, plan_attack
+from trompe_client._port import Port, blocking, finish, iterate
 from trompe_client._retry import Retries
-from trompe_client._settings import DEFAULT_SERVER, Connection
+from trompe_client._settings import Connection
 from trompe_shared.api import BackgroundInfo, ClassifierInfo, JobSpec, JobState, ObjectInfo, RendererInfo, WorkerInfo
 
-__all__ = ["DEFAULT_SERVER", "Client"]
+if TYPE_CHECKING:
+    from trompe_client._http import AsyncPort, BlockingPort
 
+Label = str | int | Sequence[str | int]
 T = TypeVar("T")
+P = TypeVar("P", bound=Port)
 
 
-class Client:
-    """A connection to a Trompe server. Use it as a context manager, or ``close`` it. Threads may share one.
+class _Connected(Generic[P]):
+    """Connection of both clients."""
 
-    ``server`` is by default TROMPE_SERVER, else http://127.0.0.1:8000; ``token`` is by default TROMPE_TOKEN.
-    ``timeout`` is how long the server may be silent, seconds; after an upload, which it reads first, 300 s more.
-    ``transport`` replaces the network (a mock, in tests).
-
-    Every method raises ``APIError`` for what the server refuses and ``ServerUnreachable``; what can be asked twice
-    without harm is asked again as ``retries`` says, and that is nearly everything.
-    """
+    port: P
 
     def __init__(
         self,
@@ -48,24 +38,141 @@ class Client:
         retries: Retries = Retries(),  # noqa: B008
         transport: Any = None,
     ) -> None:
-        from trompe_client._http import BlockingPort  # httpx is loaded only for those who connect
-
         connection = Connection.find(server, token=token, timeout=timeout, transport=transport)
         self.server = connection.url
-        self.port = BlockingPort(connection, retries)
+        self.port = self._open(connection, retries)
 
-    def attack(
-        self, object: str | Path, *, label: str | int, key: str | None = None, **options: Unpack[AttackOptions]
-    ) -> JobHandle:
-        """Submit an attack and return at once with a handle on the job.
+    def _open(self, connection: Connection, retries: Retries) -> P:
+        raise NotImplementedError
+
+
+class AsyncClient(_Connected["AsyncPort"]):
+    """``Client`` for asyncio: the same arguments and methods. Use it by ``async with``, or ``close`` it."""
+
+    def _open(self, connection: Connection, retries: Retries) -> "AsyncPort":
+        from trompe_client._http import AsyncPort  # slow to import
+
+        return AsyncPort(connection, retries)
+
+    async def attack(
+        self, object: str | Path, *, label: Label, key: str | None = None, **options: Any
+    ) -> AsyncJobHandle:
+        """As ``Client.attack``."""
+        plan = partial(plan_attack, object, label=label, **options)
+        return await self.submit(await planned(self.port, plan), key=key)
+
+    async def start(self, plan: AttackPlan, *, key: str | None = None) -> AsyncJobHandle:
+        """As ``Client.start``."""
+        return await self.submit(await uploaded(self.port, plan), key=key)
+
+    async def submit(self, spec: JobSpec, *, key: str | None = None) -> AsyncJobHandle:
+        """As ``Client.submit``."""
+        return AsyncJobHandle(self, await self.send(_core.submit(spec, key=key or _core.new_key())))
+
+    async def map(
+        self, attacks: Iterable[Attack], *, batch: str | None = None, concurrency: int = 8
+    ) -> AsyncIterator[Outcome[AsyncJobHandle]]:
+        """As ``Client.map``."""
+        async for outcome in run_all(self.port, list(attacks), batch=batch, concurrency=concurrency):
+            yield outcome.of(partial(AsyncJobHandle, self))
+
+    async def job(self, job_id: str) -> AsyncJobHandle:
+        """As ``Client.job``."""
+        return AsyncJobHandle(self, await self.send(_core.job(job_id)))
+
+    async def jobs(
+        self,
+        *,
+        state: JobState | str | None = None,
+        labels: Mapping[str, str] | None = None,
+        object: str | None = None,
+        classifier: str | None = None,
+    ) -> AsyncIterator[AsyncJobHandle]:
+        """As ``Client.jobs``."""
+        wanted = JobFilter(JobState(state) if state else None, labels or {}, object, classifier)
+        async for job in pages(self.port, wanted):
+            yield AsyncJobHandle(self, job)
+
+    async def objects(self) -> list[ObjectInfo]:
+        """Stored objects, shipped ones included."""
+        return await send(self.port, _core.listed(ObjectInfo))
+
+    async def classifiers(self) -> list[ClassifierInfo]:
+        """Stored classifiers, shipped ones included."""
+        return await send(self.port, _core.listed(ClassifierInfo))
+
+    async def backgrounds(self) -> list[BackgroundInfo]:
+        """Uploaded pictures."""
+        return await send(self.port, _core.listed(BackgroundInfo))
+
+    async def workers(self) -> list[WorkerInfo]:
+        """Processes that run jobs."""
+        return await send(self.port, _core.listed(WorkerInfo))
+
+    async def renderers(self) -> list[RendererInfo]:
+        """Renderer workers of the server."""
+        return await send(self.port, _core.listed(RendererInfo))
+
+    async def upload_object(self, source: str | Path, *, name: str | None = None) -> ObjectInfo:
+        """Store an object: a zip, a model file, or a folder with one."""
+        return await stored(self.port, partial(named_object_upload, Path(source), name), ObjectInfo)
+
+    async def upload_classifier(
+        self, source: str | Path, *, classes: list[str] | None = None, name: str | None = None
+    ) -> ClassifierInfo:
+        """Store a classifier's file. ``classes`` defaults to the names in a JSON file beside it."""
+        read = partial(classifier_upload, source, classes=classes, name=name)
+        return await stored(self.port, read, ClassifierInfo)
+
+    async def upload_background(self, source: str | Path) -> str:
+        """Store a picture. Returns its id, for the options ``background`` and ``masks`` of a ``JobSpec``."""
+        return (await stored(self.port, partial(background_upload, Path(source)), BackgroundInfo)).id
+
+    async def send(self, request: Request[T]) -> T:
+        """Send one request and parse its answer."""
+        return await send(self.port, request)
+
+    async def close(self) -> None:
+        """As ``Client.close``."""
+        await self.port.close()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        await self.close()
+
+
+class Client(_Connected["BlockingPort"]):
+    """A connection to a Trompe server. Use it as a context manager, or ``close`` it. Threads may share one.
+
+    Args:
+        server: address; default: TROMPE_SERVER, else http://127.0.0.1:8000.
+        token: access token; default: TROMPE_TOKEN.
+        timeout: longest silence of the server, seconds; 300 s more after an upload.
+        retries: limit and pauses of retries. Every request can be repeated safely.
+        transport: an httpx transport in place of the network, for tests.
+
+    Every method raises ``APIError`` for a refusal by the server, and ``ServerUnreachable``.
+    """
+
+    def _open(self, connection: Connection, retries: Retries) -> "BlockingPort":
+        from trompe_client._http import BlockingPort  # slow to import
+
+        return BlockingPort(connection, retries)
+
+    def attack(self, object: str | Path, *, label: Label, key: str | None = None, **options: Any) -> JobHandle:
+        """Submit an attack and return a handle on the job at once.
 
         Args:
-            object: path of a zip, of a folder with an .obj, or of an .obj; or the name or id of a stored object.
-            label: the object's true class, a name or an index.
-            key: with a key of its own an attack is made once, however often it is submitted.
-            options: everything else about the attack, see ``AttackOptions``; ``classifier`` first of all.
+            object: path of a zip, a model file or a folder with one; or the name or id of a stored object.
+            label: the object's true class: a name or an index; or several that all count as the object.
+            key: idempotency key; the same key makes one job.
+            options: by the keywords of ``trompe_shared.api.OPTIONS``, listed in docs/sdk.md. ``classifier``,
+                ``ensemble``, ``judges``, ``background`` and ``masks`` take names or paths. Class names are read from
+                ``<stem>.classes.json``, ``imagenet_classes.json`` or ``classes.json`` beside a classifier's file.
 
-        Raises ``ObjectError``, ``ClassifierError`` or ``SpecError`` for what is wrong on this side.
+        Raises ``ObjectError``, ``ClassifierError`` or ``SpecError`` for invalid files and options.
         """
         plan = partial(plan_attack, object, label=label, **options)
         return self.submit(finish(planned(self.port, plan)), key=key)
@@ -75,26 +182,24 @@ class Client:
         return self.submit(finish(uploaded(self.port, plan)), key=key)
 
     def submit(self, spec: JobSpec, *, key: str | None = None) -> JobHandle:
-        """Submit a job whose object and classifiers are stored already: a ``JobRequest``, or a ``JobSpec``.
+        """Submit a ``JobRequest`` or ``JobSpec`` of stored objects and classifiers.
 
-        Raises ``Conflict`` when another job was submitted with this ``key``.
+        Raises ``Conflict`` if another job was submitted with this ``key``.
         """
         return JobHandle(self, self.send(_core.submit(spec, key=key or _core.new_key())))
 
     def map(
         self, attacks: Iterable[Attack], *, batch: str | None = None, concurrency: int = 8
     ) -> Iterator[Outcome[JobHandle]]:
-        """Submit many attacks, then give each as it ends, with its result or its error; none is raised.
+        """Submit many attacks and yield each as it ends, with its result or its error. Errors are not raised.
 
-        Nothing is submitted before the first outcome is asked for.
+        Nothing is submitted before the first outcome is requested.
 
         Args:
-            attacks: arguments of ``attack`` as mappings, or jobs for ``submit``. A file that several name is read and
-                uploaded once.
-            batch: a name for all of them, which the jobs carry as their label ``batch``. The same attacks under the
-                same name again are found as they are: a script that was cut off goes on where it was. By default a new
-                one.
-            concurrency: requests at a time, not jobs.
+            attacks: arguments of ``attack`` as mappings, or jobs for ``submit``. Each file is read and uploaded once.
+            batch: name of the call; the jobs carry it as their label ``batch``. The same attacks under the same name
+                find the existing jobs, so an interrupted script continues. Default: a new name.
+            concurrency: number of simultaneous requests, not of jobs.
         """
         outcomes = iterate(run_all(self.port, list(attacks), batch=batch, concurrency=concurrency))
         return (outcome.of(partial(JobHandle, self)) for outcome in outcomes)
@@ -111,56 +216,28 @@ class Client:
         object: str | None = None,
         classifier: str | None = None,
     ) -> Iterator[JobHandle]:
-        """Handles on all jobs that are as asked for, newest first; pages are fetched as they are reached.
+        """Handles on all matching jobs, newest first; pages are fetched when they are reached.
 
-        ``labels`` are those that a job must have; ``object`` and ``classifier`` are ids, or names of shipped ones.
+        A job must have all ``labels``. ``object`` and ``classifier`` are ids, or names of shipped ones.
         """
         wanted = JobFilter(JobState(state) if state else None, labels or {}, object, classifier)
         return (JobHandle(self, job) for job in iterate(pages(self.port, wanted)))
 
-    def objects(self) -> list[ObjectInfo]:
-        """The stored objects, those that come with Trompe included."""
-        return self.send(_core.objects())
-
-    def classifiers(self) -> list[ClassifierInfo]:
-        """The stored classifiers, those that come with Trompe included."""
-        return self.send(_core.classifiers())
-
-    def backgrounds(self) -> list[BackgroundInfo]:
-        """The uploaded pictures."""
-        return self.send(_core.backgrounds())
-
-    def workers(self) -> list[WorkerInfo]:
-        """The processes that run jobs."""
-        return self.send(_core.workers())
-
-    def renderers(self) -> list[RendererInfo]:
-        """The renderer workers that the server knows."""
-        return self.send(_core.renderers())
-
-    def upload_object(self, source: str | Path, *, name: str | None = None) -> ObjectInfo:
-        """Store an object: a zip, a folder with an .obj, or an .obj file."""
-        read = partial(named_object_upload, Path(source), name)
-        return finish(uploaded_file(self.port, read, _core.upload_object))
-
-    def upload_classifier(
-        self, source: str | Path, *, classes: list[str] | None = None, name: str | None = None
-    ) -> ClassifierInfo:
-        """Store a classifier's file; ``classes`` defaults to the names in a JSON file beside it."""
-        read = partial(classifier_upload, source, classes=classes, name=name)
-        return finish(uploaded_file(self.port, read, _core.upload_classifier))
-
-    def upload_background(self, source: str | Path) -> str:
-        """Store a picture; gives the id that ``JobSpec.background`` and ``JobSpec.masks`` take."""
-        read = partial(background_upload, Path(source))
-        return finish(uploaded_file(self.port, read, _core.upload_background)).id
+    objects = blocking(AsyncClient.objects)
+    classifiers = blocking(AsyncClient.classifiers)
+    backgrounds = blocking(AsyncClient.backgrounds)
+    workers = blocking(AsyncClient.workers)
+    renderers = blocking(AsyncClient.renderers)
+    upload_object = blocking(AsyncClient.upload_object)
+    upload_classifier = blocking(AsyncClient.upload_classifier)
+    upload_background = blocking(AsyncClient.upload_background)
 
     def send(self, request: Request[T]) -> T:
-        """Send one request and read its answer."""
+        """Send one request and parse its answer."""
         return finish(send(self.port, request))
 
     def close(self) -> None:
-        """Close the connections; jobs go on."""
+        """Close the connections. Jobs continue."""
         self.port.close()
 
     def __enter__(self) -> Self:

@@ -1,7 +1,4 @@
-"""What is said to the server and how its answers are read. No I/O: any HTTP library can carry a ``Request``.
-
-One function per request of the contract; ``_operations`` puts them together.
-"""
+"""Requests of the contract and parsers of their answers. No I/O: any HTTP library can carry a ``Request``."""
 
 import secrets
 from collections.abc import Callable, Mapping
@@ -13,17 +10,7 @@ from urllib.parse import quote
 
 from pydantic import TypeAdapter, ValidationError
 
-from trompe_client._errors import (
-    APIError,
-    BadRequest,
-    Conflict,
-    ContractError,
-    Forbidden,
-    NotFound,
-    ServerFault,
-    TooMany,
-    Unauthorized,
-)
+from trompe_client._errors import BY_STATUS, APIError, BadRequest, ContractError, ServerFault
 from trompe_client._plan import Upload
 from trompe_shared.api import (
     BackgroundInfo,
@@ -31,7 +18,6 @@ from trompe_shared.api import (
     Event,
     Job,
     JobList,
-    JobRequest,
     JobSpec,
     JobState,
     ObjectInfo,
@@ -45,16 +31,23 @@ from trompe_shared.faults import faults_of
 T = TypeVar("T")
 
 SHORT_PAGE: Final = 50
+"""Jobs on the first page of a list."""
 LONG_PAGE: Final = 500
-"""Jobs on a page of a list: as many as people look at; and as many as a server gives."""
+"""Jobs on further pages: the server's limit."""
+PATHS: Final[dict[Any, str]] = {
+    ObjectInfo: "/v1/objects",
+    ClassifierInfo: "/v1/classifiers",
+    BackgroundInfo: "/v1/backgrounds",
+    WorkerInfo: "/v1/workers",
+    RendererInfo: "/v1/renderers",
+}
 
 
 @dataclass(frozen=True)
 class Request(Generic[T]):
-    """One request, and ``read``, which makes the answer's body into a value.
+    """One request, and the parser ``read`` of its answer's body.
 
-    Every request of the contract can be sent twice with the effect of once: what makes a job carries a key, and what
-    stores a file stores the same bytes once.
+    Every request is idempotent: new jobs carry a key, and the same bytes are stored once.
     """
 
     method: str
@@ -69,7 +62,7 @@ class Request(Generic[T]):
 
 @dataclass(frozen=True)
 class JobFilter:
-    """Which jobs to list: all those that are as it says."""
+    """Filter of a list of jobs."""
 
     state: JobState | None = None
     labels: Mapping[str, str] = field(default_factory=dict)
@@ -77,53 +70,31 @@ class JobFilter:
     classifier: str | None = None
 
     def params(self) -> list[tuple[str, str]]:
-        """As the parameters of a request."""
+        """Query parameters of a request."""
         words = {"state": self.state, "object": self.object, "classifier": self.classifier}
         given = [(name, str(word)) for name, word in words.items() if word is not None]
         return given + [("label", f"{name}:{value}") for name, value in self.labels.items()]
 
 
-def upload_object(upload: Upload) -> Request[ObjectInfo]:
-    return Request("POST", "/v1/objects", _reader(ObjectInfo), upload=upload)
+def store(upload: Upload, kind: type[T]) -> Request[T]:
+    """Store a file; the answer is its record, an ``upload.kind``."""
+    return Request("POST", PATHS[kind], _reader(kind), upload=upload)  # type: ignore[arg-type]
 
 
-def upload_classifier(upload: Upload) -> Request[ClassifierInfo]:
-    return Request("POST", "/v1/classifiers", _reader(ClassifierInfo), upload=upload)
-
-
-def upload_background(upload: Upload) -> Request[BackgroundInfo]:
-    return Request("POST", "/v1/backgrounds", _reader(BackgroundInfo), upload=upload)
-
-
-def objects() -> Request[list[ObjectInfo]]:
-    return Request("GET", "/v1/objects", _reader(list[ObjectInfo]))
-
-
-def classifiers() -> Request[list[ClassifierInfo]]:
-    return Request("GET", "/v1/classifiers", _reader(list[ClassifierInfo]))
-
-
-def backgrounds() -> Request[list[BackgroundInfo]]:
-    return Request("GET", "/v1/backgrounds", _reader(list[BackgroundInfo]))
-
-
-def workers() -> Request[list[WorkerInfo]]:
-    return Request("GET", "/v1/workers", _reader(list[WorkerInfo]))
-
-
-def renderers() -> Request[list[RendererInfo]]:
-    return Request("GET", "/v1/renderers", _reader(list[RendererInfo]))
+def listed(kind: type[T]) -> Request[list[T]]:
+    """All records of a kind."""
+    return Request("GET", PATHS[kind], _reader(list[kind]))  # type: ignore[valid-type]
 
 
 def new_key() -> str:
-    """A key that no other job has: with it, a submission can be repeated and makes one job."""
+    """A random idempotency key."""
     return secrets.token_hex(16)
 
 
 def submit(spec: JobSpec, *, key: str) -> Request[Job]:
-    """A job, made once for ``key``; all that a ``JobSpec`` leaves open has ``JobRequest``'s defaults."""
-    body = JobRequest.of(spec).model_dump_json()
-    return Request("POST", "/v1/jobs", _reader(Job), headers={"Idempotency-Key": key}, json=body)
+    """Submit a job; the same ``key`` makes one job. The queue's options of a plain ``JobSpec`` have their defaults."""
+    headers = {"Idempotency-Key": key}
+    return Request("POST", "/v1/jobs", _reader(Job), headers=headers, json=spec.model_dump_json())
 
 
 def jobs(wanted: JobFilter, *, limit: int, cursor: str | None = None) -> Request[JobList]:
@@ -149,7 +120,7 @@ def delete(job_id: str) -> Request[None]:
 
 
 def events(job_id: str, *, after: int | None) -> Request[bytes]:
-    """The job's events as a stream; ``after`` is the id of the last one already seen."""
+    """Stream of the events after the one with the id ``after``."""
     resume = {} if after is None else {"Last-Event-ID": str(after)}
     headers = {"Accept": "text/event-stream", **resume}
     return Request("GET", f"{_job_path(job_id)}/events", bytes, headers=headers, job_id=job_id)
@@ -168,19 +139,19 @@ def archive(job_id: str) -> Request[bytes]:
 
 
 def _file(job_id: str, path: str) -> Request[bytes]:
-    """A file as it is: compressed on its way, neither its ranges nor its checksum would be those of its bytes."""
+    """A file without content encoding, so that ranges and checksum are of its own bytes."""
     identity = {"Accept-Encoding": "identity"}
     return Request("GET", f"{_job_path(job_id)}/{path}", bytes, headers=identity, job_id=job_id)
 
 
 class EventParser:
-    """Server-sent events, line by line (https://html.spec.whatwg.org/multipage/server-sent-events.html)."""
+    """Parser of server-sent events (https://html.spec.whatwg.org/multipage/server-sent-events.html)."""
 
     def __init__(self) -> None:
         self._data: list[str] = []
 
     def feed(self, line: str) -> Event | None:
-        """Take one line without its end; gives the event that the line completes, if it does."""
+        """Parse one line without its line break. Returns the event that it completes, or None."""
         if line.startswith("data:"):
             self._data.append(line[5:].removeprefix(" "))
         if line or not self._data:
@@ -191,33 +162,22 @@ class EventParser:
 
 
 def error_from(status: int, headers: Mapping[str, str], body: bytes, *, job_id: str | None) -> APIError:
-    """The error that a refusing answer stands for; a body that is no problem document is quoted."""
+    """The error of an answer. Quotes a body that is not a problem document."""
     try:
         problem = Problem.model_validate_json(body)
     except ValidationError:
         said = body[:200].decode("utf-8", "replace").strip() or "(empty)"
-        problem = Problem(
-            title=f"HTTP {status}, not from Trompe's API", status=status, detail=f"The answer was {said!r}"
-        )
-    kind = _KINDS.get(status, ServerFault if status >= 500 else BadRequest)
+        problem = Problem(title=f"HTTP {status}, not from Trompe's API. The answer was {said!r}", status=status)
+    kind = BY_STATUS.get(status, ServerFault if status >= 500 else BadRequest)
     pause = _retry_after(headers.get("Retry-After"))
     return kind(problem, request_id=headers.get("X-Request-ID"), job_id=job_id, retry_after=pause)
 
 
-_KINDS: Final[dict[int, type[APIError]]] = {
-    401: Unauthorized,
-    403: Forbidden,
-    404: NotFound,
-    409: Conflict,
-    429: TooMany,
-}
-
-
 def _retry_after(header: str | None) -> float | None:
-    """Seconds to wait, from either form that the header can have."""
+    """Seconds to wait, from a number or an HTTP date."""
     if header is None or header.isdecimal():
         return None if header is None else float(header)
-    from email.utils import parsedate_to_datetime  # rarely needed, and it brings much with it
+    from email.utils import parsedate_to_datetime  # rarely needed, and slow to import
 
     try:
         return max(0.0, (parsedate_to_datetime(header) - datetime.now(UTC)).total_seconds())
@@ -231,7 +191,7 @@ def _job_path(job_id: str) -> str:
 
 @cache
 def _reader(schema: Any) -> Callable[[bytes], Any]:
-    """A function from a JSON body to ``schema``. The function raises ``ContractError``."""
+    """Parser of a JSON body; raises ``ContractError``."""
     adapter: TypeAdapter[Any] = TypeAdapter(schema)
 
     def read(body: bytes) -> Any:
@@ -239,8 +199,8 @@ def _reader(schema: Any) -> Callable[[bytes], Any]:
             return adapter.validate_json(body)
         except ValidationError as error:
             raise ContractError(
-                f"The server's answer is not what this client expects ({next(faults_of(error))}). "
-                "Is it a Trompe server? Install the same version of trompe on both sides."
+                f"The server's answer does not fit the contract ({next(faults_of(error))}). Check that the address is "
+                "a Trompe server's, and install the same version of trompe on both sides."
             ) from error
 
     return read

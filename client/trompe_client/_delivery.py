@@ -1,4 +1,4 @@
-"""What a job made, as files in the user's folder."""
+"""Results in the form of the user's object."""
 
 import os
 import shutil
@@ -7,31 +7,26 @@ import zipfile
 from pathlib import Path, PurePosixPath
 
 from trompe_client._errors import ContractError
-
-__all__ = ["ADVERSARIAL", "in_the_form_of"]
-
-ADVERSARIAL = "adversarial.zip"
-"""The artifact that holds the adversarial object."""
+from trompe_client._plan import SPLIT_SUFFIXES
+from trompe_shared.api import ADVERSARIAL
 
 
-def in_the_form_of(source: str, archive: Path) -> Path:
-    """Turn the downloaded ``archive`` into what the user gave: a zip stays one, a folder or .obj becomes a folder.
+def in_the_form_of(source: str, file: Path) -> Path:
+    """Unpack the zip with the repainted object if ``source`` is a folder or a model with files beside it.
 
-    It is called ``<name>_adversarial`` after ``source`` and lies beside ``archive``, which it takes the place of.
+    Returns the folder; any other file stays as it is.
     """
     given = Path(source)
-    is_folder, is_mesh = given.is_dir(), given.suffix.lower() == ".obj"
-    name = f"{given.resolve().name if is_folder else given.stem if given.is_file() else given.name}_adversarial"
-    if not (is_folder or is_mesh):
-        return archive.replace(archive.with_name(f"{name}.zip"))
-    folder = archive.with_name(name)
-    _unpack(archive, folder)
-    archive.unlink()
+    if not (file.name.endswith(f"{ADVERSARIAL}.zip") and (given.is_dir() or given.suffix.lower() in SPLIT_SUFFIXES)):
+        return file
+    folder = file.with_suffix("")
+    _unpack(file, folder)
+    file.unlink()
     return folder
 
 
 def _unpack(archive: Path, folder: Path) -> None:
-    """Unpack a flat zip; ``folder`` is replaced when all of it is there."""
+    """Unpack a flat zip, and replace ``folder`` by it once it is complete."""
     with tempfile.TemporaryDirectory(dir=archive.parent, prefix=".unpacking-") as scratch:
         fresh = Path(scratch, "object")
         fresh.mkdir()

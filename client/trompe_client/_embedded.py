@@ -1,4 +1,4 @@
-"""The service for the time of one command: ``trompe serve`` in a process of its own."""
+"""An embedded service for one command: ``trompe serve`` as a child process."""
 
 import os
 import re
@@ -15,13 +15,11 @@ from typing import Final
 
 from trompe_client._errors import EmbeddedServerError, ServerUnreachable, Unauthorized
 
-__all__ = ["embedded_server"]
-
 SERVE: Final = (sys.executable, "-m", "trompe_client.cli", "serve", "--port", "0", "--data")
 READY: Final = re.compile(r"^trompe serving on (http://\S+)", re.MULTILINE)
 HAS_TOKENS: Final = (
-    "The service of this command's own works on data that have tokens (TROMPE_DATA, TROMPE_DATABASE); "
-    "`trompe token create NAME` makes another."
+    "The embedded service uses data with tokens (TROMPE_DATA, TROMPE_DATABASE); `trompe token create NAME` makes "
+    "another token."
 )
 TAIL_LINES: Final = 20
 STOP_SECONDS: Final = 20.0
@@ -29,11 +27,10 @@ STOP_SECONDS: Final = 20.0
 
 @contextmanager
 def embedded_server(*, command: Sequence[str] = SERVE, start_seconds: float = 180.0) -> Iterator[str]:
-    """The URL of a service of our own, up for the time of the block.
+    """URL of a service that runs for the block. Its data folder is ``$TROMPE_DATA``, else a temporary one.
 
-    Its data lie in ``$TROMPE_DATA``, else in a temporary folder that goes with it. Raises ``EmbeddedServerError`` with
-    the end of its log when it does not come up within ``start_seconds``, or dies. ``Unauthorized`` that is raised in
-    the block says that the data have tokens.
+    Raises ``EmbeddedServerError`` with the end of its log if it does not start within ``start_seconds``, or dies.
+    ``Unauthorized`` raised in the block gets a remedy.
     """
     with tempfile.TemporaryDirectory(prefix="trompe-") as scratch, _signals_unwind():
         log = Path(scratch, "serve.log")
@@ -42,7 +39,7 @@ def embedded_server(*, command: Sequence[str] = SERVE, start_seconds: float = 18
         try:
             yield _wait_for_url(process, log, start_seconds)
         except ServerUnreachable as error:
-            raise EmbeddedServerError(f"The embedded service is gone. {error}\n{_tail(log)}") from error
+            raise EmbeddedServerError(f"The embedded service has ended. {error}\n{_tail(log)}") from error
         except Unauthorized as error:
             detail = f"{error.problem.detail or ''} {HAS_TOKENS}".strip()
             raise Unauthorized(error.problem.model_copy(update={"detail": detail})) from error
@@ -51,7 +48,7 @@ def embedded_server(*, command: Sequence[str] = SERVE, start_seconds: float = 18
 
 
 def _start(command: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
-    """Start the service in its own session, so that Ctrl-C reaches us alone and we can cancel the job first."""
+    """Start the service in its own session, so that Ctrl-C does not reach it and the job can be cancelled first."""
     environment = dict(os.environ, PYTHONUNBUFFERED="1")
     with log.open("wb") as output:
         return subprocess.Popen(
@@ -67,19 +64,19 @@ def _start(command: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
 def _wait_for_url(process: "subprocess.Popen[bytes]", log: Path, seconds: float) -> str:
     deadline = time.monotonic() + seconds
     while True:
-        status = process.poll()  # before the log is read, so that a dead process's last words are in it
+        status = process.poll()  # before the log is read, which is then complete
         match = READY.search(log.read_text("utf-8", "replace"))
         if status is not None:
-            raise EmbeddedServerError(f"The embedded service ended at its start (exit code {status}).\n{_tail(log)}")
+            raise EmbeddedServerError(f"The embedded service failed to start (exit code {status}).\n{_tail(log)}")
         if match:
             return match[1]
         if time.monotonic() > deadline:
-            raise EmbeddedServerError(f"The embedded service did not come up within {seconds:.0f} s.\n{_tail(log)}")
+            raise EmbeddedServerError(f"The embedded service did not start within {seconds:.0f} s.\n{_tail(log)}")
         time.sleep(0.1)
 
 
 def _stop(process: "subprocess.Popen[bytes]") -> None:
-    """Ask it to stop; after ``STOP_SECONDS``, or if it is dead, end what is left of its session."""
+    """Terminate it; after ``STOP_SECONDS`` kill its session."""
     process.terminate()
     with suppress(subprocess.TimeoutExpired):
         process.wait(STOP_SECONDS)
@@ -90,12 +87,12 @@ def _stop(process: "subprocess.Popen[bytes]") -> None:
 
 def _tail(log: Path) -> str:
     lines = log.read_text("utf-8", "replace").splitlines()[-TAIL_LINES:]
-    return "\n".join(f"  | {line}" for line in lines) or "  | (it said nothing)"
+    return "\n".join(f"  | {line}" for line in lines) or "  | (no output)"
 
 
 @contextmanager
 def _signals_unwind() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the command through its ``finally`` blocks, so that no service is left behind."""
+    """Turn SIGTERM and SIGHUP into ``SystemExit``, so that ``finally`` blocks stop the service."""
 
     def leave(number: int, _frame: FrameType | None) -> None:
         raise SystemExit(128 + number)

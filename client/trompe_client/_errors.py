@@ -1,55 +1,39 @@
-"""The errors of the client; those about inputs (``ObjectError``, ``SpecError``...) are shared with the server.
+"""Errors of the client. Errors about inputs (``ObjectError``, ``SpecError``...) are shared with the server.
 
     TrompeError                      trompe_shared.errors
-    └── ClientError                  has the ids it knows: request_id, job_id
-        ├── ServerUnreachable        nothing answers at the server's address, or the connection broke
-        ├── EmbeddedServerError      the service that a command starts for itself did not come up, or died
-        ├── BrokenDownload           the bytes that came are not those that the server promised
-        ├── ContractError            an answer that this client cannot read: another version, or no Trompe server
-        ├── APIError                 the server said no: has status, problem
-        │   ├── BadRequest           400, 413, 415, 422: what was sent is wrong
-        │   ├── Unauthorized         401: a token is needed, or this one is not known
-        │   ├── Forbidden            403: the token has not the right to do this
+    └── ClientError                  knows request_id and job_id, if there are any
+        ├── ServerUnreachable        no answer at the server's address, or a broken connection
+        ├── EmbeddedServerError      the embedded service failed to start, or died
+        ├── BrokenDownload           wrong checksum
+        ├── ContractError            unreadable answer: another version, or not a Trompe server
+        ├── APIError                 refusal by the server: has status, problem, retry_after
+        │   ├── BadRequest           400, 413, 415, 422: invalid request
+        │   ├── Unauthorized         401: missing, unknown or revoked token
+        │   ├── Forbidden            403: missing right
         │   ├── NotFound             404: no such job, object, classifier or file
-        │   ├── Conflict             409: not possible in the present state
-        │   ├── TooMany              429: too many requests; has retry_after
-        │   └── ServerFault          5xx: the server's own fault
+        │   ├── Conflict             409: not possible in the current state
+        │   ├── TooMany              429: too many requests
+        │   └── ServerFault          5xx: error of the server
         └── JobError                 has job, as last seen
             ├── JobFailed            the job ended in an error
-            ├── JobCancelled         somebody cancelled the job
-            └── WaitTimeout          the job was still going on when the time was up; it goes on
+            ├── JobCancelled         the job was cancelled
+            └── WaitTimeout          the job continues after the timeout
 
 A job that ends as n.a. (nothing was recognised before the attack) is a result, not an error.
 """
 
-from typing import ClassVar
+import re
+from typing import Any, ClassVar, Final
 
 from trompe_shared.api import Job, Problem
 from trompe_shared.errors import TrompeError
 
-__all__ = [
-    "APIError",
-    "BadRequest",
-    "BrokenDownload",
-    "ClientError",
-    "Conflict",
-    "ContractError",
-    "EmbeddedServerError",
-    "Forbidden",
-    "JobCancelled",
-    "JobError",
-    "JobFailed",
-    "NotFound",
-    "ServerFault",
-    "ServerUnreachable",
-    "TooMany",
-    "Unauthorized",
-    "WaitTimeout",
-]
-
 
 class ClientError(TrompeError):
-    """Base of the client's own errors. ``request_id`` finds the request in the server's log."""
+    """Base of the client's own errors. ``request_id`` finds the request in the server's log.
+
+    ``code`` is made from the class's name: ``not-found`` for ``NotFound``.
+    """
 
     code = "client"
 
@@ -58,40 +42,38 @@ class ClientError(TrompeError):
         self.request_id = request_id
         self.job_id = job_id
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "code" not in vars(cls):
+            cls.code = re.sub("(?<=[a-z])(?=[A-Z])", "-", cls.__name__.removesuffix("Error")).lower()
+
 
 class ServerUnreachable(ClientError):  # noqa: N818
-    """Nothing answers at the server's address, or the connection broke."""
+    """No answer at the server's address, or a broken connection."""
 
     code = "unreachable"
 
 
 class EmbeddedServerError(ClientError):
-    """The service that a command starts for itself did not come up, or died."""
-
-    code = "embedded-server"
+    """The embedded service failed to start, or died."""
 
 
 class BrokenDownload(ClientError):  # noqa: N818
-    """The bytes that came are not those that the server promised."""
-
-    code = "broken-download"
+    """The checksum of a downloaded file differs from the server's."""
 
 
 class ContractError(ClientError):
-    """An answer that this client cannot read."""
-
-    code = "contract"
+    """The server's answer does not fit the contract."""
 
 
 class APIError(ClientError):
     """The server refused a request. ``problem`` is its answer (RFC 9457), ``status`` the HTTP status.
 
-    ``retry_after`` is how many seconds the server asks to be left in peace, where it says so.
+    ``retry_after``: pause that the server asks for, seconds.
     """
 
-    code = "api"
     remedy: ClassVar[str] = ""
-    """What helps, where the server does not know how its clients are told."""
+    """Added to the server's message."""
 
     def __init__(
         self,
@@ -110,52 +92,40 @@ class APIError(ClientError):
 
 
 class BadRequest(APIError):  # noqa: N818
-    """What was sent is wrong; the message says what."""
-
-    code = "bad-request"
+    """The request is invalid."""
 
 
 class Unauthorized(APIError):  # noqa: N818
-    """A token is needed, or this one is unknown or revoked. Give one by ``token=`` or TROMPE_TOKEN."""
+    """The token is missing, unknown or revoked."""
 
-    code = "unauthorized"
-    remedy = "Give a token by TROMPE_TOKEN, --token or Client(token=...)."
+    remedy = "Give a valid token, for example in TROMPE_TOKEN."
 
 
 class Forbidden(APIError):  # noqa: N818
-    """The token has not the right to do this."""
-
-    code = "forbidden"
+    """The token lacks the right."""
 
 
 class NotFound(APIError):  # noqa: N818
-    """There is no such job, object, classifier or file."""
-
-    code = "not-found"
+    """No such job, object, classifier or file."""
 
 
 class Conflict(APIError):  # noqa: N818
-    """Not possible in the present state."""
-
-    code = "conflict"
+    """Not possible in the current state."""
 
 
 class TooMany(APIError):  # noqa: N818
-    """Too many requests, and still so after some retries."""
-
-    code = "too-many"
+    """Too many requests, even after retries."""
 
 
 class ServerFault(APIError):  # noqa: N818
-    """The server's own fault; its log has the request id."""
+    """Error of the server; its log has the request id."""
 
-    code = "server-fault"
+
+BY_STATUS: Final = {401: Unauthorized, 403: Forbidden, 404: NotFound, 409: Conflict, 429: TooMany}
 
 
 class JobError(ClientError):
-    """A job did not come to a result. ``job`` is the job as last seen."""
-
-    code = "job"
+    """A job ended without a result. ``job`` is the job as last seen."""
 
     def __init__(self, message: str, *, job: Job) -> None:
         super().__init__(message, job_id=job.id)
@@ -165,23 +135,17 @@ class JobError(ClientError):
 class JobFailed(JobError):  # noqa: N818
     """The job ended in an error."""
 
-    code = "job-failed"
-
 
 class JobCancelled(JobError):  # noqa: N818
-    """Somebody cancelled the job."""
-
-    code = "job-cancelled"
+    """The job was cancelled."""
 
 
 class WaitTimeout(JobError):  # noqa: N818
-    """The job was still going on when the time was up; it goes on."""
-
-    code = "wait-timeout"
+    """The job continues after the timeout."""
 
 
 def _explain(problem: Problem) -> str:
-    """One paragraph: title and detail, or what is wrong field by field where there is no detail."""
+    """The detail, or else the title with the faults of the fields."""
     fields = [f"{error.get('field')}: {error.get('message')}" for error in problem.errors or []]
-    parts = [problem.title, *([problem.detail] if problem.detail else fields)]
+    parts = [problem.detail] if problem.detail else [problem.title, *fields]
     return ". ".join(part.rstrip(".") for part in parts) + "."

@@ -1,4 +1,4 @@
-"""A job from its first event to its last, over as many connections as it takes. Coroutines over a ``Port``."""
+"""Events of a job to its end, over any number of connections. Coroutines over a ``Port``."""
 
 import time
 from collections.abc import AsyncGenerator, Callable
@@ -12,13 +12,13 @@ from trompe_client._port import Port
 from trompe_shared.api import Event, Job, JobState
 
 PATIENCE: Final = 60.0
-"""How long a server may be gone (restarting) while a job is followed, seconds."""
+"""Seconds that a server may be unreachable (restarting) while a job is followed."""
 SILENCE: Final = 30.0
-"""How long an event stream may say nothing before it is opened anew, seconds."""
+"""Seconds without an event or comment before a stream is opened again."""
 PAUSE: Final = 0.5
-"""Time between two connections, seconds."""
+"""Seconds between two connections."""
 AWAY: Final = (ServerUnreachable, ServerFault, TooMany)
-"""Errors of a server that may be itself again in a moment."""
+"""Temporary errors of a server."""
 
 
 class Followed:
@@ -29,7 +29,7 @@ class Followed:
 
     @property
     def id(self) -> str:
-        """The job's id; ``client.job(id)`` gives the handle again."""
+        """The job's id, for ``client.job(id)``."""
         return self.status.id
 
     @property
@@ -53,7 +53,7 @@ async def wait(port: Port, job: Followed, *, timeout: float | None, show: Callab
 
 
 def follow(port: Port, job: Followed) -> AsyncGenerator[Event, None]:
-    """All events of a job, each as it happens."""
+    """All events of a job, as they happen."""
     return _follow(port, job, None)
 
 
@@ -90,7 +90,7 @@ async def _stream(port: Port, job: Followed, after: int | None, deadline: float 
 
 
 async def refresh_patiently(port: Port, job: Followed, deadline: float | None = None) -> Job:
-    """Ask for the job's status, of a server that may be just restarting."""
+    """The job's status, from a server that may be restarting."""
     give_up, attempt = time.monotonic() + PATIENCE, 0
     while True:
         _check_time(job, deadline)
@@ -107,7 +107,7 @@ async def refresh_patiently(port: Port, job: Followed, deadline: float | None = 
 
 def _check_time(job: Followed, deadline: float | None) -> None:
     if deadline is not None and time.monotonic() > deadline:
-        raise WaitTimeout(f"Job {job.id} is still {job.state.value}; it goes on.", job=job.status)
+        raise WaitTimeout(f"Job {job.id} is still {job.state.value}; it continues.", job=job.status)
 
 
 def _raise_unless_done(job: Followed) -> None:
@@ -117,7 +117,7 @@ def _raise_unless_done(job: Followed) -> None:
 
 
 def failure(job: Job) -> JobFailed | JobCancelled | None:
-    """The error that a job ended in, if it did."""
+    """The error of a failed or cancelled job, else None."""
     if job.state is JobState.failed:
         return JobFailed(f"Job {job.id} failed: {job.error or 'no reason given'}", job=job)
     if job.state is JobState.cancelled:

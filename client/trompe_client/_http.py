@@ -1,4 +1,4 @@
-"""The two ports over httpx, which no other module imports: one blocks, one is asynchronous."""
+"""The blocking and the asynchronous port over httpx, which no other module imports."""
 
 import asyncio
 import ipaddress
@@ -18,19 +18,17 @@ from trompe_client._port import finish
 from trompe_client._retry import Retries
 from trompe_client._settings import Connection
 
-__all__ = ["AsyncPort", "BlockingPort"]
-
 CONNECT_SECONDS: Final = 10.0
-"""Longest time to get through to the server."""
+"""Timeout of connecting."""
 
 READING_SECONDS: Final = 300.0
-"""How much longer the server may be silent after an upload, which it reads before it answers."""
+"""Additional timeout after an upload, which the server reads before it answers."""
 
 T = TypeVar("T")
 
 
 class BlockingPort:
-    """Does its work on the spot; its coroutines never suspend."""
+    """Blocks; its coroutines never suspend."""
 
     def __init__(self, connection: Connection, retries: Retries) -> None:
         self.retries = retries
@@ -67,7 +65,7 @@ class BlockingPort:
 
 
 class AsyncPort:
-    """Suspends its coroutines while the network is busy; needs asyncio."""
+    """Suspends during I/O; needs asyncio."""
 
     def __init__(self, connection: Connection, retries: Retries) -> None:
         self.retries = retries
@@ -146,17 +144,14 @@ def _options(connection: Connection) -> dict[str, Any]:
         "headers": {"User-Agent": f"trompe/{version('trompe')}", **token},
         "timeout": httpx.Timeout(connection.timeout, connect=min(CONNECT_SECONDS, connection.timeout)),
         "transport": connection.transport,
-        # A proxy from the environment cannot reach a server on this very machine.
+        # A proxy cannot reach a server on this machine.
         "trust_env": not _is_loopback(httpx.URL(connection.url).host),
     }
 
 
 @contextmanager
 def _arguments(request: Request[Any], silence: float | None, timeout: float) -> Iterator[dict[str, Any]]:
-    """What httpx is told; a file that is to be sent is open for the time of the block, and httpx reads it in pieces.
-
-    ``timeout`` is the connection's own longest silence.
-    """
+    """Arguments for httpx. A file to upload is open within the block, and httpx streams it."""
     upload = request.upload
     arguments: dict[str, Any] = {
         "method": request.method,
@@ -178,17 +173,17 @@ def _arguments(request: Request[Any], silence: float | None, timeout: float) -> 
 
 @contextmanager
 def _translated(url: str) -> Iterator[None]:
-    """httpx's errors of the network as our own."""
+    """Translate httpx's network errors."""
     try:
         yield
     except (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout) as error:
         raise ServerUnreachable(
             f"No Trompe server answers at {url} ({error or type(error).__name__}). "
-            "Start one with `trompe serve`, or give the right address (--server, TROMPE_SERVER, Client(url))."
+            "Start one with `trompe serve`, or correct the address, for example in TROMPE_SERVER."
         ) from error
     except (httpx.RequestError, httpx.InvalidURL) as error:
         raise ServerUnreachable(
-            f"The connection to {url} broke ({type(error).__name__}: {error}). Look at the server's log."
+            f"The connection to {url} broke ({type(error).__name__}: {error}). Check the server's log."
         ) from error
 
 

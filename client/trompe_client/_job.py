@@ -1,4 +1,4 @@
-"""Handles on one job: follow it, wait for it, fetch what it made."""
+"""Handles on one job: follow it, wait for it, download its results."""
 
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -7,102 +7,64 @@ from typing import TYPE_CHECKING, Self
 from trompe_client import _core
 from trompe_client._following import Followed, follow, wait
 from trompe_client._operations import send
-from trompe_client._port import finish, iterate
+from trompe_client._port import Port, blocking, finish, iterate
 from trompe_client._progress import Progress, shown
 from trompe_client._transfer import fetch, fetch_all
 from trompe_shared.api import Event, Job, Result
 
 if TYPE_CHECKING:
-    from trompe_client._async_client import AsyncClient
-    from trompe_client._client import Client
-
-__all__ = ["AsyncJobHandle", "JobHandle"]
+    from trompe_client._client import AsyncClient, Client
 
 
-class JobHandle(Followed):
-    """A job on a server. ``status`` is the job as last seen; ``refresh`` asks again."""
+class _Handle(Followed):
+    """A job of a client."""
 
-    def __init__(self, client: "Client", status: Job) -> None:
+    def __init__(self, client: "Client | AsyncClient", status: Job) -> None:
         super().__init__(status)
-        self._client = client
-        self._port = client.port
+        self.client = client
+        self._port: Port = client.port
 
     @property
     def server(self) -> str:
         """The server's address."""
-        return self._client.server
-
-    def refresh(self) -> Job:
-        """Ask the server for the job's status."""
-        self.status = finish(send(self._port, _core.job(self.id)))
-        return self.status
-
-    def wait(self, timeout: float | None = None, *, progress: Progress = False) -> Self:
-        """Wait until the job is done and return this handle, so that ``job.wait().result()`` reads well.
-
-        Args:
-            timeout: seconds; None waits for ever.
-            progress: show a bar, on the terminal or in the notebook; or a function of yours, to hand each event to.
-
-        Raises ``JobFailed``, ``JobCancelled``, or ``WaitTimeout`` when the time is up (the job goes on); a job that
-        ends as n.a. raises nothing. Raises ``ServerUnreachable`` when the server stays away for a minute.
-        """
-        with shown(progress) as show:
-            finish(wait(self._port, self, timeout=timeout, show=show))
-        return self
-
-    def events(self) -> Iterator[Event]:
-        """All events of the job from its first to its last, each as it happens; survives dropped connections."""
-        return iterate(follow(self._port, self))
-
-    def result(self) -> Result:
-        """The figures of a finished job. Raises ``APIError`` when there are none (yet)."""
-        return finish(send(self._port, _core.result(self.id)))
-
-    def download(self, folder: str | Path) -> list[Path]:
-        """Fetch all artifacts into ``folder``, which is made if need be; gives their paths.
-
-        A file appears under its name when it is whole and its checksum is right, and replaces one of that name. What an
-        earlier download brought is not fetched again, and one that was cut off goes on where it was.
-        """
-        self.status, paths = finish(fetch_all(self._port, self.id, Path(folder)))
-        return paths
-
-    def archive(self, path: str | Path) -> Path:
-        """Fetch all artifacts as one zip file."""
-        return finish(fetch(self._port, _core.archive(self.id), Path(path)))
-
-    def cancel(self) -> Job:
-        """Ask the server to stop the job; it does so at the end of the current chunk of work."""
-        self.status = finish(send(self._port, _core.cancel(self.id)))
-        return self.status
-
-    def retry(self) -> "JobHandle":
-        """Submit the same job anew; gives the new one. Raises ``Conflict`` for a job that has not ended."""
-        return JobHandle(self._client, finish(send(self._port, _core.retry(self.id, key=_core.new_key()))))
-
-    def delete(self) -> None:
-        """Delete the job and its files. Raises ``Conflict`` for a job that has not ended."""
-        finish(send(self._port, _core.delete(self.id)))
+        return self.client.server
 
 
-class AsyncJobHandle(Followed):
-    """``JobHandle`` for asyncio: the same methods, to be awaited; ``events`` is iterated by ``async for``."""
+class AsyncJobHandle(_Handle):
+    """``JobHandle`` for asyncio: the same methods to await; iterate ``events`` by ``async for``."""
 
-    def __init__(self, client: "AsyncClient", status: Job) -> None:
-        super().__init__(status)
-        self._client = client
-        self._port = client.port
-
-    @property
-    def server(self) -> str:
-        """As ``JobHandle.server``."""
-        return self._client.server
+    client: "AsyncClient"
 
     async def refresh(self) -> Job:
-        """As ``JobHandle.refresh``."""
+        """Update ``status`` from the server."""
         self.status = await send(self._port, _core.job(self.id))
         return self.status
+
+    async def result(self) -> Result:
+        """The result of an ended job. Raises ``Conflict`` before that."""
+        return await send(self._port, _core.result(self.id))
+
+    async def download(self, folder: str | Path) -> list[Path]:
+        """Download all artifacts into ``folder``, created if missing. Returns their paths.
+
+        A file appears under its name once it is complete and its checksum is right, and replaces an older one. Existing
+        files are not downloaded again, and interrupted downloads continue.
+        """
+        self.status, paths = await fetch_all(self._port, self.id, Path(folder))
+        return paths
+
+    async def archive(self, path: str | Path) -> Path:
+        """Download all artifacts as one zip file."""
+        return await fetch(self._port, _core.archive(self.id), Path(path))
+
+    async def cancel(self) -> Job:
+        """Cancel the job. A running one stops at the end of its current chunk of work."""
+        self.status = await send(self._port, _core.cancel(self.id))
+        return self.status
+
+    async def delete(self) -> None:
+        """Delete the job and its files. Raises ``Conflict`` for a job that has not ended."""
+        await send(self._port, _core.delete(self.id))
 
     async def wait(self, timeout: float | None = None, *, progress: Progress = False) -> Self:
         """As ``JobHandle.wait``."""
@@ -114,28 +76,40 @@ class AsyncJobHandle(Followed):
         """As ``JobHandle.events``."""
         return follow(self._port, self)
 
-    async def result(self) -> Result:
-        """As ``JobHandle.result``."""
-        return await send(self._port, _core.result(self.id))
-
-    async def download(self, folder: str | Path) -> list[Path]:
-        """As ``JobHandle.download``."""
-        self.status, paths = await fetch_all(self._port, self.id, Path(folder))
-        return paths
-
-    async def archive(self, path: str | Path) -> Path:
-        """As ``JobHandle.archive``."""
-        return await fetch(self._port, _core.archive(self.id), Path(path))
-
-    async def cancel(self) -> Job:
-        """As ``JobHandle.cancel``."""
-        self.status = await send(self._port, _core.cancel(self.id))
-        return self.status
-
     async def retry(self) -> "AsyncJobHandle":
         """As ``JobHandle.retry``."""
-        return AsyncJobHandle(self._client, await send(self._port, _core.retry(self.id, key=_core.new_key())))
+        return AsyncJobHandle(self.client, await send(self._port, _core.retry(self.id, key=_core.new_key())))
 
-    async def delete(self) -> None:
-        """As ``JobHandle.delete``."""
-        await send(self._port, _core.delete(self.id))
+
+class JobHandle(_Handle):
+    """A job on a server. ``status`` is the job as last seen; ``refresh`` updates it."""
+
+    client: "Client"
+    refresh = blocking(AsyncJobHandle.refresh)
+    result = blocking(AsyncJobHandle.result)
+    download = blocking(AsyncJobHandle.download)
+    archive = blocking(AsyncJobHandle.archive)
+    cancel = blocking(AsyncJobHandle.cancel)
+    delete = blocking(AsyncJobHandle.delete)
+
+    def wait(self, timeout: float | None = None, *, progress: Progress = False) -> Self:
+        """Wait for the end of the job. Returns this handle: ``job.wait().result()``.
+
+        Args:
+            timeout: seconds; None waits for ever.
+            progress: whether to show a bar on the terminal or in the notebook; or a function that gets each event.
+
+        Raises ``JobFailed``, ``JobCancelled``, ``WaitTimeout`` (the job continues), or ``ServerUnreachable`` after a
+        minute without the server. A job that ends as n.a. raises nothing.
+        """
+        with shown(progress) as show:
+            finish(wait(self._port, self, timeout=timeout, show=show))
+        return self
+
+    def events(self) -> Iterator[Event]:
+        """All events of the job, as they happen; survives dropped connections."""
+        return iterate(follow(self._port, self))
+
+    def retry(self) -> "JobHandle":
+        """Submit the same job again. Returns the new one. Raises ``Conflict`` for a job that has not ended."""
+        return JobHandle(self.client, finish(send(self._port, _core.retry(self.id, key=_core.new_key()))))

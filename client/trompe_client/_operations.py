@@ -1,4 +1,4 @@
-"""Requests that are sent again where that may help, and what takes several of them. Coroutines over a ``Port``."""
+"""Requests with retries, and operations of several requests. Coroutines over a ``Port``."""
 
 from collections.abc import AsyncGenerator, Callable
 from typing import Any, TypeVar
@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 async def send(port: Port, request: Request[T]) -> T:
-    """Send a request, again while there is hope, and read its answer. Raises ``ClientError``."""
+    """Send a request, with retries, and parse its answer. Raises ``ClientError``."""
     attempt = 0
     while True:
         try:
@@ -28,14 +28,14 @@ async def send(port: Port, request: Request[T]) -> T:
 
 
 async def send_once(port: Port, request: Request[T]) -> T:
-    """Send a request and read its answer. Raises ``ClientError``."""
+    """Send a request and parse its answer. Raises ``ClientError``."""
     async with port.open(request) as answer:
         await check(answer, request)
         return request.read(await answer.body())
 
 
 async def check(answer: Answer, request: Request[Any]) -> None:
-    """Raise the error that a refusing answer stands for."""
+    """Raise the ``APIError`` of an answer other than success."""
     if answer.status >= 300:
         raise _core.error_from(answer.status, answer.headers, await answer.body(), job_id=request.job_id)
 
@@ -45,29 +45,22 @@ async def planned(port: Port, plan: Callable[[], AttackPlan]) -> JobRequest:
     return await uploaded(port, await port.off(plan))
 
 
-async def uploaded(port: Port, plan: AttackPlan) -> JobRequest:
-    """Upload a plan's files; gives the job, which names them by id."""
-
-    async def stored(request: Callable[[Upload], Request[Any]], source: Upload | str) -> str:
-        return source if isinstance(source, str) else str((await send(port, request(source))).id)
-
-    return plan.spec(
-        object=await stored(_core.upload_object, plan.object),
-        classifier=await stored(_core.upload_classifier, plan.classifier),
-        ensemble=[await stored(_core.upload_classifier, member) for member in plan.ensemble],
-        judges=[await stored(_core.upload_classifier, judge) for judge in plan.judges],
-        background=[await stored(_core.upload_background, picture) for picture in plan.backgrounds],
-        masks={texture: await stored(_core.upload_background, picture) for texture, picture in plan.masks.items()},
-    )
+async def uploaded(port: Port, plan: AttackPlan, ids: dict[Upload, str] | None = None) -> JobRequest:
+    """Upload a plan's files without an id in ``ids``, and add theirs. Returns the job."""
+    ids = {} if ids is None else ids
+    for upload in plan.uploads():
+        if upload not in ids:
+            ids[upload] = (await send(port, _core.store(upload, upload.kind))).id
+    return plan.request(ids)
 
 
-async def uploaded_file(port: Port, upload: Callable[[], Upload], request: Callable[[Upload], Request[T]]) -> T:
+async def stored(port: Port, upload: Callable[[], Upload], kind: type[T]) -> T:
     """Read a file and store it on the server."""
-    return await send(port, request(await port.off(upload)))
+    return await send(port, _core.store(await port.off(upload), kind))
 
 
 async def pages(port: Port, wanted: JobFilter) -> AsyncGenerator[Job, None]:
-    """All jobs that are as wanted, newest first; a page is fetched when it is reached, and the first one is short."""
+    """All matching jobs, newest first. Pages are fetched when they are reached; the first one is short."""
     cursor: str | None = None
     while True:
         limit = _core.LONG_PAGE if cursor else _core.SHORT_PAGE

@@ -1,211 +1,148 @@
-"""What the user points at, made ready to send: files are found and options checked before any server is asked."""
+"""An attack before it is sent: its files are found and its options checked before any request."""
 
 import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Final, TypedDict, Unpack
+from typing import Any, BinaryIO, Final
 
 from pydantic import ValidationError
 
-from trompe_shared.api import (
-    AttackOn,
-    JobRequest,
-    Loss,
-    Needs,
-    Optimiser,
-    Priority,
-    SaliencyScope,
-    SunRanges,
-    SurrogateModel,
-    ViewRanges,
-)
+from trompe_shared.api import OPTIONS, BackgroundInfo, ClassifierInfo, JobRequest, ObjectInfo, in_parts
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
-from trompe_shared.faults import faults_of
+from trompe_shared.faults import Fault, faults_of
 
-__all__ = [
-    "AttackOptions",
-    "AttackPlan",
-    "JobOptions",
-    "Sources",
-    "Upload",
-    "background_source",
-    "background_upload",
-    "classifier_source",
-    "classifier_upload",
-    "each_source",
-    "mask_upload",
-    "named_object_upload",
-    "object_source",
-    "object_upload",
-    "plan_attack",
-]
-
-CLASSIFIER_SUFFIXES: Final = (".pt2", ".pt", ".torchscript", ".onnx")
-CLASSIFIER_KINDS: Final = ("torchvision:", "hub:")
-"""How names begin that are looked up elsewhere, whatever they end with."""
+CLASSIFIER_SUFFIXES: Final = (".pt2", ".onnx")
+LOOKED_UP: Final = "torchvision:"
+"""Prefix of names of torchvision's networks, whatever their suffix."""
 SPLIT_SUFFIXES: Final = {".obj", ".gltf"}
-"""Models whose textures and materials lie in files beside them."""
+"""Models with textures and materials in files beside them."""
 MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, ".glb", ".fbx", ".ply", ".stl"}
 PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
 
-
-Sources = str | Path | Sequence[str | Path]
+StoredKind = type[ObjectInfo | ClassifierInfo | BackgroundInfo]
+Source = str | Path
 
 
 @dataclass(frozen=True)
 class Upload:
-    """A file to send, with the form fields that go with it.
+    """A file to send. ``content``: its bytes, or the path to read them from piece by piece.
 
-    ``content`` is its bytes, or the path of the file that holds them: that is read piece by piece while it is sent.
+    ``form``: fields to send with it. ``kind``: the record that the server makes of it.
     """
 
     filename: str
     content: bytes | Path = field(repr=False)
-    form: Mapping[str, str] = field(default_factory=dict)
+    form: Mapping[str, str] = field(default_factory=dict, hash=False)
+    kind: StoredKind = ObjectInfo
 
     def sha256(self) -> str:
-        """Of its bytes, in hexadecimal."""
+        """SHA-256 of the bytes, in hexadecimal."""
         if isinstance(self.content, bytes):
             return hashlib.sha256(self.content).hexdigest()
         with self.content.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
     def opened(self) -> AbstractContextManager[bytes | BinaryIO]:
-        """Its bytes, or the file, open for the time of the block."""
+        """The bytes, or the file, open within the block."""
         return self.content.open("rb") if isinstance(self.content, Path) else nullcontext(self.content)
-
-
-class JobOptions(TypedDict, total=False):
-    """Options of a job; those left out take ``JobRequest``'s defaults, where they are explained."""
-
-    diverse: bool
-    attack_on: AttackOn
-    sun: SunRanges | Mapping[str, Any]
-    vertex_budget: float
-    epsilon: float
-    alpha: float
-    tau: float | None
-    saliency_scope: SaliencyScope
-    keep: float | None
-    materials: Sequence[str]
-    epsilon_view: float | None
-    target_label: str | int | None
-    top_k: int
-    loss: Loss
-    optimiser: Optimiser
-    restarts: int
-    queries: int | None
-    surrogate: SurrogateModel
-    steps: int
-    seed: int
-    distance: float | None
-    elevation: tuple[float, float] | None
-    azimuths: int
-    elevations: int
-    pool: int
-    views_per_step: int | None
-    ranges: ViewRanges | Mapping[str, Any]
-    held_out: int
-    priority: Priority
-    labels: Mapping[str, str]
-    needs: Needs
-
-
-class AttackOptions(JobOptions, total=False):
-    """Options of an attack: those of a job, and what may be a file on this side.
-
-    - ``classifier``: path of a .pt2, TorchScript (.pt, .torchscript) or .onnx file; or the name or id of a stored
-      classifier, by default ``tiny``. Class names are read from ``<stem>.classes.json``, ``imagenet_classes.json`` or
-      ``classes.json`` beside the file.
-    - ``ensemble``: classifiers that are attacked together with it, given alike.
-    - ``judges``: classifiers that only judge the result, given alike.
-    - ``background``: "white", "black", "#rrggbb", or the path of a picture; each view draws one of several.
-    - ``masks``: by the file name of a texture, the path of a picture of its size that is white where it may change.
-    """
-
-    classifier: str | Path
-    ensemble: Sources
-    judges: Sources
-    background: Sources
-    masks: Mapping[str, str | Path]
 
 
 @dataclass(frozen=True)
 class AttackPlan:
-    """An attack with its files in hand. Object, classifiers and backgrounds are uploads, or names the server knows.
+    """A job by keyword, with an ``Upload`` in place of each file."""
 
-    ``masks`` are pictures by the texture's file name.
-    """
+    options: Mapping[str, Any]
 
-    object: Upload | str
-    label: str | int
-    classifier: Upload | str
-    ensemble: tuple[Upload | str, ...]
-    judges: tuple[Upload | str, ...]
-    backgrounds: tuple[Upload | str, ...]
-    masks: Mapping[str, Upload]
-    options: JobOptions
+    def uploads(self) -> list[Upload]:
+        """Files to send before the job, each once."""
+        found = (each for value in self.options.values() for each in _items(value) if isinstance(each, Upload))
+        return list(dict.fromkeys(found))
 
-    def spec(
-        self,
-        *,
-        object: str,
-        classifier: str,
-        ensemble: list[str],
-        judges: list[str],
-        background: list[str],
-        masks: dict[str, str],
-    ) -> JobRequest:
-        """The job, with the ids that the uploads were given. Raises ``SpecError``."""
-        attacked = {"object": object, "label": self.label, "classifier": classifier, "ensemble": ensemble}
-        others = {"judges": judges, "background": background, "masks": masks}
+    def request(self, ids: Mapping[Upload, str]) -> JobRequest:
+        """The job with ids in place of files; a file without an id keeps its name. Raises ``SpecError``."""
+
+        def named(value: Any) -> Any:
+            if isinstance(value, Upload):
+                return ids.get(value, value.filename)
+            if isinstance(value, Mapping):
+                return {key: named(each) for key, each in value.items()}
+            return [named(each) for each in value] if isinstance(value, list) else value
+
+        fields = {keyword: named(value) for keyword, value in self.options.items()}
+        object = fields.pop("object")
         try:
-            return JobRequest.model_validate(attacked | others | dict(self.options))
+            return JobRequest.model_validate({"object": object, **in_parts(fields)})
         except ValidationError as error:
-            wrong = "; ".join(map(str, faults_of(error)))
-            raise SpecError(f"The attack's options are not right: {wrong}.") from error
+            raise SpecError(f"Invalid options: {'; '.join(map(_by_keyword, faults_of(error)))}.") from error
 
 
-def plan_attack(
-    object: str | Path,
-    *,
-    label: str | int,
-    classifier: str | Path = "tiny",
-    ensemble: Sources = (),
-    judges: Sources = (),
-    background: Sources = "white",
-    masks: Mapping[str, str | Path] | None = None,
-    **options: Unpack[JobOptions],
-) -> AttackPlan:
-    """Read the files and check the options. Raises ``ObjectError``, ``ClassifierError`` or ``SpecError``."""
-    plan = AttackPlan(
-        object_source(object),
-        label,
-        classifier_source(classifier),
-        tuple(classifier_source(each) for each in each_source(ensemble)),
-        tuple(classifier_source(each) for each in each_source(judges)),
-        tuple(background_source(each) for each in each_source(background)),
-        {texture: mask_upload(Path(picture)) for texture, picture in (masks or {}).items()},
-        options,
-    )
-    plan.spec(object="", classifier="", ensemble=[], judges=[], background=[""] * len(plan.backgrounds), masks={})
+def _by_keyword(fault: Fault) -> str:
+    """A fault at the keyword of its option; a rule between options names them itself."""
+    part, field, *inner = [*fault.place.split("."), ""]
+    for option in OPTIONS.values():
+        if (option.part, option.field) == (part, field):
+            return f"{' '.join([f'`{option.keyword}`', *filter(None, inner)])}: {fault.message}"
+    return fault.message if fault.kind == "value_error" else str(fault)
+
+
+Read = Callable[[str, Source], Upload | str]
+"""Reads a file of a kind ("object" or a ``FileKind``); gives the name of a stored one back as it is."""
+
+
+def source_of(kind: str, source: Source) -> Upload | str:
+    """A file as an upload, any other word as it is. Raises ``ObjectError``, ``ClassifierError`` or ``SpecError``."""
+    read: Mapping[str, Callable[[Source], Upload | str]] = {
+        "object": object_source,
+        "classifier": classifier_source,
+        "background": background_source,
+        "mask": lambda picture: _picture(Path(picture), "mask", "the texture's size, white where it may change"),
+    }
+    return read[kind](source)
+
+
+def plan_attack(object: Source, *, read: Read = source_of, **options: Any) -> AttackPlan:
+    """Read the files and check the options (``OPTIONS``, and the queue's).
+
+    Raises ``ObjectError``, ``ClassifierError`` or ``SpecError``.
+    """
+    planned: dict[str, Any] = {"object": read("object", object)}
+    for keyword, value in options.items():
+        option = OPTIONS.get(keyword)
+        if option is None or option.file is None:
+            planned[keyword] = value
+        else:
+            several = option.repeated and isinstance(value, str | Path)
+            planned[keyword] = _read_all([value] if several else value, partial(read, option.file))
+    plan = AttackPlan(planned)
+    plan.request({})
     return plan
 
 
-def each_source(sources: Sources) -> Sequence[str | Path]:
-    """One source is a list of one, never its letters."""
-    return [sources] if isinstance(sources, str | Path) else sources
+def _read_all(value: Any, read: Callable[[Source], Upload | str]) -> Any:
+    if isinstance(value, str | Path):
+        return read(value)
+    return {name: read(each) for name, each in value.items()} if isinstance(value, Mapping) else list(map(read, value))
 
 
-def object_source(source: str | Path) -> Upload | str:
-    """A zip, a model file or a folder that holds one becomes an upload; any other word is a stored object's name.
+def _items(value: Any) -> Iterator[Any]:
+    if isinstance(value, Mapping):
+        yield from value.values()
+    elif isinstance(value, list):
+        yield from value
+    else:
+        yield value
 
-    Raises ``ObjectError`` for a path that is none of these.
+
+def object_source(source: Source) -> Upload | str:
+    """A zip, a model file or a folder with one as an upload; any other word is a stored object's name.
+
+    Raises ``ObjectError`` for a path without such a file.
     """
     path = Path(source)
     is_path = isinstance(source, Path) or path.is_file() or path.suffix.lower() in {".zip", *MODEL_SUFFIXES}
@@ -213,7 +150,7 @@ def object_source(source: str | Path) -> Upload | str:
 
 
 def object_upload(path: Path) -> Upload:
-    """A zip, a model file (an .obj or .gltf with what lies beside it), or a folder that holds one.
+    """A zip, a model file (an .obj or .gltf with the files beside it), or a folder with one.
 
     Raises ``ObjectError``.
     """
@@ -226,60 +163,54 @@ def object_upload(path: Path) -> Upload:
     if path.suffix.lower() in SPLIT_SUFFIXES:
         return Upload(f"{path.stem}.zip", _zip_files([path, *_companions(path)]))
     if path.suffix.lower() not in MODEL_SUFFIXES and not zipfile.is_zipfile(path):
-        raise ObjectError(f"{str(path)!r} is not a zip archive. Give a zip, or the folder or model file itself.")
+        raise ObjectError(f"{str(path)!r} is not a zip archive. Give a zip, a model file, or a folder with one.")
     return Upload(path.name, path)
 
 
 def named_object_upload(path: Path, name: str | None) -> Upload:
-    """An object to be stored under a name; None leaves it that of the file."""
+    """An object to store under ``name``, or under the file's name."""
     return replace(object_upload(path), form={"name": name} if name else {})
 
 
-def classifier_source(source: str | Path) -> Upload | str:
-    """A file, told by its ending, becomes an upload; any other word is a name. Raises ``ClassifierError``."""
-    is_file = Path(source).suffix.lower() in CLASSIFIER_SUFFIXES and not str(source).startswith(CLASSIFIER_KINDS)
+def classifier_source(source: Source) -> Upload | str:
+    """A .pt2 or .onnx file as an upload; any other word is a name. Raises ``ClassifierError``."""
+    is_file = Path(source).suffix.lower() in CLASSIFIER_SUFFIXES and not str(source).startswith(LOOKED_UP)
     return classifier_upload(source) if is_file else str(source)
 
 
-def classifier_upload(source: str | Path, *, classes: list[str] | None = None, name: str | None = None) -> Upload:
-    """A classifier's file with its class names: ``classes``, or those in a JSON file beside it.
+def classifier_upload(source: Source, *, classes: list[str] | None = None, name: str | None = None) -> Upload:
+    """A classifier's file with its class names: ``classes``, or the JSON list in a file beside it.
 
-    Raises ``ClassifierError`` when there is no such file or when the names are not a JSON list of strings.
+    Raises ``ClassifierError`` for a missing file, or for class names in another format.
     """
     path = Path(source)
     if not path.is_file():
         raise ClassifierError(
-            f"There is no classifier file {str(path)!r}. Give one that ends in {', '.join(CLASSIFIER_SUFFIXES)}, "
-            "or a stored one's name."
+            f"There is no classifier file {str(path)!r}. Give a file that ends in {' or '.join(CLASSIFIER_SUFFIXES)}, "
+            "or the name of a stored classifier."
         )
     names = classes if classes is not None else _classes_beside(path)
     form = {"classes": json.dumps(names)} if names is not None else {}
-    return Upload(path.name, path, form | ({"name": name} if name else {}))
+    return Upload(path.name, path, form | ({"name": name} if name else {}), ClassifierInfo)
 
 
-def background_source(source: str | Path) -> Upload | str:
-    """A picture file becomes an upload; any other word is a colour. Raises ``SpecError``."""
+def background_source(source: Source) -> Upload | str:
+    """A picture file as an upload; any other word is a colour or an id. Raises ``SpecError``."""
     return background_upload(Path(source)) if Path(source).suffix.lower() in PICTURE_SUFFIXES else str(source)
 
 
 def background_upload(path: Path) -> Upload:
-    """A picture file. Raises ``SpecError`` when there is none."""
-    return _picture(path, "background", "Give a picture file, white, black or '#rrggbb'.")
-
-
-def mask_upload(path: Path) -> Upload:
-    """A picture of a texture's size, white where it may change. Raises ``SpecError`` when there is none."""
-    return _picture(path, "mask", "Give a picture of the texture's size, white where the texture may change.")
+    """A picture file. Raises ``SpecError`` if it is missing."""
+    return _picture(path, "background", "any size; or white, black or '#rrggbb'")
 
 
 def _picture(path: Path, use: str, remedy: str) -> Upload:
     if not path.is_file():
-        raise SpecError(f"There is no {use} picture {str(path)!r}. {remedy}")
-    return Upload(path.name, path)
+        raise SpecError(f"There is no {use} picture {str(path)!r}. Give a picture of {remedy}.")
+    return Upload(path.name, path, kind=BackgroundInfo)
 
 
 def _classes_beside(path: Path) -> list[str] | None:
-    """Class names from the first of the usual files beside a classifier."""
     candidates = [f"{path.stem}.classes.json", "imagenet_classes.json", "classes.json"]
     file = next((file for name in candidates if (file := path.with_name(name)).is_file()), None)
     if file is None:
@@ -307,13 +238,13 @@ def _models_in(folder: Path) -> list[Path]:
 
 
 def _companions(mesh: Path) -> list[Path]:
-    """Material files, buffers and pictures in the folder of an .obj or .gltf file."""
+    """Material files, buffers and pictures beside an .obj or .gltf file."""
     wanted = {".mtl", ".json", ".bin", *PICTURE_SUFFIXES}
     return [file for file in mesh.parent.iterdir() if file.is_file() and file.suffix.lower() in wanted]
 
 
 def _zip_files(files: list[Path]) -> bytes:
-    """A flat zip with fixed time stamps, sorted by name: the same files give the same bytes."""
+    """A flat zip, sorted by name, with fixed time stamps: the same files give the same bytes."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for file in sorted(files, key=lambda file: file.name):

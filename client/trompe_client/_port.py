@@ -1,21 +1,23 @@
-"""What operations need of the world around them: one protocol, which a blocking and an asynchronous client provide.
+"""Protocol between operations and I/O, implemented for the blocking and the asynchronous client.
 
-Operations are written once, as coroutines over a ``Port``. The blocking client's port never suspends them: it does its
-work on the spot, so that ``finish`` can run a coroutine from its first line to its last with no event loop at hand.
+Operations are written once, as coroutines over a ``Port``. The blocking port never suspends them, so ``finish`` can run
+a coroutine to its end without an event loop.
 """
 
+import functools
 from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine, Generator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast
 
 from trompe_client._core import Request
 from trompe_client._retry import Retries
 
+A = ParamSpec("A")
 T = TypeVar("T")
 
 
 class Answer(Protocol):
-    """A server's answer, whose body comes in little by little."""
+    """A server's answer with a streamed body."""
 
     @property
     def status(self) -> int:
@@ -23,7 +25,7 @@ class Answer(Protocol):
 
     @property
     def headers(self) -> Mapping[str, str]:
-        """The headers; their names may be asked for in any case."""
+        """The headers, with case-insensitive names."""
 
     async def body(self) -> bytes:
         """All of the body."""
@@ -36,40 +38,50 @@ class Answer(Protocol):
 
 
 class Port(Protocol):
-    """The way out of an operation. ``retries`` is how often it may try again."""
+    """I/O of an operation."""
 
     @property
     def retries(self) -> Retries:
-        """How often what failed is tried again, and after which pause."""
+        """Limit and pauses of retries."""
 
     def open(self, request: Request[Any], *, silence: float | None = None) -> AbstractAsyncContextManager[Answer]:
-        """Send one request; its answer can be read within the block. ``silence``: longest time without a byte, seconds.
+        """Send one request; the answer is readable within the block. ``silence``: longest time without a byte, seconds.
 
-        Raises ``ServerUnreachable``, also for a connection that breaks within the block.
+        Raises ``ServerUnreachable``, also if the connection breaks within the block.
         """
 
     async def sleep(self, seconds: float) -> None:
-        """Let time pass."""
+        """Wait."""
 
     async def off(self, work: Callable[[], T]) -> T:
-        """Do something that blocks, such as reading a file, out of the way of whatever else goes on."""
+        """Run blocking work, such as reading a file, without blocking an event loop."""
 
     async def together(self, calls: Sequence[Callable[[], Coroutine[Any, Any, T]]], *, limit: int) -> list[T]:
-        """What all ``calls`` return, in their order; at most ``limit`` of them go on at a time."""
+        """Results of all ``calls``, in their order; at most ``limit`` run at a time."""
 
 
 def finish(operation: Awaitable[T]) -> T:
-    """What a coroutine returns that runs over a port which never suspends."""
+    """Result of a coroutine over a blocking port."""
     steps = operation.__await__()
     try:
         next(steps)
     except StopIteration as done:
         return cast(T, done.value)
-    raise RuntimeError("an operation of the blocking client has asked for an event loop")
+    raise RuntimeError("an operation of the blocking client needs an event loop")
+
+
+def blocking(method: Callable[Concatenate[Any, A], Coroutine[Any, Any, T]]) -> Callable[Concatenate[Any, A], T]:
+    """A coroutine method as a blocking one, for objects with a blocking port."""
+
+    @functools.wraps(method)
+    def run(self: Any, /, *args: A.args, **options: A.kwargs) -> T:
+        return finish(method(self, *args, **options))
+
+    return run
 
 
 def iterate(values: AsyncGenerator[T, None]) -> Generator[T, None, None]:
-    """The values of an asynchronous generator that runs over a port which never suspends."""
+    """Values of an asynchronous generator over a blocking port."""
     try:
         while True:
             try:

@@ -1,6 +1,8 @@
-"""A result as a table for people."""
+"""Tables of results, jobs and stored things for a terminal."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -10,55 +12,67 @@ from trompe_shared.api import (
     Accuracy,
     BackgroundInfo,
     ClassifierInfo,
+    GoalOptions,
     Job,
-    JobSpec,
     ObjectInfo,
     RendererInfo,
     Result,
     WorkerInfo,
+    in_flags,
 )
 
-__all__ = [
-    "backgrounds_table",
-    "classifiers_table",
-    "job_table",
-    "jobs_table",
-    "objects_table",
-    "renderers_table",
-    "result_report",
-    "workers_table",
-]
+PERCENT: Final = "{:.1%}"
+LEVELS: Final = "{:.4f} ({levels:.1f}/255)"
 
 
-def result_report(result: Result, *, note: str | None = None) -> RenderableType:
-    """Accuracies before and after, then how large the change is and how the figures came about."""
+def spent(result: Result, job: Job, *, start_up: float = 0.0, wall: float | None = None) -> dict[str, float]:
+    """Seconds from start to end, by what they went to: the queue, then the parts of the job.
+
+    wall: seconds of the command that submitted the job, with its files on disk; ``start_up``: those until the job was
+    submitted. Both are accounted for too, so that the sum is ``wall``.
+    """
+    if job.started is None or job.finished is None:
+        return result.seconds
+    queue, run = ((job.started - job.created).total_seconds(), (job.finished - job.started).total_seconds())
+    parts = {"queue": queue, **result.seconds}
+    parts["open"] = parts.get("open", 0.0) + max(0.0, run - sum(result.seconds.values()))
+    if wall is None or wall < queue + run:  # the job is older than the command
+        return parts
+    return {"start-up": start_up} | parts | {"download": max(0.0, wall - start_up - sum(parts.values()))}
+
+
+def result_report(
+    result: Result, *, note: str | None = None, seconds: Mapping[str, float] | None = None
+) -> RenderableType:
+    """Accuracies before and after, size of the change, and cost of the attack. ``seconds`` default to the job's own."""
     table = _table("", "views", "A_before", "A_after", "A_drop", right=4)
     for name, accuracy in _rows(result):
-        table.add_row(name, str(accuracy.views), *_cells(accuracy))
+        table.add_row(name, accuracy.counted, *_cells(accuracy))
     facts = Table.grid(padding=(0, 2))
     facts.add_column(no_wrap=True)
     facts.add_column()
-    for name, value in _facts(result):
+    for name, value in _facts(result, seconds or result.seconds):
         facts.add_row(name, value)
-    notes = [Text(f"n.a.: {note}", style="yellow")] if note else []
-    warnings = [Text(f"warning: {warning}", style="yellow") for warning in result.warnings]
+    notes = [Text(f"n.a.: {in_flags(note)}", style="yellow")] if note else []
+    warnings = [Text(f"warning: {in_flags(each)}", style="yellow") for each in result.warnings if each != note]
     return Group(Text(_headline(result), style="bold"), table, Text("[..] intervals at 95 %"), facts, *notes, *warnings)
 
 
 def jobs_table(jobs: Sequence[Job]) -> Table:
-    """One line per job; those with labels say them."""
+    """One line per job, with a column of labels if there are any."""
     labels = ["labels"] if any(job.labels for job in jobs) else []
     table = _table("job", "state", "object", "label", "classifier", "epsilon", "done", "created", *labels)
     for job in jobs:
         spec = job.spec
-        what = [_short(spec.object), str(spec.label), _short(spec.classifier), _budget(spec)]
+        object, classifier = (_short(_named(each, job)) for each in (spec.object, spec.victim.classifier))
+        what = [object, _either(spec.goal.label), classifier, f"{spec.paint.epsilon:g}"]
         how = [f"{job.progress.fraction:.0%}", f"{job.created:%Y-%m-%d %H:%M}"]
         table.add_row(job.id, job.state.value, *what, *how, *([_words(job.labels)] if labels else []))
     return table
 
 
 def job_table(job: Job) -> Table:
-    """All that is known of one job; of what was asked for, what is not the default."""
+    """State of a job, and its options that differ from the defaults."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
@@ -71,10 +85,11 @@ def job_table(job: Job) -> Table:
 def _job_facts(job: Job) -> Iterator[tuple[str, str]]:
     yield "job", job.id
     yield "state", f"{job.state.value}, {job.progress.phase}, {job.progress.fraction:.0%}"
-    yield "error", job.error or ""
-    yield "note", job.note or ""
-    for name, value in job.spec.model_dump(exclude_defaults=True).items():
-        yield name, str(value)
+    yield "error", in_flags(job.error or "")
+    yield "note", in_flags(job.note or "")
+    for name, value in ({"object": job.spec.object} | job.spec.changed()).items():
+        yield name, _named(", ".join(map(str, value)) if isinstance(value, list) else value, job)
+    yield "ids", " ".join(f"{name}={identity}" for identity, name in job.names.items())
     yield "labels", _words(job.labels)
     yield "priority", f"{job.priority}, needs {job.needs}"
     yield "attempts", f"{job.attempts}, worker {job.worker or 'none yet'}"
@@ -84,54 +99,42 @@ def _job_facts(job: Job) -> Iterator[tuple[str, str]]:
     yield "files", ", ".join(job.artifacts)
 
 
-def workers_table(workers: Sequence[WorkerInfo]) -> Table:
-    """One line per attack worker."""
-    table = _table("worker", "host", "device", "alive", "job", "started", "seen")
-    for one in workers:
-        times = [f"{time:%Y-%m-%d %H:%M:%S}" for time in (one.started, one.seen)]
-        table.add_row(one.id, one.host, one.device, _yes(one.alive), one.job or "", *times)
+def records_table(kind: type, records: Sequence[Any]) -> Table:
+    """One line per record of a kind: ``ObjectInfo``, ``ClassifierInfo``, ``BackgroundInfo`` and so on."""
+    columns, cells = _RECORDS[kind]
+    table = _table(*columns)
+    for record in records:
+        table.add_row(*cells(record))
     return table
 
 
-def renderers_table(renderers: Sequence[RendererInfo]) -> Table:
-    """One line per renderer worker."""
-    table = _table("renderer", "alive")
-    for one in renderers:
-        table.add_row(one.address, _yes(one.alive))
-    return table
+def _object_cells(obj: ObjectInfo) -> list[str]:
+    textures = ", ".join(f"{file} {width}x{height}" for file, (height, width) in obj.textures.items())
+    return [obj.name, _short(obj.id), str(obj.triangles), textures, f"{obj.radius:.3g} m", _origin(obj.shipped)]
 
 
-def backgrounds_table(backgrounds: Sequence[BackgroundInfo]) -> Table:
-    """One line per uploaded picture."""
-    table = _table("name", "id")
-    for one in backgrounds:
-        table.add_row(one.name, one.id)
-    return table
+def _classifier_cells(one: ClassifierInfo) -> list[str]:
+    use = "attack, judge" if one.white_box else "judge, attack by scores"
+    height, width = one.image_size
+    return [one.name, _short(one.id), use, f"{width}x{height}", str(one.n_classes), _origin(one.shipped)]
 
 
-def objects_table(objects: Sequence[ObjectInfo]) -> Table:
-    """One line per stored object."""
-    table = _table("name", "id", "triangles", "textures", "radius", "origin")
-    for obj in objects:
-        textures = ", ".join(f"{file} {width}x{height}" for file, (height, width) in obj.textures.items())
-        table.add_row(
-            obj.name, _short(obj.id), str(obj.triangles), textures, f"{obj.radius:.3g} m", _origin(obj.shipped)
-        )
-    return table
+def _worker_cells(one: WorkerInfo) -> list[str]:
+    times = [f"{time:%Y-%m-%d %H:%M:%S}" for time in (one.started, one.seen)]
+    return [one.id, one.host, one.device, _yes(one.alive), one.job or "", *times]
 
 
-def classifiers_table(classifiers: Sequence[ClassifierInfo]) -> Table:
-    """One line per stored classifier."""
-    table = _table("name", "id", "use", "input", "classes", "origin")
-    for one in classifiers:
-        use = "attack, judge" if one.white_box else "judge, attack by scores"
-        height, width = one.image_size
-        table.add_row(one.name, _short(one.id), use, f"{width}x{height}", str(one.n_classes), _origin(one.shipped))
-    return table
+_RECORDS: Final[Mapping[type, tuple[Sequence[str], Callable[[Any], Sequence[str]]]]] = {
+    ObjectInfo: (("name", "id", "triangles", "textures", "radius", "origin"), _object_cells),
+    ClassifierInfo: (("name", "id", "use", "input", "classes", "origin"), _classifier_cells),
+    BackgroundInfo: (("name", "id"), lambda one: (one.name, one.id)),
+    WorkerInfo: (("worker", "host", "device", "alive", "job", "started", "seen"), _worker_cells),
+    RendererInfo: (("renderer", "alive", "engine"), lambda one: (one.address, _yes(one.alive), one.identity or "")),
+}
 
 
 def _table(*columns: str, right: int = 0) -> Table:
-    """A table; the last ``right`` columns hold numbers: they are aligned to the right and keep to one line."""
+    """A table with numbers in the last ``right`` columns: aligned right and never wrapped."""
     table = Table()
     for index, name in enumerate(columns):
         number = index >= len(columns) - right
@@ -140,28 +143,33 @@ def _table(*columns: str, right: int = 0) -> Table:
 
 
 def _headline(result: Result) -> str:
-    label = f"{result.label_name} ({result.label})" if result.label_name else str(result.label)
-    scope = "" if result.spec.saliency_scope == "all_views" else " in each view"
-    tau = "none" if result.tau is None else f"{result.tau:g}{scope}"
-    keep = "" if result.spec.keep is None else f", keep {result.spec.keep:g}"
+    spec = result.spec
+    names = result.label_names or []
+    label = _either([f"{name} ({k})" for name, k in zip(names, result.labels, strict=False)] or result.labels)
+    tau = "none" if result.tau is None else f"{result.tau:g}"
+    keep = "" if spec.paint.keep is None else f", keep {spec.paint.keep:g}"
     budget = f"epsilon {result.epsilon:g}, alpha {result.alpha:g}, tau {tau}{keep}"
-    what = budget if result.spec.attack_on == "texture" else result.spec.attack_on
-    numbers = f"{what}, {result.steps} steps, seed {result.seed}"
-    through = " and ".join([result.classifier, *(_short(member) for member in result.spec.ensemble)])
-    return f"{result.object}, class {label}, attacked through {through}: {numbers}"
+    through = " and ".join([result.classifier, *map(_short, spec.victim.ensemble)])
+    return (
+        f"{result.object}, class {label}, attacked through {through}: {budget}, {result.steps} steps, "
+        f"seed {result.seed}"
+    )
 
 
 def _rows(result: Result) -> Iterator[tuple[str, Accuracy]]:
-    rows = [
-        ("surrogate (own views)", result.surrogate),
-        ("target (own views)", result.target),
-        ("target (held-out views)", result.held_out),
-    ]
+    rows: list[tuple[str, Accuracy | None]] = []
+    for name, each in result.by_renderer:
+        rows += [
+            (f"{name}surrogate (own views)", each.surrogate),
+            (f"{name}target (own views)", each.target),
+            (f"{name}target (held-out views)", each.held_out),
+        ]
     for judge in result.judges:
         rows += [
             (f"judge {judge.classifier} (own views)", judge.target),
             (f"judge {judge.classifier} (held-out views)", judge.held_out),
         ]
+    rows += [(f"held-out views, {each.pipeline}", each.held_out) for each in result.image_pipelines]
     return ((name, accuracy) for name, accuracy in rows if accuracy is not None)
 
 
@@ -172,69 +180,63 @@ def _cells(accuracy: Accuracy) -> list[str]:
 
 
 def _with_interval(share: float | None, interval: tuple[float, float] | None) -> str:
-    return _number(share) + (f" [{interval[0]:.2f}, {interval[1]:.2f}]" if interval else "")
+    return _figure(share) + (f" [{interval[0]:.2f}, {interval[1]:.2f}]" if interval else "")
 
 
-def _facts(result: Result) -> Iterator[tuple[str, str]]:
-    if result.goal_reached is not None and (result.spec.target_label is not None or result.spec.top_k > 1):
-        yield "goal reached", f"{_percent(result.goal_reached)} of the target views: {_goal(result.spec)}"
-    yield from _changed(result)
-    yield "max view change", _levels(result.max_view_change)
+def _facts(result: Result, seconds: Mapping[str, float]) -> Iterator[tuple[str, str]]:
+    goal = result.spec.goal
+    if result.drawn_by:
+        yield "renderer", result.drawn_by
+    if result.goal_reached is not None and (goal.target is not None or goal.top_k > 1):
+        yield "goal reached", f"{_figure(result.goal_reached, PERCENT)} of the target views: {_goal(goal)}"
+    if result.fooled_as:
+        yield "fooled views became", result.became
+    yield "N% (texels altered)", _figure(result.texels_altered, PERCENT)
+    yield "mean texel change", _figure(result.mean_texel_change, LEVELS)
+    yield "max view change", _figure(result.max_view_change, LEVELS)
     if result.views_beyond_epsilon is not None and result.pixels_beyond_epsilon is not None:
-        views, pixels = _percent(result.views_beyond_epsilon), f"{result.pixels_beyond_epsilon:.2%}"
-        yield "beyond epsilon", f"{views} of the target views ({pixels} of the object's pixels)"
-    if result.ssim is not None and result.delta_e is not None:
-        yield "what people see", f"SSIM {result.ssim:.3f}, colour difference (CIEDE2000) {result.delta_e:.2f}"
-    yield "surrogate model", f"{result.surrogate_model}: {result.surrogate_reason}"
-    yield "transfer gap", _number(result.transfer_gap)
-    yield "seconds", ", ".join(f"{phase} {seconds:.1f}" for phase, seconds in result.seconds.items())
+        views, pixels = _figure(result.views_beyond_epsilon, PERCENT), f"{result.pixels_beyond_epsilon:.2%}"
+        yield "above epsilon", f"{views} of the target views ({pixels} of the object's pixels)"
+    if result.ssim is not None and result.noticed is not None:
+        yield "visibility", f"{result.noticed} SSIM {result.ssim:.3f}"
+    for name, each in result.by_renderer:
+        if each.surrogate_model:
+            yield f"{name}surrogate model", f"{each.surrogate_model}: {each.surrogate_reason}"
+    differ = "" if result.disagreement is None else f"; they disagree on {result.disagreement:.1%} of the own views"
+    yield "transfer gap", f"{_figure(result.transfer_gap)}{differ}"
+    parts = ", ".join(f"{part} {took:.1f}" for part, took in seconds.items())
+    yield "seconds", f"{sum(seconds.values()):.1f}: {parts}"
     yield "probe renders", str(result.probe_renders)
     if result.evaluations is not None:
-        asked = "" if result.queries is None else f", {result.queries:,} scores asked"
-        yield "images evaluated", f"{result.evaluations:,} by each attacked classifier{asked}"
+        queries = "" if result.queries is None else f", {result.queries:,} scores asked"
+        yield "images evaluated", f"{result.evaluations:,} by each attacked classifier{queries}"
 
 
-def _changed(result: Result) -> Iterator[tuple[str, str]]:
-    """What the attack changed of texels, light or vertices."""
-    light, vertices = result.light, result.vertices
-    if result.spec.attack_on == "texture":
-        yield "N% (texels altered)", _percent(result.texels_altered)
-        yield "mean texel change", _levels(result.mean_texel_change)
-    if light is not None:
-        place = {name: getattr(light, name) for name in ("azimuth", "elevation", "intensity", "ambient")}
-        words = ", ".join(f"{name} {value:.3g}" for name, value in place.items() if value is not None)
-        yield "light found", f"{words}; fooled {_percent(light.fooled)} of {light.tried_on} views that judge nothing"
-    if vertices is not None:
-        largest, mean = (f"{1000 * metres:.3g} mm" for metres in (vertices.largest, vertices.mean))
-        yield "vertices moved", f"at most {largest} ({vertices.largest_share:.1%} of the radius), {mean} on average"
+def _goal(goal: GoalOptions) -> str:
+    if goal.target is None:
+        return f"the true class is not among the {goal.top_k} best"
+    return f"taken for {goal.target if isinstance(goal.target, str) else f'class {goal.target}'}"
 
 
-def _budget(spec: JobSpec) -> str:
-    """Epsilon, or what else may change."""
-    return f"{spec.epsilon:g}" if spec.attack_on == "texture" else spec.attack_on
+def _figure(value: float | None, form: str = "{:.2f}") -> str:
+    return "n.a." if value is None else form.format(value, levels=value * 255)
 
 
-def _goal(spec: JobSpec) -> str:
-    if spec.target_label is None:
-        return f"the true class is not among the {spec.top_k} best"
-    return f"taken for {spec.target_label if isinstance(spec.target_label, str) else f'class {spec.target_label}'}"
-
-
-def _number(value: float | None) -> str:
-    return "n.a." if value is None else f"{value:.2f}"
-
-
-def _percent(share: float | None) -> str:
-    return "n.a." if share is None else f"{share:.1%}"
-
-
-def _levels(change: float | None) -> str:
-    return "n.a." if change is None else f"{change:.4f} ({change * 255:.1f}/255)"
+def _either(labels: Iterable[object]) -> str:
+    return " or ".join(map(str, labels))
 
 
 def _short(reference: str) -> str:
-    """A name as it is; of an id, which is a long hash, the beginning, which the server takes as well."""
-    return reference if len(reference) < 32 else reference[:12]
+    """A name, or the first 12 digits of an id, which identify it too."""
+    return reference[:12] if re.fullmatch("[0-9a-f]{32,}", reference) else reference
+
+
+def _named(value: Any, job: Job) -> str:
+    """An option's value with names in place of ids."""
+    text = str(value)
+    for identity, name in job.names.items():
+        text = text.replace(identity, name)
+    return text
 
 
 def _origin(shipped: bool) -> str:

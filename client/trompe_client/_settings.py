@@ -1,4 +1,4 @@
-"""Where the server is, and who asks: arguments, else the environment."""
+"""Address and token of the server: arguments, else the environment."""
 
 import os
 from dataclasses import dataclass, field
@@ -6,24 +6,22 @@ from typing import Any, Final
 
 from trompe_shared.errors import SpecError
 
-__all__ = ["DEFAULT_SERVER", "Connection"]
-
 DEFAULT_SERVER: Final = "http://127.0.0.1:8000"
 
 
 @dataclass(frozen=True)
 class Connection:
-    """A server's address, the token that it is shown, and how long it may be silent, seconds."""
+    """A server's address, the access token, and the longest silence in seconds."""
 
     url: str
     token: str | None = field(repr=False)
     timeout: float
     transport: Any
-    """What carries the requests in place of the network: an httpx transport (a mock, in tests)."""
+    """An httpx transport in place of the network, for tests."""
 
     @classmethod
     def find(cls, url: str | None, *, token: str | None, timeout: float, transport: Any) -> "Connection":
-        """What is not given is taken from TROMPE_SERVER and TROMPE_TOKEN. Raises ``SpecError`` for a wrong address."""
+        """Defaults are TROMPE_SERVER and TROMPE_TOKEN. Raises ``SpecError`` for a wrong address."""
         address = (url or os.environ.get("TROMPE_SERVER") or DEFAULT_SERVER).rstrip("/")
         if not address.startswith(("http://", "https://")):
             raise SpecError(f"The server's URL must begin with http:// or https://, got {address!r}.")

@@ -1,7 +1,7 @@
-"""Files from the server to the disk: whole or not at all, checked, and taken up where a connection broke.
+"""Downloads: complete or not at all, with checksums, and resumed after a broken connection.
 
-The bytes go to ``.NAME.SUM.part`` beside the file, SUM being the checksum that the server's ETag promises, so that a
-later run, too, knows what a part is the beginning of. A file appears under its name when its checksum is right.
+Bytes go to ``.NAME.SUM.part`` beside the file. SUM is the checksum in the server's ETag, so that a later run can resume
+the part. A file appears under its name once its checksum is right.
 """
 
 import glob
@@ -22,31 +22,27 @@ from trompe_client._operations import check, send
 from trompe_client._port import Answer, Port
 from trompe_shared.api import Job
 
-__all__ = ["fetch", "fetch_all"]
-
 ETAG: Final = re.compile(r'(?:W/)?"([0-9a-f]{64})"')
 SUM: Final = re.compile(r"\.([0-9a-f]{64})\.part$")
 PARTIAL, UNCHANGED, UNSATISFIABLE = 206, 304, 416
 
 
 async def fetch_all(port: Port, job_id: str, folder: Path) -> tuple[Job, list[Path]]:
-    """Fetch all artifacts of a job into ``folder``; gives the job and the paths.
+    """Download all artifacts of a job into ``folder``. Returns the job and the paths.
 
-    Raises ``ContractError`` for a file that would lie elsewhere, ``BrokenDownload``.
+    Raises ``ContractError`` for a path outside the folder, ``BrokenDownload``.
     """
     job = await send(port, _core.job(job_id))
     for name in job.artifacts:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise ContractError(
-                f"The server offers a file named {name!r}, which would lie outside {folder}; not fetched."
-            )
+            raise ContractError(f"The server offers a file named {name!r}, outside {folder}; not downloaded.")
     return job, [await fetch(port, _core.artifact(job_id, name), folder / name) for name in job.artifacts]
 
 
 async def fetch(port: Port, request: Request[bytes], path: Path) -> Path:
-    """Fetch one file to ``path``, in place of an older one; the server is not asked for bytes that are there already.
+    """Download one file to ``path``, in place of an older one. Requests missing bytes only.
 
-    Raises ``BrokenDownload`` when wrong bytes come again and again.
+    Raises ``BrokenDownload`` if the checksum stays wrong.
     """
     attempt = 0
     while True:
@@ -65,7 +61,7 @@ async def fetch(port: Port, request: Request[bytes], path: Path) -> Path:
 
 @dataclass(frozen=True)
 class _Part:
-    """The beginning of the file at ``path``: the first ``size`` bytes of what has the checksum ``sum``."""
+    """The first ``size`` bytes of the file for ``path`` with the checksum ``sum``."""
 
     path: Path
     sum: str | None = None
@@ -73,7 +69,7 @@ class _Part:
 
     @classmethod
     def beside(cls, path: Path) -> "_Part":
-        """The part that an earlier attempt left, or an empty one."""
+        """The part of an earlier attempt, or an empty one."""
         path.parent.mkdir(parents=True, exist_ok=True)
         for file in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
             if match := SUM.search(file.name):
@@ -82,27 +78,27 @@ class _Part:
 
     @property
     def file(self) -> Path:
-        """Where the part lies."""
+        """Path of the part."""
         return self.path.with_name(f".{self.path.name}.{self.sum}.part" if self.sum else f".{self.path.name}.part")
 
     def conditions(self) -> Mapping[str, str]:
-        """Headers that ask for what is missing alone."""
+        """Headers of a request for the missing bytes."""
         if self.size:
             return {"Range": f"bytes={self.size}-", "If-Range": f'"{self.sum}"'}
         return {"If-None-Match": f'"{_checksum(self.path)}"'} if self.path.is_file() else {}
 
     def discard(self) -> None:
-        """Forget what has come so far."""
+        """Delete the part."""
         self.file.unlink(missing_ok=True)
 
     def complete(self) -> None:
-        """Check the part and give it its name. Raises ``BrokenDownload``."""
+        """Check the part and rename it. Raises ``BrokenDownload``."""
         found = self.sum and _checksum(self.file)
         if found != self.sum:
             self.discard()
             raise BrokenDownload(
-                f"{self.path.name} came with the checksum {found}, where the server promised {self.sum}. Try again; if "
-                "it stays so, something between here and the server changes the bytes."
+                f"{self.path.name} has the checksum {found}, the server's is {self.sum}. Try again; if it fails again, "
+                "look for a proxy that changes the bytes."
             )
         os.replace(self.file, self.path)
 
@@ -113,7 +109,7 @@ async def _fetch_once(port: Port, request: Request[bytes], part: _Part) -> None:
         if answer.status == UNCHANGED:
             await port.off(part.discard)
             return
-        if answer.status == UNSATISFIABLE:  # all of it had come, or more
+        if answer.status == UNSATISFIABLE:  # the part is complete, or too long
             await port.off(part.complete)
             return
         await check(answer, request)
@@ -122,7 +118,7 @@ async def _fetch_once(port: Port, request: Request[bytes], part: _Part) -> None:
 
 
 async def _append(port: Port, answer: Answer, part: _Part) -> _Part:
-    """Write the body behind ``part``, or anew where the server does not go on with it."""
+    """Append the body to ``part``, or start again if the server sends the whole file."""
     going_on = answer.status == PARTIAL and part.sum is not None
     if not going_on:
         await port.off(part.discard)

@@ -1,4 +1,4 @@
-"""Health of the API: whether it answers."""
+"""Health check of the API: it answers."""
 
 from urllib.request import urlopen
 

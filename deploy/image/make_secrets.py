@@ -1,15 +1,15 @@
-"""Makes the passwords of a deployment, each in the volume of those who may read it, unless they are there already."""
+"""Makes the missing passwords of a deployment, each in the volume of its readers."""
 
 import os
 import secrets
 from pathlib import Path
 
 SHARED = 0o640  # PostgreSQL and the object store read theirs as members of our group
-PRIVATE = 0o600  # what libpq asks for
+PRIVATE = 0o600  # required by libpq
 
 
 def keep(file: Path, text: str, mode: int) -> None:
-    """Write a file whole and with its rights, or not at all."""
+    """Write a file with its mode, atomically."""
     part = file.with_suffix(".part")
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "w") as stream:
         stream.write(text)
@@ -18,14 +18,14 @@ def keep(file: Path, text: str, mode: int) -> None:
 
 
 def secret(file: Path) -> str:
-    """What the file says; it is made first where it is missing."""
+    """Read the secret in the file; make it first if it is missing."""
     if not file.exists():
         keep(file, secrets.token_urlsafe(32), SHARED)
     return file.read_text()
 
 
 def main() -> None:
-    """Make all of them."""
+    """Make all secrets."""
     password = secret(Path("/secrets/database/database-password"))
     keep(Path("/secrets/database/pgpass"), f"*:*:*:*:{password}\n", PRIVATE)
     key = secret(Path("/secrets/objects/objects-password"))

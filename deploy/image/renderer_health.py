@@ -1,4 +1,4 @@
-"""Health of a renderer: whether it shakes hands. That its port is open says little: the supervisor keeps it open."""
+"""Health check of a renderer: it answers a handshake."""
 
 import socket
 

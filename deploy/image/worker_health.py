@@ -1,13 +1,13 @@
-"""Health of an attack worker: whether the database has heard from it of late."""
+"""Health check of an attack worker: a recent heartbeat in the database."""
 
 import socket
 import sys
 
 import sqlalchemy as sa
 
-from trompe_server.database import clock, connect
-from trompe_server.jobs.tables import workers
+from trompe_server.queue.tables import workers
 from trompe_server.settings import Settings
+from trompe_server.storage.database import clock, connect
 
 settings = Settings()
 ages = sa.select(clock() - workers.c.seen).where(workers.c.host == socket.gethostname())

@@ -1,1 +1,1 @@
-"""The renderer worker: SAILenv's socket protocol outside, physically based rendering with pyrender inside."""
+"""The renderer worker: a server of SAILenv's socket protocol that renders with pyrender."""

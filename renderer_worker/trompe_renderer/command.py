@@ -1,17 +1,37 @@
-"""``trompe render``: run a renderer worker."""
+"""``trompe render``: run a renderer worker until a signal or a crash ends it. Restarts are the caller's work."""
 
+import ctypes
+import faulthandler
 import logging
+import os
+import re
 import signal
 import socket
 import sys
+from collections.abc import Callable, Mapping
+from types import FrameType
+from typing import Final, NoReturn
 
 import click
 
-from trompe_renderer.options import Options, Quality
-from trompe_renderer.supervise import listen, supervise
+from trompe_renderer.options import Options
+from trompe_shared.engine import DEFAULT_ENGINE
 from trompe_shared.errors import RendererError
 
 __all__ = ["render"]
+
+BACKLOG: Final = 64
+"""Connections that wait until the worker accepts them."""
+_M_TRIM_THRESHOLD: Final = -1
+_M_MMAP_THRESHOLD: Final = -3
+_LARGE_BLOCK: Final = 2**20
+
+
+def _pairs(_context: click.Context, _option: click.Parameter, given: tuple[str, ...]) -> dict[str, str]:
+    wrong = next((each for each in given if not re.match(r"\w+=", each)), None)
+    if wrong is not None:
+        raise click.BadParameter(f"{wrong!r} is not NAME=VALUE.")
+    return dict(each.split("=", 1) for each in given)
 
 
 @click.command()
@@ -19,70 +39,121 @@ __all__ = ["render"]
 @click.option(
     "--port", default=8085, show_default=True, type=click.IntRange(0, 65535), help="Port; 0 picks a free one."
 )
-@click.option("--shadows/--no-shadows", default=True, show_default=True, help="Whether lights cast shadows.")
 @click.option(
-    "--shadow-map",
-    default=1024,
+    "--engine",
+    default=DEFAULT_ENGINE,
     show_default=True,
-    type=click.IntRange(64, 16384),
-    help="Texels along a shadow map's side.",
+    metavar="NAME",
+    help="pyrender, three, panda3d, mitsuba, cycles, or your own as module:Class.",
 )
 @click.option(
-    "--msaa", default=4, show_default=True, type=click.IntRange(1, 32), help="Coverage samples of a pixel; 1 is none."
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="NAME=VALUE",
+    callback=_pairs,
+    help="An option of the engine; repeatable.",
 )
 @click.option(
-    "--supersample", default=1, show_default=True, type=click.IntRange(1, 4), help="Shaded samples along a pixel."
+    "--depth-range",
+    default=Options.depth_range,
+    show_default=True,
+    type=click.FloatRange(1e-3, 1000),
+    help="Metres shown as white in depth views.",
 )
 @click.option(
-    "--anisotropy", default=1, show_default=True, type=click.IntRange(1, 16), help="Of texture filters; 1 is none."
+    "--time-step", type=click.FloatRange(0, 3600), help="Seconds from frame to frame; the clock's by default."
 )
 @click.option(
-    "--depth-range", default=10.0, show_default=True, type=click.FloatRange(1e-3, 1000), help="Metres shown as white."
+    "--check",
+    is_flag=False,
+    flag_value="",
+    metavar="[HOST:PORT]",
+    help="Check the engine, or a running renderer (SAILenv, too), with 25 pictures and exit; status 1 means a fault.",
 )
-@click.option(
-    "--time-step", type=click.FloatRange(0, 3600), help="Seconds from frame to frame, instead of the clock's."
-)
-@click.option("--verbose", is_flag=True, help="Log every agent that comes and goes.")
+@click.option("--verbose", is_flag=True, help="Log agents that connect and leave.")
 def render(
     host: str,
     port: int,
     *,
-    shadows: bool,
-    shadow_map: int,
-    msaa: int,
-    supersample: int,
-    anisotropy: int,
-    depth_range: float,
-    time_step: float | None,
+    engine: str,
+    settings: Mapping[str, str],
+    check: str | None,
     verbose: bool,
+    **options: float | None,
 ) -> None:
-    """Run a renderer worker: it speaks SAILenv's socket protocol and renders with pyrender.
+    """Run a renderer worker: it speaks SAILenv's socket protocol and renders with an engine of your choice.
 
-    What each option costs stands in docs/worker.md.
+    docs/engines.md lists the engines and their options, docs/worker.md the costs of pyrender's.
 
-    There is no authentication: keep it on an address that only those reach who may use it.
+    There is no authentication: listen only on an address that no stranger can reach.
     """
+    if check is not None:
+        sys.exit(not _check(check, engine, settings))
     logging.basicConfig(stream=sys.stderr, level=logging.INFO if verbose else logging.WARNING, format="%(message)s")
-    options = Options(Quality(shadows, msaa, shadow_map, supersample, anisotropy), depth_range, time_step)
+    faulthandler.enable()
+    stop = _StopSignals()
     try:
-        listener = listen(host, port)
+        _serve(_listen(host, port), engine, settings, Options(**options), stop)  # type: ignore[arg-type]
     except RendererError as error:
         raise click.ClickException(str(error)) from error
-    sys.exit(supervise(lambda: _work(listener, options)))
+    stop.exit()
 
 
-def _work(listener: socket.socket, options: Options) -> int:
-    """Serve until SIGTERM; the exit status."""
-    from trompe_renderer.platform import give_memory_back  # OpenGL is loaded only by those who render
-    from trompe_renderer.server import Server
+def _check(address: str, engine: str, settings: Mapping[str, str]) -> bool:
+    from trompe_renderer.check.report import check_at, check_engine
 
-    give_memory_back()
     try:
-        server = Server(listener, options)
+        return check_at(address) if address else check_engine(engine, settings)
     except RendererError as error:
-        click.echo(f"Error: {error}", err=True)
-        return 1
-    signal.signal(signal.SIGTERM, lambda *_: server.stop())
-    click.echo("trompe renderer listening on {}:{}".format(*server.address))
+        raise click.ClickException(str(error)) from error
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        return socket.create_server((host, port), backlog=BACKLOG)
+    except OSError as error:
+        raise RendererError(f"Cannot listen on {host}:{port} ({error}). Choose another --host or --port.") from error
+
+
+class _StopSignals:
+    """On SIGTERM (exit status 0) or SIGINT (130) calls ``stop_server``, which ends the process until there is one."""
+
+    def __init__(self) -> None:
+        self.stop_server: Callable[[], None] = self.exit
+        self._status = 0
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._receive)
+
+    def _receive(self, number: int, _frame: FrameType | None) -> None:
+        self._status = 128 + number if number == signal.SIGINT else 0
+        self.stop_server()
+
+    def exit(self) -> NoReturn:
+        """End the process without waiting for threads that still draw."""
+        logging.shutdown()
+        sys.stdout.flush()
+        os._exit(self._status)
+
+
+def _serve(
+    listener: socket.socket, engine: str, settings: Mapping[str, str], options: Options, stop: _StopSignals
+) -> None:
+    from trompe_renderer.engines.loading import engine_maker  # NumPy and more; --help works without it
+    from trompe_renderer.engines.render_thread import RenderThread
+    from trompe_renderer.protocol.server import Server
+
+    _return_freed_memory()
+    thread = RenderThread(engine_maker(engine, settings))
+    server = Server(listener, thread, options)
+    stop.stop_server = server.stop
+    click.echo("trompe renderer listening on {}:{}, {}".format(*server.address, thread.info))
     server.serve_forever()
-    return 0
+
+
+def _return_freed_memory() -> None:
+    """Make glibc return large freed blocks to the system at once. By default it soon keeps the largest pictures'."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallopt"):
+        for parameter in (_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD):
+            libc.mallopt(parameter, _LARGE_BLOCK)

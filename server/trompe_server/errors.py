@@ -1,10 +1,10 @@
-"""The errors of the service, on top of those that all packages share.
+"""Errors of the service, in addition to the errors shared by all packages.
 
 TrompeError
-├── NotFoundError        nothing is stored under that id or name
-├── AmbiguousError       a name or the beginning of an id fits several stored things
-├── ConflictError        the job is not in a state that allows this
-└── ServiceError         the service cannot start or cannot go on: folder in use, a child process that does not come up
+├── NotFoundError        nothing is stored under this id or name
+├── AmbiguousError       a name or the beginning of an id matches several stored things
+├── ConflictError        the state of the job does not allow this
+└── ServiceError         the service cannot start or continue: folder in use, child process does not start
 """
 
 from trompe_shared.errors import TrompeError
@@ -13,24 +13,24 @@ __all__ = ["AmbiguousError", "ConflictError", "NotFoundError", "ServiceError"]
 
 
 class NotFoundError(TrompeError):
-    """Nothing is stored under that id or name."""
+    """Nothing is stored under this id or name."""
 
     code = "not-found"
 
 
 class AmbiguousError(TrompeError):
-    """A name or the beginning of an id fits several stored things."""
+    """A name or the beginning of an id matches several stored things."""
 
     code = "ambiguous"
 
 
 class ConflictError(TrompeError):
-    """The job is not in a state that allows this."""
+    """The state of the job does not allow this."""
 
     code = "conflict"
 
 
 class ServiceError(TrompeError):
-    """The service cannot start or cannot go on."""
+    """The service cannot start or continue."""
 
     code = "service"

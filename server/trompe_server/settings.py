@@ -1,10 +1,12 @@
-"""What can be set from outside: environment variables that begin with TROMPE_, and the options of the commands."""
+"""Settings of the service: environment variables that begin with TROMPE_, and options of the commands."""
 
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from trompe_shared.engine import DEFAULT_ENGINE
 
 __all__ = ["Settings"]
 
@@ -15,38 +17,55 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="TROMPE_", frozen=True)
 
     data: Path = Path.home() / ".local" / "share" / "trompe"
-    """Folder of everything that is kept, as far as ``database`` and ``store`` name no other place."""
+    """Folder of all data, except what ``database`` and ``store`` place elsewhere."""
     database: str = ""
-    """URL of the database, SQLite or PostgreSQL; empty is a file in the data folder."""
+    """URL of the database, SQLite or PostgreSQL; empty: a file in the data folder."""
     store: str = ""
-    """URL of the store of artifacts and uploads: a local folder, or any that fsspec knows; empty is the data folder."""
+    """Store of artifacts and uploads: a local folder, or any URL fsspec supports; empty: the data folder."""
     max_upload: int = 512 * 2**20
     """Largest upload, bytes."""
     rate_limit: Annotated[float, Field(ge=0)] = 100.0
-    """Requests per second that the API serves each token, or each address without one; 0 sets no limit."""
+    """Requests per second allowed to each token, or to each address without a token; 0: no limit."""
     stall_timeout: float = 1800.0
-    """Seconds without progress after which a job's worker is stopped."""
+    """Seconds without progress after which the worker of a job is restarted."""
     silence: Annotated[float, Field(ge=1.0)] = 30.0
-    """Seconds without a heartbeat after which a worker counts as dead, and its job goes to another."""
+    """Seconds without a heartbeat after which a worker counts as dead and its job is requeued."""
     retention_days: Annotated[float, Field(ge=0)] = 0.0
-    """Days after which jobs that have ended, their artifacts and unused calibrations are deleted; 0 keeps them."""
+    """Days after which ended jobs, their artifacts and unused calibrations are deleted; 0 keeps them."""
     device: str = "cpu"
-    """Where attack workers compute, as torch names it: cpu, cuda, cuda:1."""
+    """Device of the attack workers, by torch's name: cpu, cuda, cuda:1."""
     workers: Annotated[int, Field(ge=0, le=64)] = 1
-    """Attack workers that ``serve`` starts; they share the cores. With 0 others must come from elsewhere."""
+    """Attack workers started by ``serve``; they share the cores. 0: all workers run elsewhere."""
     renderers: Annotated[int, Field(ge=0, le=64)] = 1
-    """Renderer workers that ``serve`` starts."""
+    """Renderer workers started by ``serve``."""
+    engine: str = DEFAULT_ENGINE
+    """Engine of these renderer workers, as in ``trompe render --engine``: a name or ``module:Class``."""
+    engine_options: tuple[str, ...] = ()
+    """Options of that engine, each ``NAME=VALUE``; in the environment a JSON list."""
     renderer_patience: float = 10.0
-    """Seconds a job waits for a renderer that does not answer."""
-    pipeline: str = "trompe_server.attack_job:open_pipeline"
-    """``module:function`` that opens the pipeline of a job."""
+    """Seconds a job waits for a renderer."""
+    pipeline: str = "trompe_server.job.texture_attack:open_job"
+    """``module:function`` that opens a job, with the signature of the default; replaced by tests."""
+    metrics_port: Annotated[int, Field(ge=0, le=65535)] = 0
+    """Port at which ``trompe worker`` serves its Prometheus metrics; 0: none."""
+
+    @property
+    def engine_flags(self) -> list[str]:
+        """The engine as words of ``trompe render``; none for its default."""
+        engine = [] if self.engine == DEFAULT_ENGINE else ["--engine", self.engine]
+        return [*engine, *(word for option in self.engine_options for word in ("--set", option))]
 
     @property
     def database_url(self) -> str:
-        """The database that holds jobs, events, workers and tokens."""
+        """URL of the database of jobs, events, workers and tokens."""
         return self.database or f"sqlite:///{self.data.absolute() / 'trompe.sqlite'}"
 
     @property
     def store_url(self) -> str:
-        """Where the files of jobs and the library are."""
+        """URL of the files of jobs and of the library."""
         return self.store or str(self.data.absolute())
+
+    @property
+    def metrics_folder(self) -> Path:
+        """Folder of the metrics of the workers started by ``serve``, in Prometheus' multi-process format."""
+        return self.data.absolute() / "metrics"

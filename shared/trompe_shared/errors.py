@@ -1,15 +1,15 @@
-"""The errors that more than one package raises.
+"""Errors raised by more than one package.
 
     TrompeError
-    ├── ObjectError          the 3D object cannot be read or does not hold together
-    ├── ProtocolError        bytes on a SAILenv connection that the protocol does not allow
-    ├── ClassifierError      a classifier cannot be loaded or does not keep the contract
+    ├── ObjectError          the 3D object is unreadable or inconsistent
+    ├── ProtocolError        malformed bytes on a SAILenv connection
+    ├── ClassifierError      a classifier cannot be loaded or violates the contract
     ├── LabelError           a label is not one of the classifier's classes
     ├── RendererError        a renderer worker is unreachable or answered with an error
-    │   └── RendererLostError    it is not there, hangs, or talks nonsense; another one may do what this one did not
+    │   └── RendererLostError    it is gone, hangs or sends nonsense; another renderer may succeed
     └── SpecError            the options of a job contradict each other or are out of range
 
-Each message says what was wrong, what was expected and what to do about it.
+Each message says what was wrong, what was expected and what to do.
 """
 
 __all__ = [
@@ -25,25 +25,25 @@ __all__ = [
 
 
 class TrompeError(Exception):
-    """Base of every error that Trompe raises on purpose."""
+    """Base of all deliberate errors of Trompe."""
 
     code = "error"
 
 
 class ObjectError(TrompeError):
-    """The 3D object cannot be read or does not hold together."""
+    """The 3D object is unreadable or inconsistent."""
 
     code = "invalid-object"
 
 
 class ProtocolError(TrompeError):
-    """Bytes on a SAILenv connection that the protocol does not allow."""
+    """Malformed bytes on a SAILenv connection."""
 
     code = "protocol"
 
 
 class ClassifierError(TrompeError):
-    """A classifier cannot be loaded or does not keep the contract."""
+    """A classifier cannot be loaded or violates the contract."""
 
     code = "invalid-classifier"
 
@@ -61,7 +61,7 @@ class RendererError(TrompeError):
 
 
 class RendererLostError(RendererError):
-    """A renderer worker is not there, hangs, or talks nonsense; another one may do what this one did not."""
+    """A renderer worker is gone, hangs or sends nonsense; another renderer may succeed."""
 
 
 class SpecError(TrompeError):

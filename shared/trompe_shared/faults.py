@@ -1,4 +1,4 @@
-"""What pydantic found wrong, in words for whoever wrote it."""
+"""Pydantic's validation errors as messages for users."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
@@ -8,14 +8,14 @@ from pydantic import ValidationError
 __all__ = ["Fault", "faults_of"]
 
 OWN_WORDS: Final = "Value error, "
-"""What pydantic puts before the message of a validator of ours."""
+"""Pydantic's prefix for messages of our own validators."""
 
 INNER_STEPS: Final = ("function-", "dict[", "literal[")
-"""How the steps of a place begin that are pydantic's own, not the writer's."""
+"""Prefixes of steps that pydantic adds to a place."""
 
 
 class Fault(NamedTuple):
-    """One thing that is wrong. place: the names that lead to it, with dots; empty where it is about the whole."""
+    """One error. place: names of the fields that lead to it, joined by dots; empty for the whole document."""
 
     place: str
     message: str
@@ -26,9 +26,9 @@ class Fault(NamedTuple):
 
 
 def faults_of(refusal: ValidationError | Sequence[Mapping[str, Any]]) -> Iterator[Fault]:
-    """All that is wrong, in the order of the fields, by pydantic's error or by what FastAPI keeps of one.
+    """All errors in the order of the fields, from pydantic's exception or from FastAPI's copy of its details.
 
-    What was given is not asked for: it may be a whole document.
+    The input is left out: it may be a whole document.
     """
     if isinstance(refusal, ValidationError):
         details: Sequence[Mapping[str, Any]] = refusal.errors(

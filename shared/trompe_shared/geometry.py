@@ -1,9 +1,9 @@
 """Cameras, lights and views, and their translation to SAILenv's left-handed world and back.
 
-Conventions (used everywhere in Trompe): right-handed world, y up, metres, angles in degrees, the
-object at the origin. A camera sits at ``d * (cos e sin a, sin e, cos e cos a)`` and looks at the origin; its
-vertical field of view is 60 degrees. SAILenv (Unity) is left-handed: it uses the same position numbers, poses its
-camera by Euler angles, and shows the mirror image of what a right-handed renderer shows.
+Conventions of all of Trompe: right-handed world, y up, metres, degrees, the object as authored. A camera stands at
+``centre + d * (cos e sin a, sin e, cos e cos a)`` and looks at ``centre``; its vertical field of view is 60 degrees.
+SAILenv (Unity) is left-handed: it uses the same positions, poses its camera by Euler angles, and shows the mirror image
+of a right-handed renderer's picture.
 """
 
 import math
@@ -39,7 +39,7 @@ Matrix = NDArray[np.float64]
 
 
 def spherical(azimuth: float, elevation: float) -> Matrix:
-    """Unit vector (3,) that points from the origin to (azimuth, elevation), both in degrees."""
+    """Unit vector (3,) from the origin towards (azimuth, elevation), degrees."""
     a, e = np.radians(azimuth), np.radians(elevation)
     return np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
 
@@ -47,8 +47,7 @@ def spherical(azimuth: float, elevation: float) -> Matrix:
 def look_rotation(azimuth: float, elevation: float, roll: float = 0.0) -> Matrix:
     """Camera-to-world rotation (3, 3) of an OpenGL camera at (azimuth, elevation): columns right, up, back.
 
-    ``roll`` as of ``Camera``. Closed form, so that it is well defined straight above and below the object
-    (|elevation| = 90) too.
+    ``roll`` as in ``Camera``. The closed form is well defined straight above and below the object, too.
     """
     a, e = np.radians(azimuth), np.radians(elevation)
     right = [np.cos(a), 0.0, -np.sin(a)]
@@ -65,19 +64,20 @@ def _turn(degrees: float) -> Matrix:
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera that looks at the origin. ``distance`` in metres, all angles in degrees.
+    """A camera that looks at ``centre`` (x, y, z), metres, from ``distance`` metres; angles in degrees.
 
-    ``roll`` turns the camera counter-clockwise about its line of sight: the object turns clockwise in the image.
+    ``roll`` turns the camera counter-clockwise about its line of sight, so the object turns clockwise in the image.
     """
 
     distance: float
     azimuth: float
     elevation: float
     roll: float = 0.0
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def position(self) -> Matrix:
         """World position (3,), metres."""
-        return self.distance * spherical(self.azimuth, self.elevation)
+        return np.asarray(self.distance * spherical(self.azimuth, self.elevation) + self.centre)
 
     def world_to_camera(self) -> Matrix:
         """Rigid transform (4, 4) from world to OpenGL camera coordinates (x right, y up, looks along -z)."""
@@ -90,11 +90,11 @@ class Camera:
 
 @dataclass(frozen=True)
 class Light:
-    """A directional light that shines from (azimuth, elevation), plus ambient light.
+    """A directional light from (azimuth, elevation), degrees, plus ambient light.
 
-    ``intensity`` is relative: at 1.0 a white matt surface that faces the light reflects white, before ambient is added.
-    ``ambient`` is the share of white that reaches every surface from everywhere, in [0, 1]. ``colour`` is that of the
-    directional light, linear, three ints in 0..255 as SAILenv takes them.
+    intensity: at 1.0 a white matt surface that faces the light reflects white, without ambient light.
+    ambient: light from all sides as a share of white, in [0, 1].
+    colour: of the directional light, linear, 0 to 255 as in SAILenv.
     """
 
     azimuth: float = 0.0
@@ -106,19 +106,22 @@ class Light:
 
 @dataclass(frozen=True)
 class View:
-    """One camera with one light. ``background`` is an sRGB colour, three ints in 0..255.
+    """One camera with one light.
 
-    ``backdrop`` names a picture that stands behind the object in its place.
+    background: sRGB colour, 0 to 255.
+    backdrop: name of a picture that replaces the background colour.
+    noise: number of the noise in the picture of a renderer that is not deterministic; others ignore it.
     """
 
     camera: Camera
     light: Light = field(default_factory=Light)
     background: tuple[int, int, int] = (255, 255, 255)
     backdrop: str | None = None
+    noise: int = 0
 
 
 def sailenv_pose(camera: Camera) -> tuple[Matrix, Matrix]:
-    """Position (3,) and Euler angles (3,) in degrees, as SAILenv's SET_POSITION and SET_ROTATION want them."""
+    """Position (3,), metres, and Euler angles (3,), degrees, for SAILenv's SET_POSITION and SET_ROTATION."""
     return camera.position(), np.array([180.0 - camera.elevation, camera.azimuth, 180.0 - camera.roll])
 
 
@@ -132,22 +135,21 @@ def euler_to_matrix(degrees: Matrix) -> Matrix:
 
 
 def unity_to_opengl_rotation(degrees: Matrix) -> Matrix:
-    """Camera-to-world rotation (3, 3) of an OpenGL camera that stands in for Unity's at Euler angles ``degrees``.
+    """Camera-to-world rotation (3, 3) of an OpenGL camera that replaces Unity's at Euler angles ``degrees`` (3,).
 
-    Unity looks along +z in a left-handed world. The right-handed picture with this rotation is Unity's, mirrored left-
-    right.
+    Unity looks along +z in a left-handed world. The right-handed picture is the mirror image of Unity's.
     """
     rotation = euler_to_matrix(degrees)
     return np.stack([-rotation[:, 0], rotation[:, 1], -rotation[:, 2]], axis=1)
 
 
 def light_travel_direction(light: Light) -> Matrix:
-    """Unit vector (3,) along which the light travels: SAILenv's SET_LIGHT_DIRECTION."""
+    """Unit vector (3,) of the light's travel, for SAILenv's SET_LIGHT_DIRECTION."""
     return -spherical(light.azimuth, light.elevation)
 
 
 def direction_to_angles(direction: Matrix) -> tuple[float, float]:
-    """(azimuth, elevation) in degrees of the place a light travelling along ``direction`` shines from.
+    """(azimuth, elevation), degrees, of the origin of a light that travels along ``direction`` (3,).
 
     Raises ``ValueError`` for a zero or non-finite vector.
     """
@@ -159,12 +161,12 @@ def direction_to_angles(direction: Matrix) -> tuple[float, float]:
 
 
 def framing_distance(radius: float) -> float:
-    """Distance, metres, at which an object of this radius fills most of the picture from every side."""
+    """Distance, metres, at which a sphere of ``radius``, metres, fills most of the picture from every side."""
     return 1.05 * radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
 
 
 def colour_of(text: str) -> tuple[int, int, int] | None:
-    """The colour (sRGB, 0..255) that a background's name means: white, black or #rrggbb; ``None`` for any other."""
+    """The sRGB colour, 0 to 255, named white, black or #rrggbb; ``None`` for any other text."""
     if text in COLOURS:
         return COLOURS[text]
     if not re.fullmatch("#[0-9a-fA-F]{6}", text):

@@ -1,9 +1,8 @@
-"""A 3D object: its meshes, materials and textures, and the archive they came in.
+"""A 3D object: its meshes, materials and textures, and the files of its archive.
 
 The format is SAILenv's: a flat zip with ``<name>.obj``, ``<name>_mat_def.json`` (per material the file names of
-``albedo``, ``normal`` and ``metallic``) and the PNGs. A zip or folder with a plain OBJ and MTL is read as well. Every
-file of the archive is kept byte for byte; an attack replaces albedo images only, so that what comes out is what went
-in.
+``albedo``, ``normal`` and ``metallic``; ours: ``opacity`` of a blended one) and the PNGs. A zip or folder with a plain
+OBJ and MTL is read, too. Every file of the archive is kept byte for byte; an attack replaces albedo images only.
 """
 
 import io
@@ -17,6 +16,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -25,13 +25,14 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from trompe_shared.errors import ObjectError
-from trompe_shared.wavefront import Part, parse_mtl, parse_obj
+from trompe_shared.wavefront import Part, dissolve, parse_mtl, parse_obj
 
 __all__ = [
     "MAX_TEXTURE_SIDE",
     "Material",
     "Object3D",
     "Part",
+    "decode_alpha",
     "decode_rgb",
     "encode_png",
     "load_object",
@@ -49,38 +50,42 @@ MAX_TEXTURE_SIDE: Final = 8192
 MAX_TEXELS: Final = 2 * MAX_TEXTURE_SIDE**2
 """Of all albedo textures of an object together."""
 MAX_RATIO: Final = 200
-"""How many times its size an archive may unpack to, where that is much ..."""
+"""Largest ratio of unpacked to packed size, for archives that unpack to more than ``MUCH``."""
 MUCH: Final = 64 * 2**20
-"""... which is more than this many bytes."""
+SPHERE_STEPS: Final = 100
+"""Steps of the search for the smallest sphere around an object; the error falls with their number."""
 IMAGE_FORMATS: Final = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF", "GIF")
-"""What is read as a texture: of what Pillow knows, the kinds that run no other program."""
+"""Formats of textures. Pillow reads none of them through another program."""
 
 _DAMAGED: Final = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError, EOFError, ValueError, OSError)
-"""What ``zipfile`` raises for bytes that it cannot unpack."""
+"""Errors of ``zipfile`` for damaged archives."""
 
 Texture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Material:
-    """File names of a material's maps inside the archive; ``None`` where it has none.
+    """File names of a material's maps inside the archive; ``None`` without one.
 
     ``albedo`` is sRGB. ``normal`` is a tangent-space map, +Y up (OpenGL). ``metallic`` is Unity's
-    MetallicSmoothness, linear: red is metallic, alpha is smoothness.
+    MetallicSmoothness, linear: red is metallic, alpha is smoothness. ``opacity``, in [0, 1], multiplies the albedo's
+    alpha in a surface blended over what lies behind it; ``None``: alpha below one half cuts holes, the rest is opaque.
     """
 
     name: str
     albedo: str
     normal: str | None = None
     metallic: str | None = None
+    opacity: float | None = None
 
 
 @dataclass(frozen=True)
 class Object3D:
     """An object as read from its archive.
 
-    ``files`` maps file names to their bytes, ``parts`` holds one mesh per material, ``textures`` the decoded
-    albedo images by file name: (H, W, 3) uint8, sRGB, row 0 on top.
+    files: content by file name.
+    parts: one mesh per material.
+    textures: decoded albedo images by file name, (H, W, 3) uint8, sRGB, row 0 on top.
     """
 
     name: str
@@ -99,12 +104,32 @@ class Object3D:
         """Largest distance of a vertex from the origin, metres."""
         return float(max(np.linalg.norm(part.vertices, axis=1).max() for part in self.parts))
 
+    @cached_property
+    def sphere(self) -> tuple[tuple[float, float, float], float]:
+        """(Centre (x, y, z), radius), metres, of a sphere around all vertices; within 1 % of the smallest one.
+
+        Badoiu and Clarkson (2003), Smaller core-sets for balls: the centre moves towards the farthest vertex in
+        ever smaller steps.
+        """
+        vertices = np.unique(np.concatenate([part.vertices for part in self.parts]).astype(np.float64), axis=0)
+        centre = (vertices.min(0) + vertices.max(0)) / 2
+        for step in range(SPHERE_STEPS):
+            farthest = vertices[np.square(vertices - centre).sum(1).argmax()]
+            centre += (farthest - centre) / (step + 2)
+        x, y, z = centre.tolist()
+        return (x, y, z), float(np.linalg.norm(vertices - centre, axis=1).max())
+
+    @property
+    def blended(self) -> frozenset[str]:
+        """The albedo textures of blended materials."""
+        return frozenset(each.albedo for each in self.materials.values() if each.opacity is not None)
+
     def albedo_of(self, part: Part) -> str:
-        """File name of the albedo texture that ``part`` is painted with."""
+        """File name of the albedo texture of ``part``."""
         return self.materials[part.material].albedo
 
     def with_textures(self, textures: Mapping[str, Texture]) -> "Object3D":
-        """The same object with some albedo images replaced: (H, W, 3) uint8 each, of any size.
+        """The same object with some albedo images replaced, (H, W, 3) uint8 of any size.
 
         Raises ``ObjectError`` for a name that is not one of this object's albedo textures.
         """
@@ -115,12 +140,11 @@ class Object3D:
         return replace(self, files=files, textures=dict(self.textures) | dict(textures))
 
     def _repaint(self, name: str, image: Texture) -> bytes:
-        """PNG bytes of ``image``, carrying over the alpha channel (opacity) of the file it replaces."""
-        with open_image(self.files[name], name) as before:
-            alpha = before.convert("RGBA").getchannel("A") if before.has_transparency_data else None
+        """PNG bytes of ``image`` with the alpha channel (opacity) of the replaced file."""
+        alpha = decode_alpha(self.files[name], name)
         picture = Image.fromarray(image)
-        if alpha is not None and alpha.size == picture.size:
-            picture.putalpha(alpha)
+        if alpha is not None and alpha.shape == image.shape[:2]:
+            picture.putalpha(Image.fromarray(alpha))
         return encode_png(picture)
 
     def to_zip(self) -> bytes:
@@ -129,7 +153,7 @@ class Object3D:
 
 
 def encode_png(image: Image.Image | Texture) -> bytes:
-    """PNG bytes of a picture or a uint8 array (lossless; fast compression)."""
+    """PNG bytes of a picture or a uint8 array, (H, W) or (H, W, channels); fast compression."""
     buffer = io.BytesIO()
     picture = image if isinstance(image, Image.Image) else Image.fromarray(image)
     picture.save(buffer, "PNG", compress_level=1)
@@ -138,10 +162,10 @@ def encode_png(image: Image.Image | Texture) -> bytes:
 
 @contextmanager
 def open_image(data: bytes, name: str) -> Iterator[Image.Image]:
-    """An image file that comes from anybody, opened for the time of the block: the one way in for pixels.
+    """Open an untrusted image file within a ``with`` block: the only entrance for pixels.
 
-    It is of ``IMAGE_FORMATS``, and its sides are looked at before a pixel is decoded. Raises ``ObjectError`` with
-    ``name``, also for what turns out to be damaged within the block.
+    Accepts ``IMAGE_FORMATS`` and checks the sides before it decodes a pixel. Raises ``ObjectError`` with ``name``, also
+    for damage found within the block.
     """
     try:
         with Image.open(io.BytesIO(data), formats=IMAGE_FORMATS) as image:
@@ -157,14 +181,20 @@ def open_image(data: bytes, name: str) -> Iterator[Image.Image]:
 
 
 def decode_rgb(data: bytes, name: str) -> Texture:
-    """Decode an image file to (H, W, 3) uint8; of 16 bits the upper 8, as Pillow reads those of colours.
+    """Decode an image file to (H, W, 3) uint8; of 16 bits it keeps the upper 8.
 
-    Raises ``ObjectError`` with ``name`` when it cannot be read.
+    Raises ``ObjectError`` with ``name`` for an unreadable file.
     """
     with open_image(data, name) as image:
-        if image.mode.startswith("I;16"):  # Pillow would clip these greys, not scale them
+        if image.mode.startswith("I;16"):  # Pillow clips these greys instead of scaling them
             return np.repeat((np.array(image) >> 8).astype(np.uint8)[..., None], 3, axis=2)
         return np.array(image.convert("RGB"))
+
+
+def decode_alpha(data: bytes, name: str) -> Texture | None:
+    """Alpha (H, W) uint8 of an image file; ``None`` for a file without. Raises ``ObjectError`` as ``decode_rgb``."""
+    with open_image(data, name) as image:
+        return np.array(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
 
 
 def pack_zip(files: Mapping[str, bytes]) -> bytes:
@@ -180,7 +210,7 @@ def pack_zip(files: Mapping[str, bytes]) -> bytes:
 def load_object(source: bytes | str | Path) -> Object3D:
     """Read an object from the bytes of a zip, or from the path of a zip, a folder or an OBJ file.
 
-    Raises ``ObjectError`` when there is none, when it does not hold together, or when it is unreasonably large.
+    Raises ``ObjectError`` for a missing, inconsistent or too large object.
     """
     if isinstance(source, bytes):
         return object_from_files(unzip(source))
@@ -195,7 +225,7 @@ def load_object(source: bytes | str | Path) -> Object3D:
 
 
 def unzip(data: bytes) -> dict[str, bytes]:
-    """Members of a flat zip (one common folder is allowed and removed), within the limits. Raises ``ObjectError``."""
+    """Members of a flat zip; one common folder is removed. Raises ``ObjectError``, also beyond the limits."""
     files = unpack(data)
     if any("/" in name for name in files):
         raise ObjectError("The archive must be flat: an .obj, its materials and its textures in one folder.")
@@ -203,9 +233,9 @@ def unzip(data: bytes) -> dict[str, bytes]:
 
 
 def unpack(data: bytes) -> dict[str, bytes]:
-    """Members of a zip by their path below the folder that is common to all, in the order of the archive.
+    """Members of a zip by their path below their common folder, in the order of the archive.
 
-    Raises ``ObjectError`` for an archive that is damaged, unpacks to too much, or holds what is no plain file below it.
+    Raises ``ObjectError`` for an archive that is damaged, too large, or holds links or paths outside of it.
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
@@ -226,7 +256,7 @@ def unpack(data: bytes) -> dict[str, bytes]:
 
 
 def unpacked_size(data: bytes) -> int:
-    """Bytes that a zip says it unpacks to; 0 for what is none."""
+    """Unpacked bytes according to the zip's directory; 0 for a damaged zip."""
     try:
         return sum(info.file_size for info in zipfile.ZipFile(io.BytesIO(data)).infolist())
     except _DAMAGED:
@@ -256,7 +286,7 @@ def _checked_path(info: zipfile.ZipInfo) -> PurePosixPath:
 
 
 def _common_folder(paths: list[PurePosixPath]) -> int:
-    """How many folders all ``paths`` have in common at their beginning."""
+    """Number of leading folders common to all ``paths``."""
     folders = [path.parts[:-1] for path in paths]
     shortest = min(folders, key=len, default=())
     return next((k for k, part in enumerate(shortest) if any(f[k] != part for f in folders)), len(shortest))
@@ -268,7 +298,7 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 
 
 def object_from_files(files: Mapping[str, bytes]) -> Object3D:
-    """Put an object together from the files of its archive. Raises ``ObjectError``."""
+    """Read an object from the files of its archive. Raises ``ObjectError``."""
     mesh = _mesh_name(files)
     name = mesh[: -len(".obj")]
     parts = parse_obj(files[mesh].decode("utf-8", "replace"), mesh)
@@ -286,10 +316,19 @@ def object_from_files(files: Mapping[str, bytes]) -> Object3D:
     textures = {file: decode_rgb(_member(files, file), file) for file in albedos}
     for file in {f for m in used.values() for f in (m.normal, m.metallic) if f is not None}:
         decode_rgb(_member(files, file), file)
+    used = {key: _without_idle_blending(material, files) for key, material in used.items()}
     obj = Object3D(name, dict(files), parts, used, textures)
     if obj.n_texels > MAX_TEXELS:
         raise ObjectError(f"The albedo textures have {obj.n_texels} texels; at most {MAX_TEXELS} are read.")
     return obj
+
+
+def _without_idle_blending(material: Material, files: Mapping[str, bytes]) -> Material:
+    """``material``, not blended if its alpha is 1 everywhere."""
+    if material.opacity is None or material.opacity < 1:
+        return material
+    alpha = decode_alpha(files[material.albedo], material.albedo)
+    return replace(material, opacity=None) if alpha is None or alpha.min() == 255 else material
 
 
 def _mesh_name(files: Mapping[str, bytes]) -> str:
@@ -316,7 +355,8 @@ def _materials(name: str, files: Mapping[str, bytes]) -> dict[str, Material]:
         if file.lower().endswith(".mtl"):
             for material, maps in parse_mtl(files[file].decode("utf-8", "replace")).items():
                 if "albedo" in maps:
-                    materials[material] = Material(material, maps["albedo"], maps.get("normal"))
+                    opacity = dissolve(maps, material)
+                    materials[material] = Material(material, maps["albedo"], maps.get("normal"), opacity=opacity)
     return materials
 
 
@@ -327,17 +367,26 @@ def _materials_from_json(data: bytes, file: str) -> dict[str, Material]:
             str(name): Material(
                 str(name),
                 _base(maps["albedo"]),
-                *(_base(maps[k]) if maps.get(k) else None for k in ("normal", "metallic")),
+                _base(maps["normal"]) if maps.get("normal") else None,
+                _base(maps["metallic"]) if maps.get("metallic") else None,
+                _share(maps.get("opacity")),
             )
             for name, maps in table.items()
         }
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ObjectError(
             f"{file!r} is not a material definition ({type(error).__name__}: {error}); expected "
-            '{"material": {"albedo": "file.png", "normal": "file.png", "metallic": "file.png"}}.'
+            '{"material": {"albedo": "file.png", "normal": "file.png", "metallic": "file.png"}}, '
+            'and "opacity" from 0 to 1 for a blended one.'
         ) from error
 
 
+def _share(value: float | None) -> float | None:
+    if value is not None and not 0 <= value <= 1:
+        raise ValueError(f"the opacity {value} is not from 0 to 1")
+    return value if value is None else float(value)
+
+
 def _base(name: str) -> str:
-    """File name without folders, whichever way the slashes lean."""
+    """File name without folders; both slashes separate."""
     return re.split(r"[\\/]", name)[-1]

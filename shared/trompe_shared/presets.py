@@ -1,6 +1,6 @@
-"""Named sets of options for those who do not want to choose: how fast, or how good, an attack shall be.
+"""Named sets of options for the effort of an attack.
 
-The figures that justify them: docs/experiments.md, made by ``trompe experiment run speed_accuracy``.
+Measured in docs/experiments.md by ``trompe experiment run speed_accuracy``.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ __all__ = ["PRESETS", "Preset"]
 
 @dataclass(frozen=True)
 class Preset:
-    """``options`` are fields of ``JobSpec``; ``help`` says in a line what one gets for them."""
+    """``options`` by keyword; ``help`` is one phrase."""
 
     help: str
     options: Mapping[str, Any]
@@ -25,8 +25,8 @@ def _preset(help: str, **options: Any) -> Preset:
 
 PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
     {
-        "fast": _preset("a first look: few random views, few steps", pool=60, steps=25, held_out=30),
-        "balanced": _preset("holds from unseen places too", pool=240, steps=90, held_out=60),
-        "best": _preset("for the strongest object, whatever it takes", pool=960, steps=300, held_out=200),
+        "fast": _preset("a first look with few random views and few steps", pool=60, steps=25, held_out=30),
+        "balanced": _preset("effective on unseen cameras and lights too", pool=240, steps=90, held_out=60),
+        "best": _preset("strongest attack, at any cost", pool=960, steps=300, held_out=200),
     }
 )

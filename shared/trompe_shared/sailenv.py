@@ -1,11 +1,11 @@
 """SAILenv's wire protocol as a table of commands, and the codec that server and client share. No sockets here.
 
-A connection starts with ``REGISTER``; then the client sends one command at a time (a code byte and the fields of its
-row in ``COMMANDS``) and waits for the reply of that row. Nothing frames a message: whoever misreads one field has lost
-the stream, so every length is checked, and after a ``ProtocolError`` the connection must be closed.
+A connection starts with ``REGISTER``. Then the client sends one command at a time (a code byte and the fields of its
+row in ``COMMANDS``) and waits for that row's reply. Messages have no frame: after one misread field the stream is lost.
+So every length is checked, and after a ``ProtocolError`` the connection must be closed.
 
-Both directions are little-endian, but strings differ: a client counts code points, a server counts bytes.
-Readers are callables: ``read(n)`` returns exactly n bytes, or raises (``EOFError``, ``OSError``) when the stream ends.
+Both directions are little-endian. Strings differ: a client counts code points, a server counts bytes. Readers are
+callables: ``read(n)`` returns exactly n bytes, or raises ``EOFError`` or ``OSError`` at the end of the stream.
 """
 
 import codecs
@@ -32,8 +32,8 @@ __all__ = [
     "RIM_LIGHT",
     "VIEW_FLAGS",
     "Command",
+    "DecodedCommand",
     "Reader",
-    "Request",
     "decode_frame",
     "decode_request",
     "encode_frame",
@@ -47,7 +47,6 @@ MAX_JSON: Final = 2**20
 MAX_FILE: Final = 256 * 2**20
 MAX_VIEW: Final = 256 * 2**20
 _MAX_TEXTURES: Final = 256
-_FIRST_EXTENSION: Final = 0xE0
 MAX_LIST: Final = 4096
 _GZIP_WINDOW: Final = 31  # zlib's word for gzip data
 MAX_SIDE: Final = 4096
@@ -56,9 +55,9 @@ MAX_VIEWS: Final = 256
 """Most views in one RENDER_VIEWS."""
 _MAX_CHANGES: Final = 64
 
-EXTENSIONS: Final = "trompe extensions 1"
-"""A Trompe worker that has the commands from 0xE1 on answers GET_LIGHT_TYPE for a light of this name with the name
-itself; every other SAILenv says that there is no such light, and both ends stay in step."""
+EXTENSIONS: Final = "trompe extensions 2"
+"""The name of a light. To GET_LIGHT_TYPE for it a Trompe worker with the commands from 0xE1 on answers its engine's
+identity (``EngineInfo.to_text``); any other SAILenv answers that the light does not exist."""
 MAIN_LIGHT: Final = "Main Light"
 RIM_LIGHT: Final = "Rim Light"
 LIGHT_NOT_FOUND: Final = "light_not_found"
@@ -66,26 +65,26 @@ LIGHT_NOT_FOUND: Final = "light_not_found"
 VIEW_FLAGS: Final[Mapping[str, int]] = MappingProxyType(
     {"main": 1, "category": 4, "object": 8, "optical": 16, "depth": 32}
 )
-"""Bit of each view in FRAME's flags, in the order in which a reply holds them."""
+"""Bit of each view in FRAME's flags, in the order of the reply."""
 
 Reader = Callable[[int], bytes]
 
 
-class Kind(Protocol):
-    """How one field travels."""
+class FieldCodec(Protocol):
+    """Encoding of one field."""
 
     def pack(self, value: Any) -> bytes:
-        """Bytes of ``value``; raises ``ProtocolError`` for a value that the protocol cannot carry."""
+        """Encode ``value``. Raises ``ProtocolError`` for a value outside the protocol."""
         ...
 
     def take(self, read: Reader) -> Any:
-        """The value that ``read`` stands at; raises ``ProtocolError`` for bytes that the protocol does not allow."""
+        """Read and decode a value. Raises ``ProtocolError`` for malformed bytes."""
         ...
 
 
 @dataclass(frozen=True)
 class _Numbers:
-    """``count`` numbers of one struct format; a single one is a scalar, more are a tuple."""
+    """``count`` numbers of one struct format. The value is a scalar for one, else a tuple."""
 
     format: str
     count: int = 1
@@ -105,7 +104,7 @@ class _Numbers:
 
 @dataclass(frozen=True)
 class _ClientText:
-    """Text from a client: an int with the number of CODE POINTS (SAILenv's client counts so), then UTF-8."""
+    """Text from a client: an int with the number of CODE POINTS, then UTF-8."""
 
     limit: int = MAX_TEXT
 
@@ -118,7 +117,7 @@ class _ClientText:
         text = ""
         try:
             while len(text) < count:
-                # What is missing takes at least one byte a code point, so this never reads past the text.
+                # A missing code point takes at least one byte, so this never reads past the text.
                 text += decoder.decode(read(count - len(text)))
         except UnicodeDecodeError as error:
             raise ProtocolError(f"A text of {count} code points is not UTF-8 ({error}).") from error
@@ -160,9 +159,9 @@ class _File:
 
 @dataclass(frozen=True)
 class _List:
-    """An int with the number of items, then the items; an item of one kind is the value itself, of more a tuple."""
+    """An int with the number of items, then the items. An item of several kinds is a tuple."""
 
-    kinds: tuple[Kind, ...]
+    kinds: tuple[FieldCodec, ...]
     limit: int = MAX_LIST
 
     def pack(self, value: Sequence[Any]) -> bytes:
@@ -178,7 +177,7 @@ class _List:
 
 @dataclass(frozen=True)
 class _Dynamic:
-    """An optional movement: a bool, and if true its type and its description as JSON text. ``None`` or a pair."""
+    """An optional movement: a bool, then its type and its description as JSON text. The value is ``None`` or a pair."""
 
     def pack(self, value: tuple[str, str] | None) -> bytes:
         if value is None:
@@ -191,7 +190,7 @@ class _Dynamic:
 
 @dataclass(frozen=True)
 class _Scenario:
-    """JSON text of an object that has a list "objects": the reply's length is that list's. The value is the object."""
+    """JSON text of an object with a list "objects", as long as the reply. The value is the object."""
 
     def pack(self, value: Mapping[str, Any]) -> bytes:
         return _JSON.pack(json.dumps(value))
@@ -210,7 +209,7 @@ class _Scenario:
 
 @dataclass(frozen=True)
 class _Pixels:
-    """An 8-bit RGB picture: two ints height and width, then its rows, top row first. The value is those three."""
+    """An 8-bit RGB picture. The value is (height, width, rows), top row first."""
 
     def pack(self, value: tuple[int, int, bytes]) -> bytes:
         height, width, data = value
@@ -225,7 +224,7 @@ class _Pixels:
 
 @dataclass(frozen=True)
 class _Changes:
-    """Commands that are answered by a status alone, each a code byte and its fields: (name, fields) pairs."""
+    """Commands whose reply is a status alone, each a code byte and its fields. The value is (name, fields) pairs."""
 
     def pack(self, value: Sequence[tuple[str, Mapping[str, Any]]]) -> bytes:
         body = b"".join(COMMANDS[name].encode_request(**fields) for name, fields in value)
@@ -237,9 +236,9 @@ class _Changes:
 
     def _take_one(self, read: Reader) -> tuple[str, dict[str, Any]]:
         code = _BYTE.take(read)
-        command = _BY_CODE.get(code) if code < _FIRST_EXTENSION else None
-        if command is None or not command.status or command.reply:
-            raise ProtocolError("A view may only be preceded by commands that are answered by a status alone.")
+        command = _BY_CODE.get(code)
+        if command is None or not command.status or command.reply or command.name == "repaint_object":
+            raise ProtocolError("Before a view only commands are allowed whose reply is a status alone.")
         return command.name, command.decode_fields(read)
 
 
@@ -269,7 +268,7 @@ _JSON: Final = _ClientText(MAX_JSON)
 _SERVER_TEXT: Final = _ServerText()
 
 
-def _nothing() -> Mapping[str, Kind]:
+def _nothing() -> Mapping[str, FieldCodec]:
     return MappingProxyType({})
 
 
@@ -277,23 +276,25 @@ def _nothing() -> Mapping[str, Kind]:
 class Command:
     """One row of the protocol.
 
-    ``request`` names the fields the client sends after the code byte; ``tail`` those that only the longer dialect
-    (v0.6) adds. ``reply`` holds the kinds of the answer's values. With ``status`` a text "ok" stands before them, and
-    any other text is the reason of a refusal, after which nothing follows; else the values ``refused`` stand for one.
-    The reply of a ``repeated`` command is its one kind any number of times, which only the request tells.
+    request: fields after the code byte.
+    tail: further fields of the longer dialect (v0.6).
+    reply: kinds of the answer's values.
+    status: a text precedes the reply, "ok" or the reason of a refusal; nothing follows a refusal.
+    refused: values of a refusal without status.
+    repeated: the reply repeats its one kind; the request determines the number.
     """
 
     code: int | None
     name: str
-    request: Mapping[str, Kind] = field(default_factory=_nothing)
-    reply: tuple[Kind, ...] = ()
+    request: Mapping[str, FieldCodec] = field(default_factory=_nothing)
+    reply: tuple[FieldCodec, ...] = ()
     status: bool = False
     refused: tuple[Any, ...] | None = None
-    tail: Mapping[str, Kind] = field(default_factory=_nothing)
+    tail: Mapping[str, FieldCodec] = field(default_factory=_nothing)
     repeated: bool = False
 
     def encode_request(self, **values: Any) -> bytes:
-        """Bytes a client sends. The fields of ``tail`` go out if they are among ``values``: all of them or none."""
+        """Bytes from a client. ``values`` holds all fields of ``tail`` or none."""
         head = b"" if self.code is None else _BYTE.pack(self.code)
         kinds = dict(self.request) | (dict(self.tail) if set(values) & set(self.tail) else {})
         if set(values) != set(kinds):
@@ -301,18 +302,18 @@ class Command:
         return head + b"".join(kind.pack(values[name]) for name, kind in kinds.items())
 
     def decode_fields(self, read: Reader, *, long: bool = False) -> dict[str, Any]:
-        """The request's fields after the code byte, by name; with ``long`` those of ``tail`` too."""
+        """The fields after the code byte, by name; with ``long`` also those of ``tail``."""
         kinds = dict(self.request) | (dict(self.tail) if long else {})
         return {name: kind.take(read) for name, kind in kinds.items()}
 
     def encode_reply(self, *values: Any) -> bytes:
-        """Bytes a server answers when it did what was asked."""
+        """Bytes from a server after success."""
         status = encode_status() if self.status else b""
         kinds = self.reply * len(values) if self.repeated else self.reply
         return status + b"".join(kind.pack(value) for kind, value in zip(kinds, values, strict=True))
 
     def encode_refusal(self, reason: str) -> bytes:
-        """Bytes a server answers when it refuses: ``reason`` where the protocol has room for one."""
+        """Bytes from a server that refuses; ``reason`` is sent if the protocol has room for it."""
         if self.status:
             return encode_status(reason)
         return b"".join(kind.pack(value) for kind, value in zip(self.reply, self.refused or (), strict=True))
@@ -320,7 +321,7 @@ class Command:
     def decode_reply(self, read: Reader, *, count: int = 1) -> tuple[Any, ...]:
         """The values of an answer. Raises ``RendererError`` with the server's reason for a refusal by status.
 
-        ``count`` is how many values a ``repeated`` command answers.
+        ``count`` is the number of values of a ``repeated`` command.
         """
         if self.status:
             take_status(read, self.name)
@@ -329,24 +330,24 @@ class Command:
 
 
 @dataclass(frozen=True)
-class Request:
+class DecodedCommand:
     """A decoded command with its fields by name."""
 
     command: Command
     values: Mapping[str, Any]
 
 
-def _status(code: int, name: str, request: Mapping[str, Kind], *reply: Kind) -> Command:
+def _status(code: int, name: str, request: Mapping[str, FieldCodec], *reply: FieldCodec) -> Command:
     return Command(code, name, request, reply, status=True)
 
 
-def _getter(code: int, name: str, request: Mapping[str, Kind], reply: Kind, *refused: Any) -> Command:
+def _getter(code: int, name: str, request: Mapping[str, FieldCodec], reply: FieldCodec, *refused: Any) -> Command:
     return Command(code, name, request, (reply,), refused=refused)
 
 
-_LIGHT: Final[Mapping[str, Kind]] = {"light": _CLIENT_TEXT}
-_COLOR_FIELD: Final[Mapping[str, Kind]] = {"color": _COLOR}
-_SPAWN: Final[Mapping[str, Kind]] = {
+_LIGHT: Final[Mapping[str, FieldCodec]] = {"light": _CLIENT_TEXT}
+_COLOR_FIELD: Final[Mapping[str, FieldCodec]] = {"color": _COLOR}
+_SPAWN: Final[Mapping[str, FieldCodec]] = {
     "name": _CLIENT_TEXT,
     "position": _VEC3,
     "rotation": _VEC3,
@@ -354,11 +355,11 @@ _SPAWN: Final[Mapping[str, Kind]] = {
     "scale": _VEC3,
     "use_parent": _BOOL,
 }
-_SPAWN_TAIL: Final[Mapping[str, Kind]] = {"frustum_limited": _BOOL, "dynamic": _Dynamic()}
+_SPAWN_TAIL: Final[Mapping[str, FieldCodec]] = {"frustum_limited": _BOOL, "dynamic": _Dynamic()}
 _NAMES: Final = _List((_SERVER_TEXT,))
 
 REGISTER: Final = Command(None, "register", {"width": _INT, "height": _INT, "gzip": _BOOL}, (_UNSIGNED, _NAMES))
-"""The handshake: what a client sends first, and the answer (agent id, scene names)."""
+"""The handshake. The answer is (agent id, scene names)."""
 
 _ROWS: Final = (
     Command(0x00, "frame", {"flags": _BYTE}),  # its reply depends on the flags: encode_frame, decode_frame
@@ -392,15 +393,15 @@ _ROWS: Final = (
     Command(0x1C, "spawn_view_frustum"),
     Command(0x1D, "load_scenario", {"scenario": _Scenario()}, (_SERVER_TEXT,), refused=("",), repeated=True),
     _status(0x1E, "move_object", {"instance": _INT, "position": _VEC3, "rotation": _VEC3}),
-    # Trompe's own, far from SAILenv's codes: why the last command of this agent was refused; "" if none was.
+    # Extensions of Trompe. The reason of the agent's last refusal; "" if there was none since the last query.
     _getter(0xE0, "last_error", {}, _SERVER_TEXT, ""),
-    # Other albedo textures for a spawned object, by file name; the rest of it stays.
+    # New albedo textures for a spawned object, by file name.
     _status(0xE1, "repaint_object", {"instance": _INT, "textures": _List((_CLIENT_TEXT, _Pixels()), _MAX_TEXTURES)}),
-    # For each view: changes of the state, then its picture. Its reply: a status for each view (encode_status), and
-    # after "ok" height x width RGB bytes, top row first, not mirrored; after any other status nothing more.
+    # Changes of state for each view, then its picture. The reply is a status for each view (encode_status), and after
+    # "ok" height x width RGB bytes, top row first, not mirrored. Nothing follows any other status.
     Command(0xE2, "render_views", {"views": _List((_Changes(),), MAX_VIEWS)}),
-    # An image file that stands behind all objects, as the main view is sent, until another background is set.
-    _status(0xF0, "set_background_picture", {"file": _File()}),
+    # Number of the noise in the next pictures of an engine that is not deterministic; others ignore it.
+    _status(0xE3, "set_noise", {"number": _UNSIGNED}),
 )
 
 COMMANDS: Final[Mapping[str, Command]] = MappingProxyType({row.name: row for row in _ROWS})
@@ -409,11 +410,11 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType({row.name: row for row
 _BY_CODE: Final = {row.code: row for row in _ROWS}
 
 
-def decode_request(read: Reader, *, is_long: Callable[[], bool]) -> Request:
+def decode_request(read: Reader, *, is_long: Callable[[], bool]) -> DecodedCommand:
     """Read one command of a client.
 
-    ``is_long`` is asked, once the short form of a command that also has a longer dialect is read, whether this client
-    speaks the longer one; nothing on the wire tells. Raises ``ProtocolError`` for an unknown code or a bad field.
+    ``is_long`` says whether the client speaks the longer dialect. It is called after the short form of a command with
+    two dialects: nothing on the wire tells them apart. Raises ``ProtocolError`` for an unknown code or a bad field.
     """
     code = _BYTE.take(read)
     command = _BY_CODE.get(code)
@@ -425,7 +426,7 @@ def decode_request(read: Reader, *, is_long: Callable[[], bool]) -> Request:
             values |= {name: kind.take(read) for name, kind in command.tail.items()}
     except ProtocolError as error:
         raise ProtocolError(f"{command.name}: {error}") from error
-    return Request(command, values)
+    return DecodedCommand(command, values)
 
 
 def encode_status(refusal: str | None = None) -> bytes:
@@ -437,16 +438,16 @@ def encode_status(refusal: str | None = None) -> bytes:
 
 
 def take_status(read: Reader, asked: str) -> None:
-    """Read a status. Raises ``RendererError`` with the server's reason for any but "ok"; ``asked`` says for what."""
+    """Read the status of the command ``asked``. Raises ``RendererError`` with the server's reason for any but "ok"."""
     if (status := _SERVER_TEXT.take(read)) != "ok":
         raise RendererError(f"The renderer refused {asked}: {status}")
 
 
 def encode_frame(views: Sequence[bytes], *, delta_time: float, compress: bool) -> list[bytes]:
-    """FRAME's reply, as pieces each of which starts with a view's length (if there is a view).
+    """FRAME's reply in pieces; each starts with the length of its view.
 
-    A client reads a length with one ``recv``, so a piece must be sent whole and apart from the one before. ``views``
-    are the payloads in the order of ``VIEW_FLAGS``; ``delta_time`` in seconds, NaN when the rendering failed.
+    A client reads a length with one ``recv``, so each piece must be sent whole, in segments of its own. ``views`` are
+    the payloads in the order of ``VIEW_FLAGS``; ``delta_time`` in seconds, NaN after a failed rendering.
     """
     payloads = [gzip.compress(view, 1) for view in views] if compress else views
     pieces = [_INT.pack(_within(len(payload), MAX_VIEW, "view")) + payload for payload in payloads]
@@ -454,13 +455,13 @@ def encode_frame(views: Sequence[bytes], *, delta_time: float, compress: bool) -
 
 
 def decode_frame(read: Reader, *, flags: int, compressed: bool) -> tuple[dict[str, bytes], float]:
-    """FRAME's reply: payloads by view name, uncompressed, and the delta time in seconds."""
+    """Read FRAME's reply: uncompressed payloads by view name, and the delta time in seconds."""
     views = {name: _take_view(read, compressed) for name in views_of(flags)}
     return views, _FLOAT.take(read)
 
 
 def views_of(flags: int) -> Iterator[str]:
-    """Names of the views that ``flags`` asks for, in the order of the reply."""
+    """Names of the views in ``flags``, in the order of the reply."""
     return (name for name, bit in VIEW_FLAGS.items() if flags & bit)
 
 

@@ -1,12 +1,12 @@
-"""Wavefront OBJ and MTL, as far as a textured object needs them.
+"""Wavefront OBJ and MTL: the statements of a textured mesh, with errors that name the line.
 
-trimesh drops the material names (and with them the UVs) of an OBJ whose .mtl is not beside it, which is how
-SAILenv ships its objects; so the few statements that matter are read here, with errors that name the line.
+SAILenv ships OBJ files without an .mtl. Material names, and every number as written, must survive for a repaint that
+changes nothing else.
 """
 
 import re
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -20,6 +20,7 @@ __all__ = [
     "MAX_FACES",
     "Part",
     "Surface",
+    "dissolve",
     "obj_text",
     "parse_mtl",
     "parse_obj",
@@ -29,14 +30,14 @@ __all__ = [
 
 MAX_FACES: Final = 2_000_000
 LARGEST: Final = 1e6
-"""Coordinates (metres) and texture coordinates that are larger are no object's, and have no precision left."""
+"""Largest coordinate (metres) and texture coordinate."""
 _WIDTHS: Final = {"v": 3, "vt": 2, "vn": 3}
 MAX_LINE: Final = 2**20
-"""Characters of a line; one polygon with a hundred thousand corners is within."""
+"""Characters of a line: enough for a polygon with a hundred thousand corners."""
 MAX_LINES: Final = 20_000_000
-"""Lines of a file; ten for each triangle are within."""
+"""Lines of a file: ten for each triangle."""
 _LINE: Final = re.compile(r"[\r\n]{0,65536}([^\r\n]*)")
-"""A line, after the end of the one before. Many empty lines are read in pieces: other threads have their turns."""
+"""The end of a line and the next line. The bound on empty lines lets other threads run."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,11 @@ class Part:
 
 @dataclass(frozen=True)
 class Surface:
-    """A part that may lack texture coordinates.
+    """A part, possibly without texture coordinates.
 
-    vertices, normals, faces: as of ``Part``.
-    uvs:     as of ``Part``; ``None`` where a corner has none.
-    colours: (V, 3) float32 in [0, 1], as written in the file; ``None`` where a vertex has none.
+    vertices, normals, faces: as in ``Part``.
+    uvs:     as in ``Part``; ``None`` if any corner has none.
+    colours: (V, 3) float32 in [0, 1], as written in the file; ``None`` if any vertex has none.
     """
 
     material: str
@@ -74,8 +75,6 @@ class Surface:
 
 
 class _Reader:
-    """Statements of one OBJ file, collected line by line."""
-
     def __init__(self, file: str) -> None:
         self.file = file
         self.numbers = {kind: array("d") for kind in _WIDTHS}
@@ -85,7 +84,7 @@ class _Reader:
         self._triangles = 0
 
     def read(self, text: str) -> None:
-        for count, found in enumerate(_LINE.finditer(text)):  # a list of all lines takes many times the text
+        for count, found in enumerate(_LINE.finditer(text)):  # a list of all lines would take many times the memory
             line = found[1]
             if count == MAX_LINES:
                 raise ObjectError(f"{self.file!r} has more than {MAX_LINES} lines; simplify the mesh.")
@@ -131,7 +130,7 @@ class _Reader:
         return (self._index(fields[0], "v"), self._index(fields[1], "vt"), self._index(fields[2], "vn"))
 
     def _index(self, field: str, kind: str) -> int:
-        """Zero-based index of a corner's field; -1 where it has none."""
+        """Zero-based index of a corner's field; -1 for an empty field."""
         if field == "":
             return -1
         count, value = len(self.numbers[kind]) // _WIDTHS[kind], int(field)
@@ -142,15 +141,14 @@ class _Reader:
 
 
 def _number(line: re.Match[str]) -> int:
-    """The number of a line, from 1, whether lines end with a line feed, a carriage return or both."""
+    """The number of a line, from 1, for all kinds of line ends."""
     return 1 + max(line.string.count(end, 0, line.start(1)) for end in "\r\n")
 
 
 def parse_obj(text: str, file: str) -> tuple[Part, ...]:
-    """The parts of an OBJ text, one per material, in the order of first use.
+    """The parts of an OBJ text, one per material, in the order of first use. Polygons are split into fans.
 
-    Polygons are split into fans. Raises ``ObjectError`` naming the line for what cannot be read, and for a mesh
-    without triangles, without UVs or with absurd numbers.
+    Raises ``ObjectError`` for an unreadable line, and for a mesh without triangles, without UVs or with absurd numbers.
     """
     return tuple(_part(surface, file) for surface in parse_surfaces(text, file))
 
@@ -164,7 +162,7 @@ def _part(surface: Surface, file: str) -> Part:
 
 
 def parse_surfaces(text: str, file: str) -> tuple[Surface, ...]:
-    """As ``parse_obj``, but for meshes that need not have UVs, and with the colours of vertices, where all have one."""
+    """As ``parse_obj``, also for meshes without UVs, and with vertex colours if all vertices have one."""
     reader = _Reader(file)
     reader.read(text)
     if not reader.corners:
@@ -172,7 +170,7 @@ def parse_surfaces(text: str, file: str) -> tuple[Surface, ...]:
     numbers = dict(reader.numbers)
     if len(reader.colours) == len(numbers["v"]):
         numbers["colour"] = reader.colours
-    with np.errstate(over="ignore"):  # too large for single precision is too large
+    with np.errstate(over="ignore"):  # infinite in single precision is refused below
         arrays = {kind: _rows(values, _WIDTHS.get(kind, 3)).astype(np.float32) for kind, values in numbers.items()}
     for kind, values in arrays.items():
         if not np.isfinite(values).all():
@@ -202,7 +200,7 @@ def _surface(material: str, corners: "array[int]", arrays: dict[str, NDArray[np.
 def smooth_normals(
     positions: NDArray[np.float32], index: NDArray[np.int64], faces: NDArray[np.int32]
 ) -> NDArray[np.float32]:
-    """Area-weighted normals (V, 3) of vertices that stand at ``positions[index]``, shared by those at the same one.
+    """Area-weighted normals (V, 3) of vertices at ``positions[index]``; vertices at one position share a normal.
 
     positions: (P, 3); index: (V,); faces: (F, 3) indices of vertices.
     """
@@ -220,7 +218,7 @@ def _normalised(vectors: NDArray[np.floating], *, fallback: NDArray[np.floating]
 
 
 def obj_text(parts: tuple[Part, ...], *, library: str | None = None) -> str:
-    """An OBJ text from which ``parse_obj`` reads these parts, every number as it is; ``library`` names its .mtl."""
+    """An OBJ text that ``parse_obj`` reads as exactly these parts; ``library`` names its .mtl."""
     return "".join(_statements(parts, library))
 
 
@@ -239,8 +237,12 @@ def _statements(parts: tuple[Part, ...], library: str | None) -> Iterator[str]:
 
 
 def parse_mtl(text: str) -> dict[str, dict[str, str]]:
-    """Maps of each material of an MTL text: ``{name: {"albedo": file, "normal": file}}``, files without folders."""
+    """Maps of each material of an MTL text: ``{name: {"albedo": file, "normal": file}}``, files without folders.
+
+    Transparent materials have ``map_d`` (a file), ``d`` or ``tr`` (numbers), too; see ``dissolve``.
+    """
     keys = {"map_kd": "albedo", "map_bump": "normal", "bump": "normal", "norm": "normal"}
+    keys |= {key: key for key in ("map_d", "d", "tr")}
     materials: dict[str, dict[str, str]] = {}
     current: dict[str, str] = {}
     for found in _LINE.finditer(text):
@@ -250,7 +252,21 @@ def parse_mtl(text: str) -> dict[str, dict[str, str]]:
         if words[0] == "newmtl":
             current = materials.setdefault(words[1].strip(), {})
         elif words[0].lower() in keys:
-            # Options (-bm 1.0) stand before the file name, which is the last word; names with blanks have no options.
+            # Options (-bm 1.0) precede the file name, then the last word. A name with blanks has no options.
             name = words[1].strip() if not words[1].startswith("-") else words[1].split()[-1]
             current[keys[words[0].lower()]] = name.replace("\\", "/").rsplit("/", 1)[-1]
     return materials
+
+
+def dissolve(maps: Mapping[str, str], material: str) -> float | None:
+    """Opacity in (0, 1] of a blended material with ``maps`` of ``parse_mtl``; ``None`` for an opaque one.
+
+    ``d`` is opacity and ``Tr`` is 1 - opacity. An opacity of 0 counts as 1: some programs write ``Tr 1`` (MeshLab) or
+    ``d 0`` for solid materials. Raises ``ObjectError``.
+    """
+    try:
+        given = float(maps["d"]) if "d" in maps else 1 - float(maps.get("tr", "0"))
+    except ValueError as error:
+        raise ObjectError(f"Material {material!r}: its d or Tr is not a number ({error}); expected 0 to 1.") from error
+    opacity = min(max(0.0, given), 1.0) or 1.0
+    return opacity if opacity < 1 or "map_d" in maps else None

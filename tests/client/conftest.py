@@ -1,4 +1,4 @@
-"""A Trompe server without the attack: real HTTP on a real socket, jobs that play a script."""
+"""A double of the server: real HTTP on a real socket, with scripted jobs and faults."""
 
 import asyncio
 import hashlib
@@ -14,19 +14,24 @@ from email import message_from_bytes
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import count
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 
 import pytest
+from click import testing
 from pydantic import ValidationError
 from pydantic_core import to_json
 
 from trompe_client import Client, _following
 from trompe_client._http import AsyncPort, BlockingPort
+from trompe_client._plan import Upload, object_source
+from trompe_client.cli import main
 from trompe_shared.api import (
     Accuracy,
     BackgroundInfo,
     ClassifierInfo,
     Event,
+    FooledAs,
     Job,
     JobList,
     JobRequest,
@@ -34,6 +39,7 @@ from trompe_shared.api import (
     JobState,
     Judgement,
     ObjectInfo,
+    PipelineJudgement,
     Progress,
     RendererInfo,
     Result,
@@ -42,64 +48,95 @@ from trompe_shared.api import (
 from trompe_shared.faults import faults_of
 
 NOW = datetime(2025, 1, 2, 3, 4, tzinfo=UTC)
+SPEC = JobSpec.of("mug", label="mug")
+"""The shortest job."""
 MUG = ObjectInfo(
     id="m" * 8, name="mug", materials=["m"], textures={"a.png": (4, 8)}, triangles=12, radius=0.1, shipped=True
 )
 WORKER = WorkerInfo(id="w1", host="here", device="cpu", alive=True, started=NOW, seen=NOW, job="job-1")
 RENDERER = RendererInfo(address="127.0.0.1:8085", alive=True)
-TINY = ClassifierInfo(id="t" * 8, name="tiny", white_box=True, image_size=(32, 32), n_classes=10, shipped=True)
+TINY = ClassifierInfo(
+    id="t" * 8, name="tiny", white_box=True, image_size=(32, 32), n_classes=10, classes=None, shipped=True
+)
+OWN = Accuracy(
+    views=60,
+    distinct=50,
+    a_before=0.9,
+    a_after=0.3,
+    a_drop=0.6667,
+    a_drop_interval=(0.55, 0.78),
+    a_before_interval=(0.8, 0.95),
+    a_after_interval=(0.2, 0.43),
+)
+NOTHING = dict.fromkeys(("a_after", "a_after_interval", "a_drop", "a_drop_interval"))
+NOT_RECOGNISED = OWN.model_copy(update=NOTHING | {"a_before": 0, "a_before_interval": (0, 0.06)})
+HELD_OUT = OWN.model_copy(update={"views": 17, "distinct": 17})
+FIGURES: dict[str, Any] = {
+    "surrogate": OWN,
+    "held_out": HELD_OUT,
+    "image_pipelines": [PipelineJudgement(pipeline="half size", held_out=HELD_OUT)],
+    "transfer_gap": 0.0123,
+    "texels_altered": 0.421,
+    "mean_texel_change": 0.031,
+    "max_view_change": 0.2,
+    "goal_reached": 0.8333,
+    "fooled_as": [
+        FooledAs(label=k, name=name, own=9, held_out=6 - k, neighbour=k == 5)
+        for k, name in enumerate(("jug, ewer", "cup", "vase", "pot", "pan", "beer mug", None))
+        if k != 1
+    ],
+    "pixels_beyond_epsilon": 0.0123,
+    "views_beyond_epsilon": 0.25,
+    "ssim": 0.987,
+    "delta_e": 1.234,
+    "delta_e_95": 2.5,
+    "evaluations": 4800,
+}
+"""Figures of an attack; None if nothing was recognised."""
 
 
 def result_of(spec: JobSpec, *, applicable: bool = True) -> Result:
-    """A result with figures that a table must show."""
-    own = Accuracy(
-        views=60,
-        a_before=0.9,
-        a_after=0.3,
-        a_drop=0.6667,
-        a_drop_interval=(0.55, 0.78),
-        a_before_interval=(0.8, 0.95),
-        a_after_interval=(0.2, 0.43),
-    )
-    nothing = Accuracy(
-        views=60, a_before=0, a_after=None, a_drop=None, a_before_interval=(0, 0.06), a_after_interval=None
-    )
+    """A result with figures for all rows of a table."""
     return Result(
         spec=spec,
         object=spec.object,
         label=3,
         label_name="mug",
-        classifier=spec.classifier,
-        epsilon=spec.epsilon,
+        labels=[3, 1],
+        label_names=["mug", "cup"],
+        classifier=spec.victim.classifier,
+        epsilon=spec.paint.epsilon,
         alpha=spec.alpha,
-        tau=spec.tau,
+        tau=spec.paint.tau,
         surrogate_model="calibrated",
         surrogate_reason="error 0.4/255 is within tolerance",
-        seed=spec.seed,
-        steps=spec.steps,
+        seed=spec.search.seed,
+        steps=spec.search.steps,
         image_size=(32, 32),
-        surrogate=own if applicable else None,
-        target=own if applicable else nothing,
-        held_out=own.model_copy(update={"views": 17}) if applicable else None,
-        transfer_gap=0.0123 if applicable else None,
-        judges=[Judgement(classifier=judge, target=own) for judge in spec.judges],
-        texels_altered=0.421 if applicable else None,
-        mean_texel_change=0.031 if applicable else None,
-        max_view_change=0.2 if applicable else None,
-        goal_reached=0.8333 if applicable else None,
-        pixels_beyond_epsilon=0.0123 if applicable else None,
-        views_beyond_epsilon=0.25 if applicable else None,
-        ssim=0.987 if applicable else None,
-        delta_e=1.234 if applicable else None,
-        evaluations=4800 if applicable else None,
-        queries=48_000 if applicable and spec.queries else None,
+        target=OWN if applicable else NOT_RECOGNISED,
+        judges=[Judgement(classifier=judge, target=OWN) for judge in spec.judges.networks],
+        queries=48_000 if applicable and spec.victim.queries else None,
         warnings=["the [racket] is thin"],
         seconds={"calibrate": 1.25, "attack": 7.5},
         probe_renders=120,
         versions={"trompe": "0"},
         views=[],
         held_out_views=[],
+        **(FIGURES if applicable else dict.fromkeys(FIGURES) | {"fooled_as": [], "image_pipelines": []}),
     )
+
+
+def trompe(*words: object) -> testing.Result:
+    """Run a command in this process."""
+    return testing.CliRunner().invoke(main, [str(word) for word in words])
+
+
+def zipped(source: Path) -> bytes:
+    """What is sent for an object of several files."""
+    upload = object_source(source)
+    assert isinstance(upload, Upload)
+    assert isinstance(upload.content, bytes)
+    return upload.content
 
 
 def adversarial_zip() -> bytes:
@@ -111,12 +148,11 @@ def adversarial_zip() -> bytes:
 
 
 class FakeServer:
-    """State and script of the fake.
+    """State and script of the double.
 
-    ``ending`` is how jobs end; ``drops`` how often an event stream breaks off; ``cut`` after how many bytes the next
-    files break off; ``refusals`` are the answers (status, headers) to the next requests, whatever they ask for;
-    ``lies`` how many files come with wrong bytes; ``token`` is asked for where it is set; ``when_listed`` is called
-    before jobs are listed.
+    ``ending``: final state of jobs. ``drops``: number of event streams to break off. ``cut``: bytes of the next files
+    before they break off. ``refusals``: answers (status, headers) to the next requests, with ``detail``. ``lies``:
+    number of files with wrong bytes. ``token``: required if set. ``when_listed``: called before jobs are listed.
     """
 
     def __init__(self) -> None:
@@ -127,9 +163,12 @@ class FakeServer:
         self.requests: list[tuple[str, str, dict[str, str]]] = []
         self.cut: list[int] = []
         self.refusals: list[tuple[int, dict[str, str]]] = []
+        self.detail: str | None = None
         self.lies = 0
         self.token: str | None = None
-        self.artifacts = ["adversarial.zip", "report/index.html", "result.json"]
+        self.note = "no view was recognised before the attack"
+        self.warnings = ["the [racket] is thin"]
+        self.artifacts = ["NAME-adversarial.zip", "report/index.html", "result.json"]
         self.when_listed: Callable[[], None] = lambda: None
         self.url = ""
         self.uploads: dict[str, tuple[str, bytes, dict[str, str]]] = {}
@@ -143,8 +182,10 @@ class FakeServer:
         self.ids = count(1)
 
     def add_job(self, request: JobRequest) -> Job:
-        more = {"priority": request.priority, "labels": request.labels, "needs": request.needs}
-        job = Job(id=f"job-{next(self.ids)}", state=JobState.queued, spec=request.spec(), created=NOW, **more)
+        queued: dict[str, Any] = request.model_dump(include={"priority", "labels", "needs"})
+        queued["names"] = {one.id: one.name for one in self.objects if not one.shipped}
+        queued["names"] |= {one.id: one.name for one in self.classifiers if not one.shipped}
+        job = Job(id=f"job-{next(self.ids)}", state=JobState.queued, spec=request.spec(), created=NOW, **queued)
         self.jobs[job.id] = job
         self.history[job.id] = self.script(job)
         return job
@@ -152,7 +193,7 @@ class FakeServer:
     def script(self, job: Job) -> list[Event]:
         ids = count(1)
 
-        def event(state: JobState, message: str | None = None, **progress: object) -> Event:
+        def event(state: JobState, message: str | None = None, **progress: Any) -> Event:
             return Event(id=next(ids), time=NOW, state=state, progress=Progress(**progress), message=message)
 
         return [
@@ -167,11 +208,11 @@ class FakeServer:
         """The job is now where ``event`` says."""
         update: dict[str, object] = {"state": event.state, "progress": event.progress}
         if event.state in {JobState.succeeded, JobState.not_applicable}:
-            update["artifacts"] = self.artifacts
+            update["artifacts"] = [each.replace("NAME", self.name_of(job_id)) for each in self.artifacts]
         if event.state is JobState.failed:
             update["error"] = "the renderer said no"
         if event.state is JobState.not_applicable:
-            update["note"] = "no view was recognised before the attack"
+            update["note"] = self.note
         self.jobs[job_id] = self.jobs[job_id].model_copy(update=update)
 
     def cancel(self, job_id: str) -> None:
@@ -187,13 +228,19 @@ class FakeServer:
                 self.reach(job_id, self.history[job_id][-1])
 
     def artifact(self, job_id: str, name: str) -> bytes:
-        if name == "adversarial.zip":
+        if name.endswith("-adversarial.zip"):
             return adversarial_zip()
         return b"<html>" if name.endswith(".html") else self.result(job_id).model_dump_json().encode()
 
+    def name_of(self, job_id: str) -> str:
+        """Name of a job's object."""
+        reference = self.jobs[job_id].spec.object
+        return [one.name for one in self.objects if reference in {one.id, one.name}][-1]
+
     def result(self, job_id: str) -> Result:
         job = self.jobs[job_id]
-        return result_of(job.spec, applicable=job.state is not JobState.not_applicable)
+        found = result_of(job.spec, applicable=job.state is not JobState.not_applicable)
+        return found.model_copy(update={"warnings": self.warnings})
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -227,7 +274,7 @@ class Handler(BaseHTTPRequestHandler):
         self.fake.requests.append((self.command, self.path, dict(self.headers)))
         if self.fake.refusals:
             status, headers = self.fake.refusals.pop(0)
-            self.problem(status, "Not now", headers)
+            self.problem(status, "Not now", headers, detail=self.fake.detail)
             return True
         if self.fake.token and self.headers.get("Authorization") != f"Bearer {self.fake.token}":
             self.problem(401, "Who are you")
@@ -272,7 +319,7 @@ class Handler(BaseHTTPRequestHandler):
             return self.reply(b"", 304, ETag=etag)
         start = 0
         if self.headers.get("If-Range") == etag:
-            start = int(re.fullmatch(r"bytes=(\d+)-", self.headers["Range"])[1])
+            start = int(self.headers["Range"].removeprefix("bytes=").removesuffix("-"))
             if start >= len(data):
                 return self.problem(416, "No such range")
         body = data[start:]
@@ -287,7 +334,7 @@ class Handler(BaseHTTPRequestHandler):
     def page(self, query: dict[str, list[str]]) -> JobList:
         def wanted(job: Job) -> bool:
             labels = dict(label.split(":", 1) for label in query.get("label", []))
-            known = {"state": job.state.value, "object": job.spec.object, "classifier": job.spec.classifier}
+            known = {"state": job.state.value, "object": job.spec.object, "classifier": job.spec.victim.classifier}
             return all(query.get(name) in (None, [value]) for name, value in known.items()) and (
                 labels.items() <= job.labels.items()
             )
@@ -319,7 +366,7 @@ class Handler(BaseHTTPRequestHandler):
         if what == "retry":
             old = self.fake.jobs[job_id]
             more = {"priority": old.priority, "labels": old.labels, "needs": old.needs}
-            return self.make(JobRequest.of(old.spec).model_copy(update=more))
+            return self.make(JobRequest.model_validate(old.spec.model_dump() | more))
         return self.store(what, *self.multipart(body))
 
     def submit(self, body: bytes) -> None:
@@ -345,7 +392,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def multipart(self, body: bytes) -> tuple[str, bytes, dict[str, str]]:
         head = f"Content-Type: {self.headers['Content-Type']}\r\n\r\n".encode()
-        parts = message_from_bytes(head + body).get_payload()
+        parts: Any = message_from_bytes(head + body).get_payload()
         fields = {part.get_param("name", header="content-disposition"): part for part in parts}
         file = fields.pop("file")
         form = {name: part.get_payload(decode=True).decode() for name, part in fields.items()}

@@ -6,6 +6,7 @@ import json
 import secrets
 import zipfile
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -24,7 +25,7 @@ from trompe_client import (
 from trompe_client._embedded import embedded_server
 from trompe_shared.api import JobRequest, JobSpec, JobState
 
-FEW = {"pool": 0, "azimuths": 2, "elevations": 1, "held_out": 1, "steps": 1}
+FEW: dict[str, Any] = {"grid": True, "azimuths": 2, "elevations": 1, "held_out": 1, "steps": 1}
 """Options of a job of seconds."""
 ENDLESS = FEW | {"steps": 10_000}
 
@@ -83,9 +84,9 @@ def client(request: pytest.FixtureRequest, address: str) -> Iterator[Any]:
             yield connected
         return
     with asyncio.Runner() as runner:
-        connected = AsyncClient(address)
-        yield Blocking(connected, runner.get_loop())
-        runner.run(connected.close())
+        asynchronous = AsyncClient(address)
+        yield Blocking(asynchronous, runner.get_loop())
+        runner.run(asynchronous.close())
 
 
 @pytest.fixture
@@ -94,7 +95,7 @@ def name() -> str:
     return secrets.token_hex(8)
 
 
-def test_a_job_from_its_submission_to_its_files(client, tmp_path):
+def test_a_job_from_its_submission_to_its_files(client: Any, tmp_path: Path) -> None:
     job = client.attack("mug", label="mug", epsilon=0.1, labels={"who": "me"}, priority="interactive", **FEW)
     assert job.state in {JobState.queued, JobState.running}
     job.wait(timeout=120)
@@ -102,16 +103,18 @@ def test_a_job_from_its_submission_to_its_files(client, tmp_path):
     assert (job.status.labels, job.status.priority) == ({"who": "me"}, "interactive")
     result = job.result()
     assert (result.epsilon, result.target.views > 0) == (0.1, True)
+    (tmp_path / "result.json").write_text("older")
     paths = job.download(tmp_path)
     assert [path.relative_to(tmp_path).as_posix() for path in paths] == job.status.artifacts
     assert json.loads((tmp_path / "result.json").read_text())["epsilon"] == 0.1
     with zipfile.ZipFile(job.archive(tmp_path / "all.zip")) as archive:
         assert archive.testzip() is None
-    states = [event.state for event in job.events()]
-    assert (states[0], states[-1]) == (JobState.queued, JobState.succeeded)
+    events = list(client.job(job.id).events())
+    assert [event.id for event in events] == list(range(1, len(events) + 1))
+    assert (events[0].state, events[-1].state) == (JobState.queued, JobState.succeeded)
 
 
-def test_a_key_makes_one_job(client, name):
+def test_a_key_makes_one_job(client: Any, name: str) -> None:
     first = client.attack("mug", label="mug", key=name, **FEW)
     assert client.submit(first.status.spec, key=name).id == first.id
     with pytest.raises(Conflict):
@@ -119,10 +122,12 @@ def test_a_key_makes_one_job(client, name):
     first.wait(timeout=120)
 
 
-def test_a_cancelled_job_can_be_submitted_anew_and_deleted(client):
+def test_a_cancelled_job_can_be_submitted_anew_and_deleted(client: Any) -> None:
     job = client.attack("mug", label="mug", labels={"who": "them"}, **ENDLESS)
     with pytest.raises(Conflict):
         job.delete()
+    with pytest.raises(Conflict, match=r"queued|running"):
+        job.result()
     job.cancel()
     with pytest.raises(JobCancelled) as caught:
         job.wait(timeout=60)
@@ -137,7 +142,7 @@ def test_a_cancelled_job_can_be_submitted_anew_and_deleted(client):
         job.refresh()
 
 
-def test_jobs_are_found_by_state_label_object_and_classifier(client, name):
+def test_jobs_are_found_by_state_label_object_and_classifier(client: Any, name: str) -> None:
     label = {"test": name}
     jobs = [client.attack("mug", label="mug", labels=label, seed=seed, **FEW) for seed in range(3)]
     assert [job.id for job in client.jobs(labels=label)] == [job.id for job in reversed(jobs)]
@@ -149,22 +154,23 @@ def test_jobs_are_found_by_state_label_object_and_classifier(client, name):
     assert list(client.jobs(labels=label, state="failed")) == []
 
 
-def test_many_jobs_come_back_with_results_and_errors(client, name):
+def test_many_jobs_come_back_with_results_and_errors(client: Any, name: str) -> None:
     one = {"object": "mug", "label": "mug", **FEW}
-    attacks = [one | {"seed": 1}, one | {"object": "no such"}, JobRequest(**one, labels={"own": "label"})]
-    attacks.append(JobSpec(object="mug", label="mug", azimuths=2))
+    request = JobRequest.of(**one, labels={"own": "label"}, priority="sweep")
+    lost = JobSpec.of("mug", label="mug").model_copy(update={"object": "no such"})
+    attacks = [one | {"seed": 1}, one | {"object": "no such"}, request, lost]
     outcomes = {outcome.index: outcome for outcome in client.map(attacks, batch=name)}
     assert sorted(outcomes) == [0, 1, 2, 3]
     assert isinstance(outcomes[1].error, NotFound)
-    assert isinstance(outcomes[3].error, BadRequest)
-    assert "azimuths and elevations shape the paper's grid" in str(outcomes[3].error)
+    assert isinstance(outcomes[3].error, NotFound)
     assert [outcomes[index].result.seed for index in (0, 2)] == [1, 0]
-    assert outcomes[2].job.status.labels == {"own": "label", "batch": name}
+    queued = outcomes[2].job.status
+    assert (queued.labels, queued.priority) == ({"own": "label", "batch": name}, "sweep")
     again = {outcome.index: outcome for outcome in client.map(attacks, batch=name)}
     assert [again[index].job.id for index in (0, 2)] == [outcomes[index].job.id for index in (0, 2)]
 
 
-def test_what_is_stored_and_what_does_the_work(client, mug_folder):
+def test_what_is_stored_and_what_does_the_work(client: Any, mug_folder: Path) -> None:
     assert "mug" in {one.name for one in client.objects()}
     assert "tiny" in {one.name for one in client.classifiers()}
     assert [worker.alive for worker in client.workers()] == [True]
@@ -172,10 +178,10 @@ def test_what_is_stored_and_what_does_the_work(client, mug_folder):
     assert isinstance(client.backgrounds(), list)
 
 
-def test_what_is_wrong_says_so_with_the_ids(client):
+def test_what_is_wrong_says_so_with_the_ids(client: Any) -> None:
     with pytest.raises(NotFound) as caught:
         client.job("no-such-job")
-    assert caught.value.job_id == "no-such-job"
+    assert (caught.value.status, caught.value.job_id) == (404, "no-such-job")
     assert caught.value.request_id
     with pytest.raises((BadRequest, NotFound)):
         client.attack("no such object", label=0)
@@ -185,7 +191,7 @@ PAIRS = [pytest.param(Client, AsyncClient, id="client"), pytest.param(JobHandle,
 
 
 @pytest.mark.parametrize(("blocking", "asynchronous"), PAIRS)
-def test_both_clients_have_the_same_methods_with_the_same_arguments(blocking, asynchronous):
+def test_both_clients_have_the_same_methods_with_the_same_arguments(blocking: type, asynchronous: type) -> None:
     def arguments(kind: type) -> dict[str, list[str]]:
         members = inspect.getmembers(kind, inspect.isfunction)
         public = {name: member for name, member in members if not name.startswith("_")}
@@ -194,5 +200,5 @@ def test_both_clients_have_the_same_methods_with_the_same_arguments(blocking, as
     assert arguments(blocking) == arguments(asynchronous)
 
 
-def test_both_clients_are_made_alike():
+def test_both_clients_are_made_alike() -> None:
     assert str(inspect.signature(Client)) == str(inspect.signature(AsyncClient))

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from documentation import DOCS, blocks
 
 import trompe_client
+from tests.client.conftest import FakeServer, zipped
+from tests.documentation import DOCS, blocks
 from trompe_client._embedded import embedded_server
 from trompe_client.cli import main
 from trompe_client.cli.exits import EXITS
@@ -40,7 +41,7 @@ def run(command: list[str], folder: Path, server: str) -> str:
     return done.stdout
 
 
-def test_the_quickstart_starts_the_service_that_these_tests_start():
+def test_the_quickstart_starts_the_service_that_these_tests_start() -> None:
     assert [code for _, code in blocks("quickstart.md", "sh")][:2] == [
         "pip install 'trompe[server]'\n",
         "trompe serve\n",
@@ -48,31 +49,29 @@ def test_the_quickstart_starts_the_service_that_these_tests_start():
 
 
 @pytest.mark.parametrize(("heading", "out"), [("Python", "out-python"), ("Python with asyncio", "out-asyncio")])
-def test_the_quickstart_in_python_runs(service, tmp_path, heading, out):
+def test_the_quickstart_in_python_runs(service: str, tmp_path: Path, heading: str, out: str) -> None:
     said = run([sys.executable, "-W", "error", "-c", QUICKSTART[heading]], tmp_path, service)
     assert re.fullmatch(r"recognised in \d+% of the views before, in \d+% after\n", said)
-    assert (tmp_path / out / "adversarial.zip").is_file()
+    assert (tmp_path / out / "mug-adversarial.zip").is_file()
 
 
-def test_the_quickstart_on_the_command_line_runs(service, tmp_path):
+def test_the_quickstart_on_the_command_line_runs(service: str, tmp_path: Path) -> None:
     said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["Command line"]], tmp_path, service)
     assert "target (own views)" in said
-    assert (tmp_path / "out-cli" / "mug_adversarial.zip").is_file()
+    assert (tmp_path / "out-cli" / "mug-adversarial.zip").is_file()
 
 
-def test_the_quickstart_with_curl_runs(service, tmp_path):
+def test_the_quickstart_with_curl_runs(service: str, tmp_path: Path) -> None:
     said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["curl"]], tmp_path, service)
     assert "event: progress" in said
-    assert (tmp_path / "out-curl" / "adversarial.zip").read_bytes()[:2] == b"PK"
+    assert (tmp_path / "out-curl" / "mug-adversarial.zip").read_bytes()[:2] == b"PK"
     assert '"texels_altered"' in (tmp_path / "out-curl" / "result.json").read_text()
 
 
 @pytest.fixture
-def readers_folder(server, mug_folder, tmp_path, monkeypatch):
+def readers_folder(server: FakeServer, mug_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the files that the pages speak of; the fake server is where commands look for one."""
-    from trompe_client._plan import object_upload
-
-    (tmp_path / "mug.zip").write_bytes(object_upload(mug_folder).content)
+    (tmp_path / "mug.zip").write_bytes(zipped(mug_folder))
     (tmp_path / "net.pt2").write_bytes(b"network")
     (tmp_path / "room.png").write_bytes(b"picture")
     server.when_listed = server.finish_all
@@ -83,7 +82,9 @@ def readers_folder(server, mug_folder, tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("readers_folder")
-def test_the_page_on_the_sdk_runs_from_its_beginning_to_its_end(server, capsys):
+def test_the_page_on_the_sdk_runs_from_its_beginning_to_its_end(
+    server: FakeServer, capsys: pytest.CaptureFixture[str]
+) -> None:
     names: dict[str, object] = {}
     for heading, code in blocks("sdk.md", "python"):
         here = code.replace('"http://127.0.0.1:8000"', repr(server.url))
@@ -92,22 +93,22 @@ def test_the_page_on_the_sdk_runs_from_its_beginning_to_its_end(server, capsys):
 
 
 @pytest.mark.usefixtures("readers_folder")
-def test_the_page_on_the_command_line_runs_from_its_beginning_to_its_end():
+def test_the_page_on_the_command_line_runs_from_its_beginning_to_its_end() -> None:
     lines = [line for _, code in blocks("cli.md", "sh") for line in code.splitlines()]
     for line in lines:
         program, *words = shlex.split(line)
         done = CliRunner().invoke(main, words)
         assert (program, done.exit_code) == ("trompe", 0), f"{line}\n{done.output}"
     named = {shlex.split(line)[1] for line in lines}
-    assert named >= OWN.keys() - {"cancel", "experiment"}
+    assert named >= OWN.keys() - {"cancel"}
 
 
-def test_the_page_lists_the_exit_codes_of_the_code():
+def test_the_page_lists_the_exit_codes_of_the_code() -> None:
     rows = re.findall(r"^\| (\d+) \| (.+) \|$", (DOCS / "cli.md").read_text(), re.M)
     assert {int(code): meaning for code, meaning in rows} == EXITS
 
 
-def test_the_page_on_the_sdk_names_every_error():
+def test_the_page_on_the_sdk_names_every_error() -> None:
     text = (DOCS / "sdk.md").read_text()
     public = {name: getattr(trompe_client, name) for name in trompe_client.__all__}
     errors = {name for name, one in public.items() if isinstance(one, type) and issubclass(one, Exception)}
@@ -115,7 +116,10 @@ def test_the_page_on_the_sdk_names_every_error():
     assert {name for name in errors if f"`{name}`" not in text} <= bases
 
 
-@pytest.mark.parametrize("page", ["quickstart.md", "sdk.md", "cli.md", "library.md"])
-def test_links_lead_somewhere(page):
-    links = re.findall(r"\]\(([^)#:]+)\)", (DOCS / page).read_text())
-    assert [link for link in links if not (DOCS / link).exists()] == []
+@pytest.mark.parametrize(
+    "page", ["README.md", *(f"docs/{page.relative_to(DOCS)}" for page in sorted(DOCS.rglob("*.md")))]
+)
+def test_links_lead_somewhere(page: str) -> None:
+    path = DOCS.parent / page
+    links = re.findall(r"\]\(([^)#:]+)[^):]*\)", path.read_text())
+    assert [link for link in links if not (path.parent / link).exists()] == []

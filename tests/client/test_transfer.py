@@ -1,18 +1,18 @@
 """Files come whole or not at all, and no byte of them twice."""
 
 import hashlib
+from pathlib import Path
 
 import pytest
 
-from trompe_client import BrokenDownload, ServerUnreachable
-from trompe_shared.api import JobSpec
+from tests.client.conftest import SPEC, FakeServer
+from trompe_client import BrokenDownload, Client, JobHandle, ServerUnreachable
 
-SPEC = JobSpec(object="mug", label="mug")
 DATA = bytes(range(256)) * 4000
 
 
 @pytest.fixture
-def job(client, server, monkeypatch):
+def job(client: Client, server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> JobHandle:
     """A finished job of one file of a megabyte."""
     monkeypatch.setattr(server, "artifact", lambda _job, _name: DATA)
     server.artifacts = ["big.bin"]
@@ -21,7 +21,7 @@ def job(client, server, monkeypatch):
     return job
 
 
-def asked(server):
+def asked(server: FakeServer) -> list[tuple[str | None, str | None]]:
     """What the downloads asked for: (Range, If-None-Match)."""
     return [
         (headers.get("Range"), headers.get("If-None-Match"))
@@ -30,7 +30,7 @@ def asked(server):
     ]
 
 
-def test_a_file_that_breaks_off_goes_on_where_it_was(job, server, tmp_path):
+def test_a_file_that_breaks_off_goes_on_where_it_was(job: JobHandle, server: FakeServer, tmp_path: Path) -> None:
     server.cut = [300_000, 500_000]
     (path,) = job.download(tmp_path)
     assert path.read_bytes() == DATA
@@ -38,7 +38,9 @@ def test_a_file_that_breaks_off_goes_on_where_it_was(job, server, tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["big.bin"]
 
 
-def test_another_process_takes_up_what_one_has_left(job, server, client, tmp_path):
+def test_another_process_takes_up_what_one_has_left(
+    job: JobHandle, server: FakeServer, client: Client, tmp_path: Path
+) -> None:
     server.cut = [300_000] + [0] * 9
     with pytest.raises(ServerUnreachable):
         job.download(tmp_path)
@@ -49,18 +51,20 @@ def test_another_process_takes_up_what_one_has_left(job, server, client, tmp_pat
     assert asked(server) == [("bytes=300000-", None)]
 
 
-def test_a_slow_line_that_brings_something_each_time_is_not_given_up(job, server, tmp_path):
+def test_a_slow_line_that_brings_something_each_time_is_not_given_up(
+    job: JobHandle, server: FakeServer, tmp_path: Path
+) -> None:
     server.cut = [50_000] * 15
     assert job.download(tmp_path)[0].read_bytes() == DATA
 
 
-def test_what_is_there_is_not_brought_again(job, server, tmp_path):
+def test_what_is_there_is_not_brought_again(job: JobHandle, server: FakeServer, tmp_path: Path) -> None:
     job.download(tmp_path)
     job.download(tmp_path)
     assert asked(server) == [(None, None), (None, f'"{hashlib.sha256(DATA).hexdigest()}"')]
 
 
-def test_a_part_of_another_file_is_of_no_use(job, server, tmp_path):
+def test_a_part_of_another_file_is_of_no_use(job: JobHandle, server: FakeServer, tmp_path: Path) -> None:
     other = hashlib.sha256(b"other").hexdigest()
     (tmp_path / f".big.bin.{other}.part").write_bytes(b"oth")
     assert job.download(tmp_path)[0].read_bytes() == DATA
@@ -68,19 +72,21 @@ def test_a_part_of_another_file_is_of_no_use(job, server, tmp_path):
 
 
 @pytest.mark.parametrize("extra", [b"", b"more"], ids=["all of it", "more than all"])
-def test_a_part_that_is_no_part_is_checked_and_brought_anew_if_need_be(job, server, tmp_path, extra):
+def test_a_part_that_is_no_part_is_checked_and_brought_anew_if_need_be(
+    job: JobHandle, server: FakeServer, tmp_path: Path, extra: bytes
+) -> None:
     (tmp_path / f".big.bin.{hashlib.sha256(DATA).hexdigest()}.part").write_bytes(DATA + extra)
     assert job.download(tmp_path)[0].read_bytes() == DATA
     assert [file.name for file in tmp_path.iterdir()] == ["big.bin"]
     assert len(asked(server)) == 1 + bool(extra)
 
 
-def test_wrong_bytes_are_brought_again(job, server, tmp_path):
+def test_wrong_bytes_are_brought_again(job: JobHandle, server: FakeServer, tmp_path: Path) -> None:
     server.lies = 1
     assert job.download(tmp_path)[0].read_bytes() == DATA
 
 
-def test_bytes_that_stay_wrong_are_an_error_and_no_file(job, server, tmp_path):
+def test_bytes_that_stay_wrong_are_an_error_and_no_file(job: JobHandle, server: FakeServer, tmp_path: Path) -> None:
     (tmp_path / "big.bin").write_bytes(b"old")
     server.lies = 99
     with pytest.raises(BrokenDownload, match=hashlib.sha256(DATA).hexdigest()):
@@ -88,7 +94,7 @@ def test_bytes_that_stay_wrong_are_an_error_and_no_file(job, server, tmp_path):
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == {"big.bin": b"old"}
 
 
-def test_an_archive_comes_under_the_name_it_is_given(job, tmp_path):
+def test_an_archive_comes_under_the_name_it_is_given(job: JobHandle, tmp_path: Path) -> None:
     path = job.archive(tmp_path / "deep" / "all.zip")
     assert path.read_bytes()[:2] == b"PK"
     assert [file.name for file in path.parent.iterdir()] == ["all.zip"]

@@ -3,6 +3,7 @@
 import asyncio
 import hashlib
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import httpx
@@ -60,7 +61,7 @@ def send_with_asyncio(picture: Path, transport: Counting) -> str:
 
 
 @pytest.mark.parametrize("way", [send, send_with_asyncio])
-def test_a_large_file_takes_little_memory(way, picture):
+def test_a_large_file_takes_little_memory(way: Callable[[Path, Counting], str], picture: Path) -> None:
     transport = Counting()
     tracemalloc.start()
     try:
@@ -71,7 +72,7 @@ def test_a_large_file_takes_little_memory(way, picture):
     assert transport.zeros == [LARGE]
 
 
-def test_the_name_of_a_large_file_takes_little_memory(picture):
+def test_the_name_of_a_large_file_takes_little_memory(picture: Path) -> None:
     expected = hashlib.sha256(bytes(LARGE)).hexdigest()
     tracemalloc.start()
     try:
@@ -82,7 +83,9 @@ def test_the_name_of_a_large_file_takes_little_memory(picture):
 
 
 @pytest.mark.parametrize("way", [send, send_with_asyncio])
-def test_what_is_sent_again_is_the_whole_file(way, picture, slept):
+def test_what_is_sent_again_is_the_whole_file(
+    way: Callable[[Path, Counting], str], picture: Path, slept: list[float]
+) -> None:
     transport = Counting(refusals=2)
     assert way(picture, transport) == "b1"
     assert transport.zeros == [LARGE] * 3

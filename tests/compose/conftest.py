@@ -9,7 +9,6 @@ import json
 import logging
 import os
 import re
-import socket
 import subprocess
 import sys
 import time
@@ -21,6 +20,7 @@ from typing import Any, Final
 
 import pytest
 
+from tests.served import free_port
 from trompe_client import Client
 
 ROOT: Final = Path(__file__).parents[2]
@@ -128,12 +128,6 @@ class Stack:
         return Stack(self.files, self.environment | environment, self.project, self._token)
 
 
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        port: int = listener.getsockname()[1]
-        return port
-
-
 def _official_images_missing() -> bool:
     images = OFFICIAL.findall((ROOT / "docker-compose.yml").read_text())
     assert len(images) == 2
@@ -170,7 +164,7 @@ def built(engine: str) -> Stack:
         logger.warning("the official images can't be pulled: Debian's PostgreSQL and moto stand in for them")
         figures.append("stand-ins: Debian's PostgreSQL for postgres, moto for MinIO")
         files.append(STAND_INS / "compose.yml")
-    fixed = {"TROMPE_VERSION": VERSION, "TROMPE_PORT": str(_free_port()), "TROMPE_SILENCE": "15"}
+    fixed = {"TROMPE_VERSION": VERSION, "TROMPE_PORT": str(free_port()), "TROMPE_SILENCE": "15"}
     stack = Stack(files, fixed | _variables_of_the_build())
     with timed("building the images"):
         stack.compose("--profile", "s3", "build", "--quiet", timeout=1800)

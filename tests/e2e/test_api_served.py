@@ -1,6 +1,6 @@
 """The API of a running ``trompe serve``: real sockets, many requests at once, streams, the examples of the docs.
 
-The pipeline is a fake one; all that is asked here is what the API makes of it.
+The jobs are fake.
 """
 
 import json
@@ -15,89 +15,48 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import httpx
 import pytest
 
-from trompe_server.access import Right, Tokens
-from trompe_server.jobs.fake import PHASES, trace
-from trompe_server.jobs.store import JobStore
-from trompe_server.jobs.worker import prepare_data
-from trompe_server.settings import Settings
-from trompe_shared.api import JobRequest, JobState
+from tests.fake_job import PHASES, trace
+from tests.served import FAKE, Served, wait_until
+from trompe_server.executor.worker import prepare_data
+from trompe_server.storage.tokens import Right, Tokens
+from trompe_shared.api import JobState, in_parts
 from trompe_shared.shipped import shipped_objects
 
 ROOT = Path(__file__).parents[2]
-JOB = {"object": "mug", "label": "mug"}
+JOB = {"object": "mug", **in_parts({"label": "mug"})}
 
 
-class Serve:
-    """A running ``trompe serve`` that has tokens: ``client`` may write, ``reader`` may read."""
+class Serve(Served):
+    """A running ``trompe serve`` with tokens: ``http`` may write, ``reader`` may read."""
 
-    def __init__(self, data: Path, **environment: str) -> None:
-        self.settings = Settings(data=data)
+    def __init__(self, data: Path) -> None:
+        super().__init__(data, environment=FAKE | {"TROMPE_RATE_LIMIT": "0"})
         prepare_data(self.settings)
-        self.store = JobStore(self.settings.database_url)
         self.tokens = Tokens(self.store.engine)
         self.secret = self.tokens.create("writer", Right.write)
-        own = {"TROMPE_PIPELINE": "trompe_server.jobs.fake:open_pipeline", "TROMPE_RATE_LIMIT": "0"}
-        with (data / "serve.log").open("w") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "trompe_server.jobs.leash", "serve", "--port", "0", "--data", str(data)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                env=os.environ | own | environment,
-                text=True,
-            )
-        assert self.process.stdout is not None
-        self.url = self.process.stdout.readline().split()[-1]
-        self.client = self.client_of(self.secret)
-        self.reader = self.client_of(self.tokens.create("reader", Right.read))
+        self._read_secret = self.tokens.create("reader", Right.read)
 
-    def client_of(self, secret: str) -> httpx.Client:
-        limits = httpx.Limits(max_connections=None)
-        headers = {"Authorization": f"Bearer {secret}"}
-        return httpx.Client(base_url=self.url, headers=headers, timeout=60, limits=limits, trust_env=False)
+    def start(self) -> Self:
+        super().start()
+        self.http, self.reader = self.client_of(self.secret), self.client_of(self._read_secret)
+        return self
 
-    def close(self) -> None:
-        self.client.close()
+    def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
         self.reader.close()
-        self.store.close()
-        if self.process.poll() is None:
-            self.process.terminate()
-        self.process.wait(60)
-        for pipe in (self.process.stdin, self.process.stdout):
-            assert pipe is not None
-            pipe.close()
-
-
-@contextmanager
-def serving(data: Path, **environment: str) -> Iterator[Serve]:
-    running = Serve(data, **environment)
-    try:
-        yield running
-    finally:
-        running.close()
+        return super().stop(number)
 
 
 @pytest.fixture(scope="module")
 def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serve]:
-    with serving(tmp_path_factory.mktemp("api") / "data") as running:
+    with Serve(tmp_path_factory.mktemp("api") / "data") as running:
         yield running
-
-
-def wait_until(condition: Callable[[], Any], *, seconds: float = 60.0) -> Any:
-    """What ``condition`` returns once it is true; fails after ``seconds``."""
-    deadline = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.05)
-    return value
 
 
 def all_ended(serve: Serve) -> bool:
@@ -112,8 +71,8 @@ def test_a_thousand_jobs_submitted_at_once_are_all_there_and_none_twice(serve: S
 
     def submit(number: int) -> tuple[int, int, str]:
         start.wait(60)
-        body = JOB | {"seed": number, "labels": {"experiment": "thousand"}}
-        answer = serve.client.post("/v1/jobs", json=body, headers={"Idempotency-Key": f"thousand {number}"})
+        body = JOB | in_parts({"label": "mug", "seed": number}) | {"labels": {"experiment": "thousand"}}
+        answer = serve.http.post("/v1/jobs", json=body, headers={"Idempotency-Key": f"thousand {number}"})
         return number, answer.status_code, answer.json()["id"]
 
     with ThreadPoolExecutor(len(numbers)) as pool:
@@ -122,17 +81,18 @@ def test_a_thousand_jobs_submitted_at_once_are_all_there_and_none_twice(serve: S
     ids = {number: job for number, _, job in answers}
     assert len(set(ids.values())) == 1000
 
-    listed, cursor = [], None
+    listed: list[dict[str, Any]] = []
+    cursor: str | None = None
     while cursor != "":
-        params = {"limit": 500, "label": "experiment:thousand"} | ({"cursor": cursor} if cursor else {})
+        params = {"limit": "500", "label": "experiment:thousand"} | ({"cursor": cursor} if cursor else {})
         page = serve.reader.get("/v1/jobs", params=params).json()
         listed += page["jobs"]
         cursor = page["next_cursor"] or ""
-    assert {job["spec"]["seed"]: job["id"] for job in listed} == ids
+    assert {job["spec"]["search"]["seed"]: job["id"] for job in listed} == ids
     assert len(listed) == 1000
     with ThreadPoolExecutor(4) as pool:
         cancel = [f"/v1/jobs/{job['id']}/cancel" for job in listed[:-20]]
-        assert all(answer.is_success for answer in pool.map(serve.client.post, cancel))
+        assert all(answer.is_success for answer in pool.map(serve.http.post, cancel))
     wait_until(lambda: all_ended(serve))
     for job in listed[-20:]:
         folder = serve.settings.data / "jobs" / job["id"]
@@ -152,7 +112,9 @@ def test_an_idle_connection_outlives_the_time_that_clients_keep_theirs(serve: Se
 
     assert answered()
     connection.auto_open = 0  # never a second connection in place of the first
-    time.sleep(httpx.Limits().keepalive_expiry + 2)
+    expiry = httpx.Limits().keepalive_expiry
+    assert expiry is not None
+    time.sleep(expiry + 2)
     assert answered()
     connection.close()
 
@@ -165,7 +127,7 @@ def test_a_revoked_token_is_worthless_within_moments(serve: Serve) -> None:
 
 
 def test_a_stream_of_events_is_taken_up_again_where_it_broke_off(serve: Serve) -> None:
-    job = serve.store.create(JobRequest.model_validate(JOB | {"label": "gate"}))[0].id
+    job = serve.submit("gate")
     seen: list[int] = []
 
     def follow(*, until: Callable[[dict[str, Any]], bool]) -> None:
@@ -185,8 +147,8 @@ def test_a_stream_of_events_is_taken_up_again_where_it_broke_off(serve: Serve) -
 
 
 def test_streams_end_when_the_server_stops_and_it_stops_at_once(tmp_path: Path) -> None:
-    with serving(tmp_path / "data") as serve:
-        job = serve.store.create(JobRequest.model_validate(JOB | {"label": "gate"}))[0].id
+    with Serve(tmp_path / "data") as serve:
+        job = serve.submit("gate")
         with serve.reader.stream("GET", f"/v1/jobs/{job}/events") as stream:
             events = stream.iter_lines()
             next(events)
@@ -210,7 +172,7 @@ def test_a_large_upload_does_not_fill_the_memory_of_the_server(serve: Serve) -> 
     Path(f"/proc/{serve.process.pid}/clear_refs").write_text("5")  # what was the peak so far is forgotten
     before = peak_memory(serve)
     headers = {"Content-Type": "multipart/form-data; boundary=b"}
-    answer = serve.client.post("/v1/classifiers", content=parts(), headers=headers)
+    answer = serve.http.post("/v1/classifiers", content=parts(), headers=headers)
     assert answer.status_code == 422, answer.text
     assert peak_memory(serve) - before < 50 * 2**20
 

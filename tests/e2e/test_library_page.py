@@ -1,12 +1,12 @@
-"""The page on use without a server is true: its code runs, on a real renderer, and does what it says."""
+"""The code of docs/library.md runs on a real renderer and does what the page says."""
 
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from documentation import blocks
 
+from tests.documentation import blocks
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
@@ -20,17 +20,17 @@ def test_the_page_runs_from_its_beginning_to_its_end(
         exec(compile(code, f"library.md, {heading}", "exec"), names)
     said = capsys.readouterr().out
 
-    recognised = re.search(r"recognised in (\d+)% before, in (\d+)% after", said)
-    assert recognised is not None, said
-    before, after = map(int, recognised.groups())
-    assert before >= 50
-    assert after <= before / 3
-    clean, painted = load_object(shipped_objects()["mug"].path), load_object(tmp_path / "adversarial.zip")
+    recognised = re.findall(r"recognised in (\d+)% before, in (\d+)% after", said)
+    assert recognised, said
+    for before, after in recognised:
+        assert int(before) >= 50
+        assert int(after) <= int(before) / 3
+    clean, painted = load_object(shipped_objects()["mug"].path), load_object(tmp_path / "mug-adversarial.zip")
     change = max(np.abs(painted.textures[name].astype(int) - texture).max() for name, texture in clean.textures.items())
     assert 0 < change <= 0.1 * 255
 
     texels = re.search(r"(\d+) texels may move", said)
     assert texels is not None, said
     assert 0 < int(texels[1]) <= 0.05 * sum(texture[..., 0].size for texture in clean.textures.values()) + 1
-    assert "curve two probes a view are not enough" in said
+    assert "calibrated good enough with two probes a view" in said
     assert said.endswith("2 steps\n")

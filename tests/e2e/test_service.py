@@ -1,101 +1,19 @@
-"""``trompe serve`` as users start it: real processes, a real renderer, and mostly a pipeline without an attack."""
+"""``trompe serve`` as users start it: real processes, a real renderer, and mostly fake jobs."""
 
 import json
 import os
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
-from trompe_server.jobs.fake import PHASES, trace
-
-FAKE = {"TROMPE_PIPELINE": "trompe_server.jobs.fake:open_pipeline"}
-
-
-def wait_until(condition: Callable[[], Any], *, seconds: float = 60.0) -> Any:
-    """What ``condition`` returns once it is true; fails after ``seconds``."""
-    deadline = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.05)
-    return value
-
-
-class Serve:
-    """A running ``trompe serve``."""
-
-    def __init__(self, data: Path, environment: dict[str, str] = FAKE) -> None:
-        self.data = data
-        with (data.parent / "serve.log").open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "trompe_server.jobs.leash", "serve", "--port", "0", "--data", str(data)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                text=True,
-                env=os.environ | environment,
-            )
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line.startswith("trompe serving on http://127.0.0.1:"), line
-        self.client = httpx.Client(base_url=line.split()[-1], timeout=30)
-
-    def get(self, path: str) -> Any:
-        return self.client.get(path).raise_for_status().json()
-
-    def submit(self, label: str) -> str:
-        """Queue a job past the checks of the API, which know nothing of a fake pipeline's labels."""
-        from trompe_server.jobs.store import JobStore
-        from trompe_shared.api import JobRequest
-
-        store = JobStore(f"sqlite:///{self.data / 'trompe.sqlite'}")
-        job = store.create(JobRequest.model_validate({"object": "mug", "label": label}))[0].id
-        store.close()
-        return job
-
-    def state(self, job: str) -> str:
-        return str(self.get(f"/v1/jobs/{job}")["state"])
-
-    def in_gate(self, job: str) -> bool:
-        return bool(self.get(f"/v1/jobs/{job}")["progress"]["phase"] == "attack-001")
-
-    def open_gate(self, job: str) -> None:
-        (self.folder(job) / "go").touch()
-
-    def folder(self, job: str) -> Path:
-        return self.data / "jobs" / job
-
-    def children(self) -> dict[str, int]:
-        """Process ids of the supervised children, by command."""
-        found = {}
-        for entry in Path("/proc").iterdir():
-            if entry.name.isdecimal() and self.process.pid == parent(int(entry.name)):
-                words = (entry / "cmdline").read_text().split("\0")
-                if "trompe_server.jobs.leash" in words:
-                    found[words[words.index("trompe_server.jobs.leash") + 1]] = int(entry.name)
-        return found
-
-    def close(self) -> None:
-        self.client.close()
-        if self.process.poll() is None:
-            self.process.terminate()
-        self.process.wait(60)
-        for pipe in (self.process.stdin, self.process.stdout):
-            assert pipe is not None
-            pipe.close()
-
-
-def parent(pid: int) -> int | None:
-    try:
-        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-    except (FileNotFoundError, ProcessLookupError):
-        return None
+from tests.fake_job import PHASES, trace
+from tests.served import CHILD, Served, parent, wait_until
+from trompe_shared.api import JobRequest
 
 
 def gone(pid: int) -> bool:
@@ -106,22 +24,15 @@ def gone(pid: int) -> bool:
         return True
 
 
-@pytest.fixture
-def serve(tmp_path: Path) -> Iterator[Serve]:
-    running = Serve(tmp_path / "data")
-    yield running
-    running.close()
-
-
-def events(serve: Serve, job: str, *, after: int = 0) -> Iterator[dict[str, Any]]:
+def events(serve: Served, job: str, *, after: int = 0) -> Iterator[dict[str, Any]]:
     """Events of a job as they come in."""
-    with serve.client.stream("GET", f"/v1/jobs/{job}/events", headers={"Last-Event-ID": str(after)}) as stream:
+    with serve.http.stream("GET", f"/v1/jobs/{job}/events", headers={"Last-Event-ID": str(after)}) as stream:
         for line in stream.iter_lines():
             if line.startswith("data: "):
                 yield json.loads(line.removeprefix("data: "))
 
 
-def test_a_job_is_followed_live_through_a_lost_connection_and_a_killed_worker(serve: Serve) -> None:
+def test_a_job_is_followed_live_through_a_lost_connection_and_a_killed_worker(serve: Served) -> None:
     assert serve.get("/readyz") == {"status": "ready"}
     job = serve.submit("gate")
     seen = []
@@ -131,7 +42,7 @@ def test_a_job_is_followed_live_through_a_lost_connection_and_a_killed_worker(se
             break
 
     os.kill(serve.children()["worker"], signal.SIGKILL)
-    wait_until(lambda: serve.get(f"/v1/jobs/{job}")["attempts"] == 2)
+    wait_until(lambda: serve.state(job).attempts == 2)
     serve.open_gate(job)
     seen += list(events(serve, job, after=seen[-1]["id"]))
 
@@ -142,29 +53,32 @@ def test_a_job_is_followed_live_through_a_lost_connection_and_a_killed_worker(se
     assert ends == [f"end {phase}" for phase in PHASES]
 
 
-def test_a_job_is_cancelled_over_http(serve: Serve) -> None:
+def test_a_job_is_cancelled_over_http(serve: Served) -> None:
     job = serve.submit("gate")
     wait_until(lambda: serve.in_gate(job))
     asked = time.monotonic()
-    assert serve.client.post(f"/v1/jobs/{job}/cancel").json()["state"] == "running"
-    wait_until(lambda: serve.state(job) == "cancelled")
+    assert serve.http.post(f"/v1/jobs/{job}/cancel").json()["state"] == "running"
+    wait_until(lambda: serve.state(job).state == "cancelled")
     assert time.monotonic() - asked < 5
 
 
-def test_a_renderer_that_is_killed_comes_back_at_the_same_address(serve: Serve) -> None:
-    before = serve.children()
+def test_a_renderer_that_is_killed_comes_back_at_the_same_address(serve: Served) -> None:
+    before, renderers = serve.children(), serve.get("/v1/renderers")
+    pids = [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdecimal()]
+    assert [pid for pid in pids if parent(pid) == before["render"]] == []  # serve alone supervises it
     os.kill(before["render"], signal.SIGKILL)
-    wait_until(lambda: serve.client.get("/readyz").status_code == 503)
-    wait_until(lambda: serve.client.get("/readyz").status_code == 200)
+    wait_until(lambda: serve.http.get("/readyz").status_code == 503)
+    wait_until(lambda: serve.http.get("/readyz").status_code == 200)
     after = serve.children()
     assert after["worker"] == before["worker"]
     assert after["render"] != before["render"]
+    assert serve.get("/v1/renderers") == renderers
     job = serve.submit("fine")
-    wait_until(lambda: serve.state(job) == "succeeded")
+    wait_until(lambda: serve.state(job).state == "succeeded")
 
 
-def test_a_second_serve_on_the_same_data_is_refused(serve: Serve) -> None:
-    command = [sys.executable, "-m", "trompe_server.jobs.leash", "serve", "--port", "0", "--data", str(serve.data)]
+def test_a_second_serve_on_the_same_data_is_refused(serve: Served) -> None:
+    command = [*CHILD, "serve", "--port", "0", "--data", str(serve.data)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as second:
         assert second.wait(60) == 1
         assert second.stderr is not None
@@ -173,51 +87,53 @@ def test_a_second_serve_on_the_same_data_is_refused(serve: Serve) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
-def test_nothing_is_left_running_when_serve_ends(serve: Serve, number: signal.Signals) -> None:
+def test_nothing_is_left_running_when_serve_ends(serve: Served, number: signal.Signals) -> None:
     job = serve.submit("gate")
     wait_until(lambda: serve.in_gate(job))
     children = serve.children()
     assert set(children) == {"worker", "render"}
-    serve.process.send_signal(number)
-    status = serve.process.wait(30)
-    assert status == (-number if number is signal.SIGKILL else 0)
+    assert serve.stop(number) == (-number if number is signal.SIGKILL else 0)
     wait_until(lambda: all(gone(pid) for pid in children.values()), seconds=20)
 
 
-def test_jobs_outlive_the_service(serve: Serve) -> None:
+def test_jobs_outlive_the_service(serve: Served) -> None:
     job = serve.submit("gate")
     wait_until(lambda: serve.in_gate(job))
-    serve.close()
-
-    again = Serve(serve.data)
-    try:
-        again.open_gate(job)
-        wait_until(lambda: again.state(job) == "succeeded")
-        assert again.get("/v1/jobs?state=succeeded")["jobs"][0]["id"] == job
-    finally:
-        again.close()
+    serve.stop()
+    serve.start()
+    serve.open_gate(job)
+    wait_until(lambda: serve.state(job).state == "succeeded")
+    assert serve.get("/v1/jobs?state=succeeded")["jobs"][0]["id"] == job
 
 
-def test_an_attack_whose_worker_is_killed_ends_with_the_same_bytes(tmp_path: Path) -> None:
-    few = {"pool": 0, "azimuths": 2, "elevations": 2, "held_out": 2, "steps": 60}
-    spec = {"object": "mug", "label": "mug", "classifier": "tiny", **few}
-    serve = Serve(tmp_path / "data", {})
-    try:
-        whole, cut = (serve.client.post("/v1/jobs", json=spec).json()["id"] for _ in range(2))
-        wait_until(lambda: serve.state(whole) == "succeeded", seconds=120)
-        wait_until(lambda: (serve.get(f"/v1/jobs/{cut}")["progress"]["step"] or 0) > 10, seconds=120)
+def test_an_attack_whose_renderer_and_worker_are_killed_ends_with_the_same_bytes(tmp_path: Path) -> None:
+    few = {"grid": True, "azimuths": 2, "elevations": 2, "held_out": 2, "steps": 30}
+    spec = JobRequest.of("mug", label="mug", **few).model_dump(mode="json")
+    with Served(tmp_path / "data", environment={}) as serve:
+
+        def submit() -> str:
+            return str(serve.http.post("/v1/jobs", json=spec).raise_for_status().json()["id"])
+
+        whole = submit()
+        wait_until(lambda: serve.state(whole).state == "succeeded", seconds=120)
+        os.kill(serve.children()["render"], signal.SIGSTOP)  # holds the next job in its first phase
+        cut = submit()
+        wait_until(lambda: serve.state(cut).state == "running", seconds=120)
+        os.kill(serve.children()["render"], signal.SIGKILL)
+        wait_until(lambda: serve.state(cut).progress.phase == "calibrate", seconds=120)
+        os.kill(serve.children()["render"], signal.SIGKILL)
+        wait_until(lambda: (serve.state(cut).progress.step or 0) > 10, seconds=120)
         os.kill(serve.children()["worker"], signal.SIGKILL)
-        wait_until(lambda: serve.state(cut) == "succeeded", seconds=120)
+        wait_until(lambda: serve.state(cut).state == "succeeded", seconds=120)
 
-        assert [serve.get(f"/v1/jobs/{job}")["attempts"] for job in (whole, cut)] == [1, 2]
-        adversarial = [serve.client.get(f"/v1/jobs/{job}/artifacts/adversarial.zip") for job in (whole, cut)]
+        assert [serve.state(job).attempts for job in (whole, cut)] == [1, 2]
+        assert serve.log.read_text().count("the renderer worker ended (status -9)") == 2
+        adversarial = [serve.http.get(f"/v1/jobs/{job}/artifacts/mug-adversarial.zip") for job in (whole, cut)]
         assert adversarial[0].raise_for_status().content == adversarial[1].raise_for_status().content
-    finally:
-        serve.close()
 
 
 def test_serve_says_so_where_no_renderer_comes_up(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "trompe_server.jobs.leash", "serve", "--port", "0", "--data", str(tmp_path)]
+    command = [*CHILD, "serve", "--port", "0", "--data", str(tmp_path)]
     pipe, environment = subprocess.PIPE, os.environ | {"EGL_DEVICE_ID": "99"}
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) as serve:
         assert serve.wait(90) == 1
@@ -226,5 +142,5 @@ def test_serve_says_so_where_no_renderer_comes_up(tmp_path: Path) -> None:
         assert serve.stdout.read() == ""
         words = serve.stderr.read()
     assert "No OpenGL context can be created" in words
-    assert "The renderer worker does not come up (it died 3 times)" in words
+    assert "The renderer worker does not start (it died 3 times)" in words
     assert "Traceback" not in words

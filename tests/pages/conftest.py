@@ -1,22 +1,14 @@
 """A real service, and Debian's Chromium to look at it with."""
 
-import os
-import re
 import shutil
-import signal
-import subprocess
-import sys
-import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, sync_playwright
 
+from tests.served import Served
 from trompe_client import Client
-from trompe_shared.api import Job, JobRequest
 
 FLAGS = [
     "--no-sandbox",
@@ -31,79 +23,29 @@ OTHERS = "ERR_NETWORK_CHANGED"
 """What Chromium reports when something else on the machine adds or removes a network, such as a container's."""
 
 
-SMALL = {"pool": 0, "azimuths": 3, "elevations": 2, "held_out": 4, "steps": 5}
+SMALL = {"grid": True, "azimuths": 3, "elevations": 2, "held_out": 4, "steps": 5}
 """A job of some seconds."""
 
 
-class Service:
-    """The service on ``folder``; ``token`` opens it where it has one."""
+class Service(Served):
+    """A running service with real attacks. ``token`` opens it if it has one."""
 
-    def __init__(self, folder: Path, *, token: str | None = None) -> None:
-        self.folder, self.token, self.port = folder, token, 0
-        self._process: subprocess.Popen[str] | None = None
-
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.port}"
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
-
-    def start(self) -> None:
-        """Start it, on the port that it had before."""
-        command = [sys.executable, "-m", "trompe_client.cli", "serve", "--data", str(self.folder), "--port"]
-        self._process = subprocess.Popen(
-            [*command, str(self.port)], stdout=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
-        )
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            if match := re.search(r"serving on http://127\.0\.0\.1:(\d+)", line):
-                self.port = int(match[1])
-                self._reader = threading.Thread(target=self._drain, daemon=True)
-                self._reader.start()
-                return
-        raise RuntimeError("trompe serve ended before it was up")
-
-    def stop(self) -> None:
-        """End it as Ctrl-C does."""
-        process = self._process
-        if process is not None and process.poll() is None:
-            process.send_signal(signal.SIGINT)
-            process.wait(60)
-            self._reader.join()
+    token: str | None = None
 
     def client(self) -> Client:
         return Client(self.url, token=self.token)
 
-    def submit(self, *, labels: dict[str, str] | None = None, **options: Any) -> str:
-        """Submit a small job on the shipped mug; its id."""
-        spec = {"object": "mug", "label": "mug", "labels": labels or {}} | SMALL | options
+    def submit(self, *, labels: dict[str, str] | None = None, **options: Any) -> str:  # type: ignore[override]
+        """Submit a small job on the shipped mug. Returns its id."""
         with self.client() as client:
-            return client.submit(JobRequest.model_validate(spec)).id
+            return client.attack("mug", label="mug", labels=labels or {}, **SMALL | options).id
 
     def finished(self, **options: Any) -> str:
-        """The id of a small job that has ended well."""
+        """The id of a small job that has succeeded."""
         job = self.submit(**options)
         with self.client() as client:
             client.job(job).wait(timeout=240)
         return job
-
-    def state(self, job: str) -> Job:
-        with self.client() as client:
-            return client.job(job).status
-
-    def _drain(self) -> None:
-        assert self._process is not None
-        assert self._process.stdout is not None
-        with self._process.stdout as lines:
-            for _ in lines:
-                pass
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +62,8 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture(scope="session")
 def new_service(tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Service]:
-    """A service of its own, to be entered."""
-    return lambda: Service(tmp_path_factory.mktemp("service"))
+    """Makes a service, to be entered."""
+    return lambda: Service(tmp_path_factory.mktemp("service") / "data", environment={"OMP_NUM_THREADS": "1"})
 
 
 @pytest.fixture(scope="session")

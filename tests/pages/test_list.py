@@ -9,14 +9,15 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from trompe_server.access import Tokens
 from trompe_server.api.services import Services
-from trompe_server.app import create_app
-from trompe_server.artifacts import open_folder
-from trompe_server.jobs.store import JobStore
-from trompe_server.jobs.worker import prepare_data
+from trompe_server.executor.worker import prepare_data
 from trompe_server.library import Library
+from trompe_server.pages.serving import _code
+from trompe_server.queue.store import JobStore
+from trompe_server.service.app import create_app
 from trompe_server.settings import Settings
+from trompe_server.storage.folders import open_folder
+from trompe_server.storage.tokens import Tokens
 from trompe_shared.api import JobRequest
 
 JOBS = 120
@@ -48,8 +49,8 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browserless]:
     store, files = JobStore(settings.database_url), open_folder(settings.store_url)
     for seed in range(JOBS):
         labels = {"sweep": "even" if seed % 2 == 0 else "odd"} | ({"experiment": "few"} if seed < len(TAUS) else {})
-        options = {"tau": TAUS[seed] if seed < len(TAUS) else None, "seed": seed, "labels": labels}
-        store.create(JobRequest.model_validate({"object": "mug", "label": MUG if seed % 2 == 0 else "mug"} | options))
+        tau = TAUS[seed] if seed < len(TAUS) else None
+        store.create(JobRequest.of("mug", label=MUG if seed % 2 == 0 else "mug", tau=tau, seed=seed, labels=labels))
     library = Library(files.within("library"))
     app = create_app(Services(settings, library, store, files, Tokens(store.engine), list, list))
     yield Browserless(app)
@@ -98,6 +99,10 @@ def test_a_filter_that_makes_no_sense_is_told(client: Browserless, query: str) -
     assert answer.status_code in {400, 422}
     assert answer.headers["content-type"].startswith("text/html")
     assert "<h1>" in answer.text
+
+
+def test_names_of_options_are_shown_as_code() -> None:
+    assert _code("<b>: leave out `grid`") == "&lt;b&gt;: leave out <code>grid</code>"
 
 
 def test_names_from_users_are_shown_as_text(client: Browserless) -> None:

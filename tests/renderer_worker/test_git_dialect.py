@@ -1,31 +1,30 @@
-"""SAILenv's client as it stands in its repository: a session of it as bytes, and how the worker knows its dialect."""
+"""SAILenv's client from its git repository: a recorded session in bytes, and the detection of its dialect."""
 
 import socket
 import struct
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from tests.wire import ORIGIN, Wire, received
 from trompe_shared.sailenv import COMMANDS
 
 TRANSCRIPT = Path(__file__).parent / "git_dialect.txt"
-SPAWN = {"name": "mug", "position": (0, 0, 0), "rotation": (0, 0, 0), "scale": (1, 1, 1), "use_parent": True}
-SHORT = SPAWN | {"remove_dynamics": True}
+SHORT = ORIGIN | {"name": "mug", "remove_dynamics": True, "use_parent": True}
 LONG = SHORT | {"frustum_limited": True, "dynamic": None}
 
 
 def exchanges() -> Iterator[tuple[int, str, list[str]]]:
-    """Line number, ``>`` or ``<``, and the tokens of each line of the transcript that is not a comment."""
+    """Line number, ``>`` or ``<``, and tokens of each line of the transcript, without comments."""
     for number, line in enumerate(TRANSCRIPT.read_text().splitlines(), start=1):
         if not line.startswith("#"):
             yield number, line[0], line[1:].split()
 
 
 class Replay:
-    """Says a client's lines and compares the answers."""
+    """Sends a client's lines and compares the answers."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         self.socket = socket.create_connection(address, timeout=60)
@@ -46,20 +45,12 @@ class Replay:
             elif token == "view":
                 assert self._counted()
             elif token == "*4":
-                self._read(4)
+                received(self.socket, 4)
             else:
-                assert self._read(len(token) // 2).hex() == token
+                assert received(self.socket, len(token) // 2).hex() == token
 
     def _counted(self) -> bytes:
-        return self._read(struct.unpack("<i", self._read(4))[0])
-
-    def _read(self, count: int) -> bytes:
-        data = b""
-        while len(data) < count:
-            part = self.socket.recv(count - len(data))
-            assert part, "the worker hung up"
-            data += part
-        return data
+        return received(self.socket, struct.unpack("<i", received(self.socket, 4))[0])
 
 
 def test_a_recorded_session_of_the_git_client_is_answered_byte_for_byte(ticking_worker: tuple[str, int]) -> None:
@@ -67,7 +58,7 @@ def test_a_recorded_session_of_the_git_client_is_answered_byte_for_byte(ticking_
     for number, direction, tokens in exchanges():
         try:
             (replay.say if direction == ">" else replay.hear)(tokens)
-        except AssertionError as error:
+        except (AssertionError, EOFError) as error:
             raise AssertionError(f"{TRANSCRIPT.name}:{number}: {error}") from error
     assert replay.socket.recv(1) == b""  # nothing more was sent, and DELETE ended it
     replay.socket.close()
@@ -80,7 +71,7 @@ def test_the_recorded_session_holds_every_command_of_the_git_client() -> None:
     assert sum(request[:2] == b"\x00\x3d" for request in requests) >= 60
 
 
-def test_a_short_spawn_is_waited_on_once_and_then_no_more(wire: Callable[..., Any]) -> None:
+def test_a_short_spawn_is_waited_on_once_and_then_no_more(wire: Callable[..., Wire]) -> None:
     agent, seconds = wire(), []
     for _ in range(3):
         start = time.monotonic()
@@ -91,7 +82,7 @@ def test_a_short_spawn_is_waited_on_once_and_then_no_more(wire: Callable[..., An
 
 
 @pytest.mark.parametrize("pause", [0.0, 0.1], ids=["at once", "after a moment"])
-def test_a_long_spawn_is_known_by_its_tail(wire: Callable[..., Any], pause: float) -> None:
+def test_a_long_spawn_is_known_by_its_tail(wire: Callable[..., Wire], pause: float) -> None:
     agent, spawn = wire(), COMMANDS["spawn_object"]
     short = spawn.encode_request(**SHORT)
     agent.socket.sendall(short)
@@ -103,7 +94,7 @@ def test_a_long_spawn_is_known_by_its_tail(wire: Callable[..., Any], pause: floa
 
 
 @pytest.mark.parametrize("proof", ["spawn_view_frustum", "load_scenario", "move_object"])
-def test_commands_that_only_the_git_client_has_prove_its_dialect(wire: Callable[..., Any], proof: str) -> None:
+def test_commands_that_only_the_git_client_has_prove_its_dialect(wire: Callable[..., Wire], proof: str) -> None:
     agent, spawn = wire(), COMMANDS["spawn_object"]
     if proof == "load_scenario":
         agent.load({"scene_name": "object_view/scene", "objects": []})
@@ -114,7 +105,7 @@ def test_commands_that_only_the_git_client_has_prove_its_dialect(wire: Callable[
         agent.ask(proof)
     short = spawn.encode_request(**SHORT)
     agent.socket.sendall(short)
-    time.sleep(0.5)  # longer than a client of unknown dialect would be given
+    time.sleep(0.4)  # longer than a client of unknown dialect would be given
     agent.socket.sendall(spawn.encode_request(**LONG)[len(short) :])
     assert spawn.decode_reply(agent.read) == ("1",)
     assert agent.ask("get_position") == (0, 0, 0)  # nothing of the tail was taken for a command

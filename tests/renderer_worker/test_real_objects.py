@@ -1,4 +1,4 @@
-"""The paper's objects, if they are at hand: each is understood, in the picture, and textured."""
+"""The paper's objects, if TROMPE_ASSETS names them: each is read, in the picture, and textured."""
 
 import json
 import os
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trompe_server.target import SailenvTarget
+from trompe_server.renderers import SailenvTarget
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import load_object
 

@@ -1,4 +1,4 @@
-"""Limits of time, size and number on the worker's side; its end in good order; its return after OpenGL is lost."""
+"""Limits of time, size and number; fair turns; the end of a worker by a signal, a crash or the loss of OpenGL."""
 
 import os
 import signal
@@ -9,62 +9,52 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from trompe_renderer import link as link_module
-from trompe_renderer.link import Link, Memory
-from trompe_renderer.model import Library
-from trompe_renderer.options import Quality
-from trompe_renderer.render_thread import Renderer, _Line
-from trompe_renderer.scenery import Scenery
-from trompe_renderer.session import Session
-from trompe_renderer.supervise import LOST
+from tests.wire import ORIGIN, Wire, boxes
+from tests.worker_process import Worker
+from trompe_renderer.engines.render_thread import FairQueue, RenderThread
+from trompe_renderer.protocol.limits import MIB, Limits, MemoryBudget
+from trompe_renderer.protocol.link import Link
+from trompe_renderer.protocol.session import Session
+from trompe_renderer.protocol.upload import ModelCache
+from trompe_renderer.world.snapshot import Snapshot
+from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import ProtocolError, RendererError
-from trompe_shared.object3d import Object3D
-from trompe_shared.sailenv import COMMANDS, MAX_VIEWS, REGISTER, decode_frame, take_status
+from trompe_shared.geometry import Camera
+from trompe_shared.sailenv import MAX_VIEWS, REGISTER, decode_frame, take_status
 
-Start = Callable[[], Any]
-Boxes = Callable[..., Object3D]
+Connect = Callable[..., Wire]
+Pair = tuple[socket.socket, socket.socket]
 
 
 @pytest.fixture
-def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
-    """Both ends of a connection."""
+def pair() -> Iterator[Pair]:
+    """Both ends of a connection: the agent's, the worker's."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        ours = socket.create_connection(listener.getsockname())
-        theirs, _ = listener.accept()
-    yield ours, theirs
-    ours.close()
-    theirs.close()
+        agents = socket.create_connection(listener.getsockname())
+        workers, _ = listener.accept()
+    with agents, workers:
+        yield agents, workers
 
 
-@pytest.fixture
-def connect(wire_to: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
-    """Connects a bare client to the worker at an address."""
-    opened: list[Any] = []
-
-    def connect(*where: Any, **options: Any) -> Any:
-        opened.append(wire_to(*where, **options))
-        return opened[-1]
-
-    yield connect
-    for agent in opened:
-        agent.socket.close()
+def link_of(pair: Pair, memory: MemoryBudget | None = None, **limits: Any) -> Link:
+    return Link(pair[1], memory or MemoryBudget(1024 * MIB), Limits(**limits))
 
 
-def test_a_request_that_comes_drop_by_drop_is_cut_off_in_time(pair: Any) -> None:
-    ours, theirs = pair
-    link = Link(theirs, Memory(), timeout=0.5)
-    ours.sendall(b"!")
+def test_a_request_that_arrives_byte_by_byte_is_cut_off_in_time(pair: Pair) -> None:
+    link = link_of(pair, request_timeout=0.3)
+    pair[0].sendall(b"!")
     link.wait()
     stop = threading.Event()
 
     def drip() -> None:
         while not stop.wait(0.05):
-            ours.sendall(b".")
+            pair[0].sendall(b".")
 
     thread = threading.Thread(target=drip)
     thread.start()
@@ -76,288 +66,236 @@ def test_a_request_that_comes_drop_by_drop_is_cut_off_in_time(pair: Any) -> None
     thread.join()
 
 
-def test_an_agent_that_takes_no_reply_is_given_up(pair: Any) -> None:
-    _, theirs = pair
-    link = Link(theirs, Memory(), timeout=0.3)
+def test_an_agent_that_takes_no_reply_is_given_up(pair: Pair) -> None:
+    link = link_of(pair, request_timeout=0.2)
+    assert pair[1].getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)  # no piece waits for an acknowledgement
     with pytest.raises(TimeoutError):
-        link.send(bytes(64 * 2**20))
+        link.send(bytes(64 * MIB))
 
 
-def test_no_piece_of_a_reply_waits_until_the_one_before_is_acknowledged(pair: Any) -> None:
-    Link(pair[1], Memory())
-    assert pair[1].getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-
-
-def test_a_link_is_drained_when_nothing_is_left_to_send(pair: Any) -> None:
-    ours, theirs = pair
-    theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2**20)
-    theirs.setblocking(False)
+def test_a_link_is_drained_when_nothing_is_left_to_send(pair: Pair) -> None:
+    agents, workers = pair
+    workers.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2**20)
+    workers.setblocking(False)
     sent = 0
     with suppress(BlockingIOError):
         while True:
-            sent += theirs.send(bytes(2**16))
+            sent += workers.send(bytes(2**16))
     with pytest.raises(TimeoutError):
-        Link(theirs, Memory(), timeout=0.2).drain()
-    reader = threading.Thread(target=lambda: [ours.recv(2**16) for _ in range(sent // 2**12)])
-    ours.settimeout(1)
+        link_of(pair, request_timeout=0.2).drain()
+    reader = threading.Thread(target=lambda: [agents.recv(2**16) for _ in range(sent // 2**12)])
+    agents.settimeout(1)
     reader.start()
-    Link(theirs, Memory(), timeout=30).drain()
-    theirs.close()
+    link_of(pair).drain()
+    workers.close()
     reader.join()
 
 
-def test_an_idle_agent_may_be_silent_for_longer_than_any_request(pair: Any) -> None:
-    ours, theirs = pair
-    link = Link(theirs, Memory(), timeout=0.1)
-    timer = threading.Timer(0.5, ours.sendall, [b"x"])
+def test_an_agent_may_be_silent_for_longer_than_any_request_and_a_request_has_a_largest_size(pair: Pair) -> None:
+    link = link_of(pair, request_timeout=0.1, request_size=1000)
+    timer = threading.Timer(0.3, pair[0].sendall, [bytes(2000)])
     timer.start()
-    link.wait()
-    assert link.read(1) == b"x"
-    timer.join()
-
-
-def test_a_request_has_a_largest_size_however_many_fields_it_has(pair: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, theirs = pair
-    monkeypatch.setattr(link_module, "MAX_REQUEST", 1000)
-    link = Link(theirs, Memory())
-    ours.sendall(bytes(2000))
     link.wait()
     link.read(600)
     link.wait()
     link.read(600)
     with pytest.raises(ProtocolError):
         link.read(600)
+    timer.join()
 
 
-def test_uploads_of_all_agents_together_have_a_largest_size(pair: Any) -> None:
-    ours, theirs = pair
-    memory = Memory(3 * 2**20)
-    link = Link(theirs, memory, timeout=0.3)
-    memory.take(2 * 2**20, timeout=0.0)
-    ours.sendall(b"!")
+def test_uploads_of_all_agents_together_have_a_largest_size(pair: Pair) -> None:
+    memory = MemoryBudget(3 * MIB)
+    link = link_of(pair, memory, request_timeout=0.2)
+    memory.take(2 * MIB, timeout=0.0)
+    pair[0].sendall(b"!")
     link.wait()
     with pytest.raises(TimeoutError, match="memory"):
-        link.read(2 * 2**20)
-    memory.give_back(2 * 2**20)
-    writer = threading.Thread(target=ours.sendall, args=(bytes(2 * 2**20),))
+        link.read(2 * MIB)
+    memory.give_back(2 * MIB)
+    writer = threading.Thread(target=pair[0].sendall, args=(bytes(2 * MIB),))
     writer.start()
-    link = Link(theirs, memory, timeout=10)
+    link = link_of(pair, memory)
     link.wait()
-    assert len(link.read(2 * 2**20)) == 2 * 2**20
+    assert len(link.read(2 * MIB)) == 2 * MIB
     link.close()
-    memory.take(3 * 2**20, timeout=0.0)
+    memory.take(3 * MIB, timeout=0.0)
     writer.join()
 
 
-def test_an_agent_that_never_shakes_hands_loses_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_module, "REGISTER_TIMEOUT", 0.2)
-    with socket.create_server(("127.0.0.1", 0)) as listener, socket.create_connection(listener.getsockname()):
-        link = Link(listener.accept()[0], Memory())
-        with pytest.raises(TimeoutError):
-            REGISTER.decode_fields(link.read)
-        link.close()
+def test_an_agent_without_a_handshake_loses_its_place(pair: Pair) -> None:
+    link = link_of(pair, register_timeout=0.1)
+    with pytest.raises(TimeoutError):
+        REGISTER.decode_fields(link.read)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_worker_that_is_told_to_stop_finishes_the_reply_it_is_at(
-    own_worker: Start, connect: Callable[..., Any], make_boxes: Boxes, number: signal.Signals
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_stopped_worker_finishes_its_reply(
+    own_worker: Worker, wire: Connect, number: signal.Signals, status: int
 ) -> None:
-    worker = own_worker()
-    agent, idle = connect(worker.address, size=(512, 512)), connect(worker.address)
-    agent.spawn(make_boxes())
-    agent.ask("set_position", position=(0, 0, 0.3))
-    agent.ask("set_rotation", rotation=(180, 0, 180))
+    agent, idle = wire(own_worker.address, size=(512, 512)), wire(own_worker.address)
+    agent.spawn(boxes())
+    agent.look(Camera(0.3, 0, 0))
     expected = agent.views(1)[0]
-    agent.socket.sendall(COMMANDS["frame"].encode_request(flags=1))
+    agent.send("frame", flags=1)
     time.sleep(0.05)
-    for _ in range(3):  # told more than once, as by Ctrl-C and a supervisor
-        os.kill(worker.process.pid, number)
+    for _ in range(3):  # Ctrl-C and a supervisor may both send it
+        own_worker.process.send_signal(number)
     assert decode_frame(agent.read, flags=1, compressed=False)[0] == expected
-    assert worker.process.wait(20) == (130 if number == signal.SIGINT else 0)
+    assert own_worker.process.wait(20) == status
     assert idle.socket.recv(1) == b""
     with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(worker.address)
+        socket.create_connection(own_worker.address)
 
 
-def test_a_batch_ends_with_a_reason_when_the_worker_stops(
-    own_worker: Start, connect: Callable[..., Any], make_boxes: Boxes
-) -> None:
-    worker = own_worker()
-    agent = connect(worker.address, size=(512, 512))
-    agent.spawn(make_boxes())
-    agent.socket.sendall(COMMANDS["render_views"].encode_request(views=[[]] * MAX_VIEWS))
-    take_status(agent.read, "a view")
-    agent.read(512 * 512 * 3)
-    worker.process.send_signal(signal.SIGTERM)
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_starting_worker_stops_at_once(number: signal.Signals, status: int) -> None:
+    """The signal comes while OpenGL is loaded: the worker listens already and serves not yet."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = free.getsockname()
+    command = [sys.executable, "-m", "trompe_renderer", "--port", str(address[1])]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        while process.poll() is None:
+            with suppress(ConnectionRefusedError), socket.create_connection(address):
+                break
+        process.send_signal(number)
+        assert process.wait(20) == status
+        assert process.stdout is not None
+        assert process.stdout.read() == ""
 
-    def take_all() -> None:
-        for _ in range(MAX_VIEWS):
+
+def test_a_batch_ends_with_a_reason_when_the_worker_stops(own_worker: Worker, wire: Connect) -> None:
+    agent = wire(own_worker.address, size=(512, 512))
+    agent.spawn(boxes())
+    agent.send("render_views", views=[[]] * MAX_VIEWS)
+
+    def take_views(count: int) -> None:
+        for _ in range(count):
             take_status(agent.read, "a view")
             agent.read(512 * 512 * 3)
 
+    take_views(1)
+    own_worker.process.send_signal(signal.SIGTERM)
     with pytest.raises(RendererError, match="about to stop"):
-        take_all()
+        take_views(MAX_VIEWS)
     assert agent.socket.recv(1) == b""
 
 
-def test_a_worker_ends_when_its_supervisor_is_killed(own_worker: Start) -> None:
-    worker = own_worker()
-    serving = worker.serving
-    worker.process.kill()
-    deadline = time.monotonic() + 10
-    while os.path.exists(f"/proc/{serving}") and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert not os.path.exists(f"/proc/{serving}")
+def test_a_crash_ends_the_worker_with_its_signal_and_a_line_in_the_log(own_worker: Worker, tmp_path: Path) -> None:
+    own_worker.process.send_signal(signal.SIGSEGV)
+    assert own_worker.process.wait(20) == -signal.SIGSEGV
+    assert "Fatal Python error: Segmentation fault" in (tmp_path / "worker.log").read_text()
 
 
-def test_after_a_crash_the_same_address_serves_again(own_worker: Start, connect: Callable[..., Any]) -> None:
-    worker = own_worker()
-    for number in (signal.SIGSEGV, signal.SIGKILL):
-        serving = worker.serving
-        os.kill(serving, number)
-        agent = connect(worker.address)  # waits in line until the next one is there
-        assert agent.picture().shape == (32, 48, 3)
-        assert worker.serving != serving
+def test_a_worker_without_its_engine_ends_with_a_status_and_a_reason() -> None:
+    """``RenderThread`` has lost its engine: the default of ``lost``."""
+    script = "from trompe_renderer.engines.render_thread import _exit_process; _exit_process('context lost')"
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == os.EX_TEMPFAIL
+    assert "The engine is lost" in ended.stderr
+    assert "context lost" in ended.stderr
 
 
-@pytest.mark.parametrize(
-    ("ends", "status", "runs"),
-    [
-        pytest.param("sys.exit(0)", 0, 1, id="done"),
-        pytest.param("sys.exit(1)", 1, 1, id="cannot start"),
-        pytest.param("crash() if first() else sys.exit(0)", 0, 2, id="crashed once"),
-        pytest.param(f"sys.exit({LOST}) if first() else sys.exit(3)", 3, 2, id="lost OpenGL once"),
-        pytest.param("1 / 0", 1, 1, id="error"),
-    ],
-)
-def test_a_crash_starts_the_work_anew_and_an_end_ends_it(tmp_path: Any, ends: str, status: int, runs: int) -> None:
-    script = f"""
-import os, pathlib, signal, sys
-from trompe_renderer.session import Session
-from trompe_renderer.supervise import supervise
-
-log = pathlib.Path({str(tmp_path)!r}) / "log"
-first = lambda: log.read_text() == "."
-crash = lambda: os.kill(os.getpid(), signal.SIGSEGV)
-
-def work():
-    with log.open("a") as out:
-        out.write(".")
-    try:
-        {ends}
-    except SystemExit as end:
-        return end.code
-
-sys.exit(supervise(work))
-"""
-    done = subprocess.run([sys.executable, "-c", script], timeout=30, check=False, capture_output=True)
-    assert done.returncode == status
-    assert (tmp_path / "log").read_text() == "." * runs
-
-
-SMALL: dict[str, Any] = {"width": 4, "height": 4, "whose": Session}
-"""A picture for anybody."""
+ENGINE = EngineInfo("test", "1")
 
 
 class _Engine:
-    """Fails as it is told to."""
+    """Fails on request, and takes as many seconds for a picture as its ambient light is red."""
 
-    def __init__(self, broken: list[bool]) -> None:
-        self._broken = broken
+    def __init__(self) -> None:
+        self.info, self.broken = ENGINE, False
 
-    def render(self, scenery: Scenery, *, width: int, height: int) -> Any:
-        if scenery.placements:
+    def render(self, world: Snapshot, *, width: int, height: int) -> Any:
+        if world.instances:
             raise RuntimeError("out of memory")
-        time.sleep(scenery.ambient[0])
+        if self.broken:
+            raise RuntimeError("context lost")
+        time.sleep(world.ambient[0])
         return np.zeros((height, width, 3), np.uint8)
 
-    def check(self) -> None:
-        if self._broken:
-            raise RuntimeError("context lost")
+
+def thread_of(engine: _Engine, **options: Any) -> RenderThread:
+    return RenderThread(lambda: engine, **options)
 
 
-def scene(*, placements: tuple[Any, ...] = (), seconds: float = 0.0) -> Scenery:
-    return Scenery(placements, np.eye(4), (), (seconds, 0.0, 0.0), (0.0, 0.0, 0.0))
+def draw(thread: RenderThread, *, fails: bool = False, seconds: float = 0.0, agent: object = Session) -> Any:
+    """A picture in the future."""
+    world = Snapshot((1,) if fails else (), np.eye(4), (), (seconds, 0.0, 0.0), (0.0, 0.0, 0.0))  # type: ignore[arg-type]
+    return thread.run(lambda engine: engine.render(world, width=4, height=4), agent=agent)
 
 
-def test_opengl_counts_as_lost_when_not_even_an_empty_picture_can_be_drawn() -> None:
-    broken: list[bool] = []
-    lost: list[str] = []
-    renderer = Renderer(Quality(), engine=lambda _: _Engine(broken), lost=lost.append)  # type: ignore[arg-type, return-value]
+def test_an_engine_counts_as_lost_when_not_even_an_empty_picture_can_be_drawn() -> None:
+    engine, lost = _Engine(), list[str]()
+    thread = thread_of(engine, lost=lost.append)
     for _ in range(2):
         with pytest.raises(RuntimeError, match="out of memory"):
-            renderer.render(scene(placements=(1,)), **SMALL)
-        assert renderer.render(scene(), **SMALL).shape == (4, 4, 3)
+            draw(thread, fails=True).result()
+        assert draw(thread).result().shape == (4, 4, 3)
     assert lost == []
-    broken.append(True)
+    engine.broken = True
     with pytest.raises(RuntimeError, match="out of memory"):
-        renderer.render(scene(placements=(1,)), **SMALL)
+        draw(thread, fails=True).result()
     assert "context lost" in lost[0]
 
 
-def test_opengl_counts_as_lost_when_a_picture_takes_for_ever() -> None:
+def test_an_engine_counts_as_lost_when_a_picture_takes_for_ever() -> None:
     lost = threading.Event()
-    renderer = Renderer(
-        Quality(),
-        engine=lambda _: _Engine([]),  # type: ignore[arg-type, return-value]
-        lost=lambda reason: lost.set(),
-        turn_limit=0.2,
-    )
+    thread = thread_of(_Engine(), lost=lambda reason: lost.set(), turn_limit=0.2)
     for _ in range(5):
-        renderer.render(scene(seconds=0.1), **SMALL)
+        draw(thread, seconds=0.08).result()
     assert not lost.is_set()
-    renderer.render(scene(seconds=1.0), **SMALL)
-    assert lost.is_set()
+    endless = draw(thread, seconds=1.0)
+    assert lost.wait(10)
+    endless.result()
 
 
-def test_the_next_turn_is_of_whom_the_turns_took_least_and_of_those_of_whoever_came_first() -> None:
-    line, (large, small, late) = _Line(), (Session(Library()) for _ in range(3))
+def sessions(count: int, limits: Limits | None = None) -> list[Session]:
+    cache = ModelCache(limits or Limits())
+    return [Session(cache, ENGINE) for _ in range(count)]
 
-    def turns(count: int, seconds: dict[Any, float]) -> list[Any]:
+
+def test_the_next_turn_goes_to_the_agent_with_the_least_time_used() -> None:
+    queue, (large, small, late) = FairQueue(), sessions(3)
+
+    def turns(count: int) -> list[Any]:
         served = []
         for _ in range(count):
-            served.append(line.next()[0])
-            line.charge(served[-1], seconds[served[-1]])
+            served.append(queue.next()[0])
+            queue.charge(served[-1], 2.0 if served[-1] is large else 0.5)
         return served
 
-    seconds = {large: 2.0, small: 0.5, late: 0.5}
-    for whose in (large, large, small, small, small):
-        line.join(whose, int)
-    assert turns(4, seconds) == [large, small, small, small]
-    for whose in (small, small, late, late, late):  # who comes late has no claim for the time before
-        line.join(whose, int)
-    assert turns(6, seconds) == [late, small, late, large, small, late]
+    for agent in (large, large, small, small, small):
+        queue.join(agent, int)
+    assert turns(4) == [large, small, small, small]
+    for agent in (small, small, late, late, late):  # time away earns no credit
+        queue.join(agent, int)
+    assert turns(6) == [late, small, late, large, small, late]
 
 
-def test_who_asks_for_large_pictures_does_not_make_those_wait_who_ask_for_small_ones() -> None:
-    renderer = Renderer(Quality(), engine=lambda _: _Engine([]))  # type: ignore[arg-type, return-value]
-    agents = {name: Session(Library()) for name in ("large", "small")}
+def test_large_pictures_do_not_delay_small_ones() -> None:
+    thread, (large, small) = thread_of(_Engine()), sessions(2)
     order: list[str] = []
-
-    def ask(name: str, seconds: float) -> Any:
-        drawn = renderer.start(scene(seconds=seconds), width=4, height=4, whose=agents[name])
-        drawn.add_done_callback(lambda _: order.append(name))
-        return drawn
-
-    asked = [ask(name, seconds) for name, seconds in (("large", 0.3), ("large", 0.3), ("small", 0.01), ("small", 0.01))]
-    for drawn in asked:
-        drawn.result()
+    asked = []
+    for agent, name, seconds in ((large, "large", 0.1),) * 2 + ((small, "small", 0.01),) * 2:
+        asked.append(draw(thread, seconds=seconds, agent=agent))
+        asked[-1].add_done_callback(lambda _, name=name: order.append(name))
+    for each in asked:
+        each.result()
     assert order == ["large", "small", "small", "large"]
 
 
-def test_who_wants_much_memory_is_not_passed_over_for_those_who_want_little() -> None:
-    memory, order = Memory(100), []
+def test_large_requests_for_memory_are_not_overtaken_by_small_ones() -> None:
+    memory, order = MemoryBudget(100), list[int]()
 
     def use(count: int) -> None:
-        with memory.lent(count):
+        with memory.reserved(count):
             order.append(count)
-            time.sleep(0.05)
 
-    with memory.lent(30):
+    with memory.reserved(30):
         threads = [threading.Thread(target=use, args=(count,)) for count in (1000, 20, 20)]
         for thread in threads:
             thread.start()
-            time.sleep(0.1)
+            time.sleep(0.05)
         assert order == []
     for thread in threads:
         thread.join()
@@ -365,17 +303,13 @@ def test_who_wants_much_memory_is_not_passed_over_for_those_who_want_little() ->
     memory.take(100, timeout=0)
 
 
-def test_the_textures_of_all_that_is_spawned_have_a_largest_size(
-    make_boxes: Boxes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("trompe_renderer.world.MAX_SHOWN_BYTES", 3000)
-    session = Session(Library())
-    place = {"position": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0), "scale": (1.0, 1.0, 1.0)}
-    (path,) = session.send_obj_zip(file=("box.zip", make_boxes().to_zip()))
-    for _ in range(5):  # all have the same textures
-        session.spawn_object(name=f"file:{path}", **place)
+def test_the_textures_of_all_spawned_objects_have_a_largest_size() -> None:
+    (session,) = sessions(1, Limits(textures=3000))
+    (path,) = session.send_obj_zip(file=("box.zip", boxes().to_zip()))
+    for _ in range(5):  # all share their textures
+        session.spawn_object(name=f"file:{path}", **ORIGIN)
     session.repaint_object(instance=1, textures=[("front_albedo.png", (20, 20, bytes(1200)))])
-    with pytest.raises(RendererError, match="despawn"):
+    with pytest.raises(RendererError, match="Despawn"):
         session.repaint_object(instance=2, textures=[("front_albedo.png", (25, 25, bytes(1875)))])
     session.despawn_object(instance=1)
     session.repaint_object(instance=2, textures=[("front_albedo.png", (25, 25, bytes(1875)))])

@@ -1,6 +1,5 @@
-"""Scenes, scenarios, and what stands behind the objects: colour, sky, a photograph."""
+"""Scenes, scenarios, and backgrounds: a colour or the sky."""
 
-import io
 import json
 import subprocess
 import sys
@@ -10,22 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from PIL import Image, ImageOps
 
-from trompe_renderer.scenes import CATEGORIES, SCENES, scene_named
+from tests.wire import Wire, boxes, pixel_rays
+from trompe_renderer.world.scenes import CATEGORIES, SCENES, scene_named
 from trompe_shared.errors import RendererError
-from trompe_shared.geometry import FIELD_OF_VIEW, Camera
-from trompe_shared.object3d import Object3D
+from trompe_shared.geometry import Camera
 from trompe_shared.shipped import shipped_objects
 
-Connect = Callable[..., Any]
-Boxes = Callable[..., Object3D]
+Connect = Callable[..., Wire]
 ROOM = "room_01/scene"
 
 
 @pytest.fixture
-def room(wire: Connect) -> Any:
+def room(wire: Connect) -> Wire:
     agent = wire(size=(90, 120), long=True)
     agent.ask("change_scene", scene=ROOM)
     return agent
@@ -39,20 +35,20 @@ def names_in(agent: Any) -> set[str]:
 
 def test_all_scenes_are_named_at_the_handshake_and_can_be_loaded(wire: Connect) -> None:
     agent = wire()
-    assert agent.scenes == ["object_view/scene", ROOM]
+    assert agent.scenes == list(SCENES) == ["object_view/scene", ROOM]
     for scene in agent.scenes:
         agent.ask("change_scene", scene=scene)
         assert agent.picture().shape == (32, 48, 3)
 
 
-def test_the_room_is_furnished_and_its_camera_starts_where_there_is_something_to_see(room: Any) -> None:
+def test_the_room_is_furnished_and_its_first_view_shows_it(room: Wire) -> None:
     assert {"table", "chair", "teapot", "mug", "floor", "wall", "window", "rug"} <= names_in(room)
     picture = room.picture()
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 1000
     assert 60 < picture.mean() < 180
 
 
-def test_from_inside_the_room_nothing_but_the_window_looks_out(room: Any) -> None:
+def test_from_inside_the_room_nothing_but_the_window_looks_out(room: Wire) -> None:
     seen: set[str] = set()
     for azimuth in range(0, 360, 45):
         for elevation in (-60, 0, 60):
@@ -70,14 +66,12 @@ def test_from_inside_the_room_nothing_but_the_window_looks_out(room: Any) -> Non
 
 def test_the_rooms_furniture_stands_on_something() -> None:
     grounds = {0.0, 0.013, 0.753, 0.86}
-    for fixture in scene_named(ROOM).fixtures[8:]:
-        lowest = min(part.vertices[:, 1].min() for part in fixture.model.obj.parts) + fixture.place.position[1]
+    for fixture in scene_named(ROOM).static_objects[8:]:
+        lowest = min(part.vertices[:, 1].min() for part in fixture.model.obj.parts) + fixture.pose.position[1]
         assert min(abs(lowest - ground) for ground in grounds) < 1e-3
 
 
-def test_the_room_has_lights_of_both_kinds_and_the_point_light_falls_with_the_square_of_distance(
-    room: Any, make_boxes: Boxes
-) -> None:
+def test_the_room_has_lights_of_both_kinds_and_the_point_light_falls_with_the_square_of_distance(room: Wire) -> None:
     lights = room.ask("get_lights_names")
     kinds = {light: room.ask("get_light_type", light=light) for light in lights}
     assert kinds == {"Main Light": "Directional", "Rim Light": "Directional", "Ceiling Light": "Point"}
@@ -86,9 +80,9 @@ def test_the_room_has_lights_of_both_kinds_and_the_point_light_falls_with_the_sq
     room.ask("set_ambient_light_color", color=(0, 0, 0))
     indoors = room.labels()["category"] != CATEGORIES["none"]
     assert np.median(room.picture()[indoors]) == 0
-    assert (room.picture()[indoors] == 0).mean() > 0.95  # all but what the sky shines past at the window's edge
+    assert (room.picture()[indoors] == 0).mean() > 0.95  # all but the sky at the window's edge
     white = {"front": np.full((4, 4, 3), 255, np.uint8)}
-    room.spawn(make_boxes(textures=white), position=(-1, 1, 0))
+    room.spawn(boxes(textures=white), position=(-1, 1, 0))
     room.ask("set_position", position=(-1, 1, 0.3))
     room.ask("set_rotation", rotation=(0, 180, 0))
     room.ask("set_light_intensity", light="Ceiling Light", intensity=0.5)
@@ -100,7 +94,7 @@ def test_the_room_has_lights_of_both_kinds_and_the_point_light_falls_with_the_sq
     assert np.allclose(levels, np.outer([0.5, 0.25, 0.125], np.ones(3)), atol=0.03)
 
 
-def test_fixtures_cannot_be_moved_or_removed_and_spawned_things_are_numbered_after_them(room: Any) -> None:
+def test_fixtures_cannot_be_moved_or_removed_and_spawned_things_are_numbered_after_them(room: Wire) -> None:
     for command, values in (
         ("despawn_object", {"instance": 1}),
         ("move_object", {"instance": 1, "position": (0, 0, 0), "rotation": (0, 0, 0)}),
@@ -108,17 +102,16 @@ def test_fixtures_cannot_be_moved_or_removed_and_spawned_things_are_numbered_aft
         with pytest.raises(RendererError, match="No object 1"):
             room.ask(command, **values)
     number = int(room.spawn_named("ball", position=(0, 1.5, 0)))
-    assert number == len(scene_named(ROOM).fixtures) + 1
+    assert number == len(scene_named(ROOM).static_objects) + 1
     room.ask("despawn_object", instance=number)
 
 
 def test_furniture_casts_shadows_in_the_room_and_its_walls_do_not(
-    wire_to: Connect, shadowless_worker: tuple[str, int], room: Any
+    wire: Connect, shadowless_worker: tuple[str, int], room: Wire
 ) -> None:
-    plain = wire_to(shadowless_worker, size=(90, 120))
+    plain = wire(shadowless_worker, size=(90, 120))
     plain.ask("change_scene", scene=ROOM)
     lit, shaded = (agent.picture().astype(int) for agent in (plain, room))
-    plain.socket.close()
     darker = (lit - shaded).max(axis=-1) > 10
     floor = np.isin(room.labels()["category"], (CATEGORIES["floor"], CATEGORIES["rug"]))
     assert 0.1 < darker[floor].mean() < 0.7
@@ -128,92 +121,43 @@ def test_the_script_makes_the_room_that_is_shipped(tmp_path: Path) -> None:
     root = Path(__file__).parents[2]
     script = [sys.executable, str(root / "scripts" / "make_room.py"), "--out", str(tmp_path)]
     subprocess.run(script, check=True, capture_output=True, timeout=120)
-    shipped = root / "renderer_worker" / "trompe_renderer" / "room_01"
+    shipped = root / "renderer_worker" / "trompe_renderer" / "world" / "room_01"
     assert sorted(p.name for p in shipped.iterdir()) == sorted(p.name for p in tmp_path.iterdir())
     assert json.loads((shipped / "scene.json").read_text()) == json.loads((tmp_path / "scene.json").read_text())
     for path in shipped.iterdir():
         assert path.read_bytes() == (tmp_path / path.name).read_bytes(), path.name
 
 
-# --- behind the objects ---
-
-
-def rays_up(agent: Any, camera: Camera) -> NDArray[np.float64]:
-    """(H, W): the sine of the height above the horizon that each pixel's centre looks to."""
-    height, width = agent.size
-    slope = np.tan(np.radians(FIELD_OF_VIEW / 2)) / (height / 2)
-    x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2) * slope, (height / 2 - np.arange(height) - 0.5) * slope)
-    rays = np.stack([x, y, -np.ones_like(x)], axis=-1) @ camera.world_to_camera()[:3, :3]
-    return np.asarray(rays[..., 1] / np.linalg.norm(rays, axis=-1))
+# --- backgrounds ---
 
 
 @pytest.mark.parametrize("elevation", [-70, -20, 0, 15, 60])
 def test_the_sky_has_its_horizon_where_the_camera_is_level(wire: Connect, elevation: float) -> None:
     agent, camera = wire(), Camera(1.0, 30, elevation)
     agent.look(camera)
-    agent.ask("set_clear_color", color=(-1, 0, 0))
-    picture, up = agent.picture().astype(int), rays_up(agent, camera)
+    agent.ask("set_clear_color", color=(-1, 0, -1))
+    picture, rays = agent.picture().astype(int), pixel_rays(agent.size) @ camera.world_to_camera()[:3, :3]
+    up = rays[..., 1] / np.linalg.norm(rays, axis=-1)  # sine of the height above the horizon
     blue = picture[..., 2] > picture[..., 0] + 10
     assert blue[up > 0.02].all()
     assert not blue[up < -0.02].any()
     bright = picture[..., 0][up > 0.02]
     if len(bright) > 100:
         assert np.corrcoef(bright, up[up > 0.02])[0, 1] < -0.8  # deeper blue towards the zenith
-
-
-def test_a_colour_replaces_the_sky_again(wire: Connect) -> None:
-    agent = wire()
-    agent.ask("set_clear_color", color=(-1, -1, -1))
     agent.ask("set_clear_color", color=(1, 2, 3))
     assert (agent.picture() == (1, 2, 3)).all()
 
 
-def encoded(picture: NDArray[np.uint8], kind: str = "PNG") -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, kind)
-    return buffer.getvalue()
-
-
-def test_a_photograph_fills_the_picture_behind_the_objects_as_it_is(wire: Connect, make_boxes: Boxes) -> None:
-    agent = wire(size=(48, 64))
-    agent.look(Camera(0.4, 0, 0))
-    photograph = np.random.default_rng(3).integers(0, 256, (100, 90, 3), dtype=np.uint8)
-    agent.ask("set_background_picture", file=("photograph.png", encoded(photograph)))
-    fitted = np.asarray(ImageOps.fit(Image.fromarray(photograph), (64, 48), Image.Resampling.LANCZOS))
-    assert (agent.picture() == fitted).all()
-    agent.spawn(make_boxes(((0.05, 0, 0), (0.03, 0.03, 0.03))))
-    picture, mask = agent.picture(), agent.labels()["object"].any(axis=-1)
-    away = ~(mask | np.roll(mask, 2, 1) | np.roll(mask, -2, 1) | np.roll(mask, 2, 0) | np.roll(mask, -2, 0))
-    assert mask.sum() > 30
-    assert (picture == fitted)[away].all()
-    assert (picture[mask] != fitted[mask]).any(axis=-1).mean() > 0.9
-
-
-def test_edges_blend_with_what_stands_behind_them(wire: Connect, make_boxes: Boxes) -> None:
+def test_edges_blend_with_the_background(wire: Connect) -> None:
     agent = wire(size=(48, 64))
     agent.look(Camera(0.4, 30, 25))
-    agent.spawn(make_boxes())
+    agent.spawn(boxes())
     pictures = []
     for level in (40, 200):
         agent.ask("set_clear_color", color=(level, level, level))
-        plain = agent.picture()
-        agent.ask("set_background_picture", file=("p", encoded(np.full((8, 8, 3), level, np.uint8))))
-        assert (agent.picture() == plain).all()
-        pictures.append(plain.astype(int))
+        pictures.append(agent.picture().astype(int))
     partly = (pictures[1] - pictures[0])[..., 0]
     assert ((partly > 20) & (partly < 140)).sum() > 10
-
-
-@pytest.mark.parametrize("data", [b"", b"no picture", encoded(np.zeros((4, 4, 3), np.uint8))[:40]])
-def test_a_photograph_that_is_none_is_refused_and_the_background_stays(wire: Connect, data: bytes) -> None:
-    agent = wire()
-    agent.ask("set_clear_color", color=(9, 9, 9))
-    with pytest.raises(RendererError, match=r"p\.jpg"):
-        agent.ask("set_background_picture", file=("p.jpg", data))
-    assert (agent.picture() == 9).all()
-
-
-# --- what can be spawned ---
 
 
 @pytest.mark.parametrize("name", sorted(shipped_objects()))
@@ -300,7 +244,7 @@ def test_a_scenario_that_cannot_be_loaded_changes_nothing_and_gives_no_ids(
     ],
 )
 def test_objects_of_a_scenario_start_when_its_timings_say(
-    ticking_worker: tuple[str, int], wire_to: Connect, timings: Any, starts: tuple[float, ...]
+    ticking_worker: tuple[str, int], wire: Connect, timings: Any, starts: tuple[float, ...]
 ) -> None:
     def rising(number: int) -> dict[str, Any]:
         at = {"x": 0.8 * number - 0.8, "y": -0.4, "z": 0.0}
@@ -308,7 +252,7 @@ def test_objects_of_a_scenario_start_when_its_timings_say(
         dynamic = {"type": "linear_waypoints", "description": {"waypoints": rows, "total_time": 1.0}}
         return actor("ball", position=at, dynamic=dynamic)
 
-    agent = wire_to(ticking_worker, size=(60, 80))
+    agent = wire(ticking_worker, size=(60, 80))
     agent.look(Camera(1.6, 0, 0))
     agent.load(scenario(*[rising(number) for number in range(3)], timings=timings))
     rows: list[list[float]] = [[], [], []]
@@ -316,11 +260,6 @@ def test_objects_of_a_scenario_start_when_its_timings_say(
         colors = agent.labels()["object"]
         for number, third in enumerate(np.array_split(colors[:, ::-1], 3, axis=1)):  # x grows to the left
             rows[number].append(float(np.nonzero(third.any(axis=-1))[0].mean()))
-    agent.socket.close()
     for start, track in zip(starts, rows, strict=True):
         arrived = 0.5 * (1 + int(np.flatnonzero(np.array(track) < 20)[0]))
         assert arrived == start + 1.0
-
-
-def test_all_scenes_have_names_that_the_git_client_knows() -> None:
-    assert all(name.endswith("/scene") for name in SCENES)

@@ -1,6 +1,6 @@
-"""A worker at work for long: many agents at once, many frames, many uploads.
+"""Long runs: many agents at once, many frames, many uploads.
 
-The figures: ``--log-cli-level=INFO`` shows them, ``--junit-xml=FILE`` keeps them as properties of the test.
+``--log-cli-level=INFO`` shows the figures, ``--junit-xml=FILE`` stores them as properties of the test.
 The slow runs last TROMPE_SOAK_SECONDS (600) with 8 agents, and 10,000 frames and 1,000 uploads.
 """
 
@@ -10,17 +10,15 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
-from typing import Any
 
 import numpy as np
 import pytest
 
-from trompe_server.target import SailenvTarget
+from tests.wire import Wire, boxes
+from tests.worker_process import Worker
+from trompe_server.renderers import SailenvTarget
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D
-
-Boxes = Callable[..., Object3D]
-Start = Callable[[], Any]
 
 AGENTS = 8
 SIZE = (64, 64)
@@ -31,7 +29,7 @@ log = logging.getLogger(__name__)
 
 
 def marked(box: Object3D, agent: int, turn: int) -> Object3D:
-    """``box`` with textures that no other agent and no other turn has."""
+    """``box`` with textures of its own for each agent and turn."""
     random = np.random.default_rng([agent, turn])
     return box.with_textures({name: random.integers(0, 256, (32, 32, 3), dtype=np.uint8) for name in box.textures})
 
@@ -44,10 +42,10 @@ def marked(box: Object3D, agent: int, turn: int) -> Object3D:
     ],
 )
 def test_agents_at_work_at_once_get_their_own_pictures_and_none_waits_for_long(
-    seconds: float, own_worker: Start, make_boxes: Boxes, record_property: Callable[[str, object], None]
+    seconds: float, own_worker: Worker, record_property: Callable[[str, object], None]
 ) -> None:
-    worker, turns = own_worker(), 3
-    objects = [[marked(make_boxes(), agent, turn) for turn in range(turns)] for agent in range(AGENTS)]
+    worker, turns = own_worker, 3
+    objects = [[marked(boxes(), agent, turn) for turn in range(turns)] for agent in range(AGENTS)]
     with closing(SailenvTarget(*worker.address)) as target:
         expected = [[target.render(obj, VIEWS, size=SIZE) for obj in mine] for mine in objects]
     waits: list[list[float]] = [[] for _ in range(AGENTS)]
@@ -88,23 +86,18 @@ def test_agents_at_work_at_once_get_their_own_pictures_and_none_waits_for_long(
     ("frames", "uploads"),
     [pytest.param(300, 40, id="some"), pytest.param(10_000, 1_000, id="many", marks=SLOW)],
 )
-def test_memory_stays_flat(
-    frames: int, uploads: int, own_worker: Start, wire_to: Callable[..., Any], make_boxes: Boxes
-) -> None:
-    worker = own_worker()
-    agent = wire_to(worker.address)
+def test_memory_stays_flat(frames: int, uploads: int, own_worker: Worker, wire: Callable[..., Wire]) -> None:
+    agent = wire(own_worker.address)
     random = np.random.default_rng(0)
 
     def upload(count: int) -> None:
         for _ in range(count):
             front = random.integers(0, 256, (64, 64, 3), dtype=np.uint8)
             half = (random.uniform(0.05, 0.1), 0.06, 0.04)  # another mesh each time
-            agent.ask(
-                "despawn_object", instance=int(agent.spawn(make_boxes(((0, 0, 0), half), textures={"front": front})))
-            )
+            agent.ask("despawn_object", instance=int(agent.spawn(boxes(((0, 0, 0), half), textures={"front": front}))))
 
     def draw(count: int) -> None:
-        agent.spawn(make_boxes())
+        agent.spawn(boxes())
         for number in range(count):
             agent.ask("set_position", position=(0, 0, 0.3 + number % 7 / 50))
             agent.views(1)
@@ -116,9 +109,8 @@ def test_memory_stays_flat(
             agent.ask("change_scene", scene="object_view/scene")
 
     work(frames // 2 if frames < 1000 else 2000, uploads // 2 if uploads < 100 else 200)
-    before = worker.memory
+    before = own_worker.memory
     work(frames, uploads)
-    after = worker.memory
-    agent.socket.close()
+    after = own_worker.memory
     log.info("%d frames, %d uploads: memory %.1f to %.1f MiB", frames, uploads, before / 2**20, after / 2**20)
     assert after < before + 24 * 2**20

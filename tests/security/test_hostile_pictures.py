@@ -9,7 +9,6 @@ import shutil
 import struct
 import subprocess
 import tempfile
-import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -18,18 +17,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_models import OBJ, gltf_files, with_picture_inside
 
+from tests.small_models import OBJ, gltf_files, large_png, with_picture_inside
 from trompe_server.formats import read_object
 from trompe_server.formats.fbx_tree import Tree, parse_tree
 from trompe_server.formats.gltf_write import write_glb
 from trompe_server.library import Library
-from trompe_server.target import SailenvTarget
-from trompe_server.target.sailenv import _picture
+from trompe_server.renderers import SailenvTarget
 from trompe_shared.errors import ObjectError, ProtocolError, RendererError, SpecError, TrompeError
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files, pack_zip
 from trompe_shared.opacity import opacity_of
+from trompe_shared.sailenv_client import _picture
 
 SIDE = 8
 GOOD = encode_png(np.zeros((SIDE, SIDE, 3), np.uint8))
@@ -54,16 +53,7 @@ def fits() -> bytes:
     return "".join(f"{line:80}" for line in lines).encode().ljust(2880) + bytes(2880)
 
 
-def large_png(width: int, height: int) -> bytes:
-    """The file says that it is so large; there are no pixels in it."""
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    data = b"\x89PNG\r\n\x1a\n"
-    for kind, body in ((b"IHDR", header), (b"IDAT", zlib.compress(b"")), (b"IEND", b"")):
-        data += struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-    return data
-
-
-OTHER_FORMATS = {
+OTHER_FORMATS: dict[str, Callable[[], bytes]] = {
     "EPS": lambda: saved("EPS"),
     "PSD": psd,
     "FITS": fits,

@@ -1,4 +1,4 @@
-"""A service of real processes that somebody looks after, and somebody else who kills, freezes and stops them."""
+"""A service of real, restarted processes, and faults that kill, freeze and stop them."""
 
 import hashlib
 import json
@@ -9,7 +9,6 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -19,13 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
-from processes import wait_until
-
+from tests.fake_job import PHASES, trace
+from tests.served import CHILD, FAKE, free_port, wait_until
 from trompe_client import Client, Retries
 from trompe_client._job import JobHandle
-from trompe_server.jobs.fake import PHASES, trace
-from trompe_server.jobs.store import JobStore
-from trompe_server.jobs.worker import prepare_data
+from trompe_server.executor.worker import prepare_data
+from trompe_server.queue.store import JobStore
 from trompe_server.settings import Settings
 from trompe_shared.api import Event, Job, JobRequest, JobState
 
@@ -34,43 +32,42 @@ logger = logging.getLogger(__name__)
 WORKERS: Final = 3
 RENDERERS: Final = 3
 REAL_EVERY: Final = 12
-"""One job of so many is a real attack."""
+"""One in this many jobs is a real attack."""
 KINDS: Final = {"serve": "API", "worker": "attack worker", "render": "renderer worker"}
-"""What a process is, by the command that it runs."""
+"""Kinds of processes, by command."""
 SHARES: Final = ["API", *["attack worker"] * WORKERS, *["renderer worker"] * RENDERERS]
 RESTART: Final = 0.5
-"""Seconds after which a process that died is started again by the one who looks after it."""
+"""Seconds before a dead process is restarted."""
 
 Digests = Mapping[int, Mapping[str, str]]
-"""By the number of a job: the SHA-256 of each of its artifacts, but for the times in them."""
+"""SHA-256 of each artifact without its times, by number of the job."""
 
 
 def request(number: int) -> JobRequest:
-    """The job with this number: most are short and pretend, some are attacks, with a checkpoint in their middle."""
-    common = {"object": "mug", "label": "mug", "seed": number, "labels": {"run": "chaos"}}
+    """The job with this number: most are fake, some are attacks with a checkpoint in the middle."""
+    common = {"label": "mug", "seed": number, "labels": {"run": "chaos"}}
     if number % REAL_EVERY != REAL_EVERY // 3:
-        return JobRequest.model_validate(common | {"steps": 1})
-    views = {"pool": 0, "azimuths": 2, "elevations": 1, "held_out": 2}
-    return JobRequest.model_validate(common | views | {"steps": 10})
+        return JobRequest.of("mug", **common, steps=1)
+    return JobRequest.of("mug", **common, grid=True, azimuths=2, elevations=1, held_out=2, steps=10)
 
 
 def is_real(number: int) -> bool:
-    """Whether the job with this number is an attack."""
-    return request(number).steps > 1
+    """Whether the job with this number is a real attack."""
+    return request(number).search.steps > 1
 
 
 class Kept:
-    """A process that is started again whenever it dies, as compose would do. What it says goes to ``log``."""
+    """A process restarted whenever it dies, as by compose. Its output goes to ``log``."""
 
     def __init__(self, arguments: Sequence[str], environment: Mapping[str, str], log: Path) -> None:
-        self._command = [sys.executable, "-m", "trompe_server.jobs.leash", *arguments]
+        self._command = [*CHILD, *arguments]
         self._environment, self._log = os.environ | environment, log
         self._stopping = threading.Event()
         self.process: subprocess.Popen[bytes] | None = None
-        self._thread = threading.Thread(target=self._look_after, daemon=True)
+        self._thread = threading.Thread(target=self._supervise, daemon=True)
         self._thread.start()
 
-    def _look_after(self) -> None:
+    def _supervise(self) -> None:
         while not self._stopping.is_set():
             with self._log.open("ab") as log:
                 self.process = subprocess.Popen(
@@ -82,7 +79,7 @@ class Kept:
             self._stopping.wait(RESTART)
 
     def close(self) -> None:
-        """End it for good."""
+        """End it."""
         self._stopping.set()
         if self.process is not None:
             self.process.terminate()
@@ -96,11 +93,11 @@ class Kept:
 class Site:
     """Three attack workers, three renderer workers and the API on the database at ``url``, all under ``folder``.
 
-    On one machine (``scattered=False``) `trompe serve` looks after the others; else each process stands alone, and the
-    workers have nothing in common but the database and the store.
+    With ``scattered=False``, `trompe serve` supervises the others. Otherwise each process stands alone, and the workers
+    share only the database and the store. ``phase_seconds``: length of the phases of fake jobs.
     """
 
-    def __init__(self, folder: Path, url: str, *, scattered: bool, silence: float, dawdle: float) -> None:
+    def __init__(self, folder: Path, url: str, *, scattered: bool, silence: float, phase_seconds: float) -> None:
         self.folder = folder
         self.settings = Settings(data=folder / "api", database=url, store=str(folder / "store"), silence=silence)
         self._environment = {
@@ -109,9 +106,9 @@ class Site:
             "TROMPE_SILENCE": str(silence),
             "TROMPE_RATE_LIMIT": "0",
             "TROMPE_RENDERER_PATIENCE": "120",
-            "TROMPE_PIPELINE": "chaos_pipeline:open_pipeline",
-            "TROMPE_FAKE_SECONDS": str(dawdle),
-            "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]),
+            "TROMPE_PIPELINE": "tests.service.chaos_pipeline:open_job",
+            "TROMPE_FAKE_SECONDS": str(phase_seconds),
+            "PYTHONPATH": FAKE["PYTHONPATH"],
             "OMP_NUM_THREADS": "1",
         }
         prepare_data(self.settings)
@@ -131,17 +128,17 @@ class Site:
         return [self._serve(workers=0, renderers=0), *workers, *renderers]
 
     def _keep(self, name: str, *arguments: str) -> Kept:
-        """A process with a data folder of its own."""
+        """A process with its own data folder."""
         own = {"TROMPE_DATA": str(self.folder / name)}
         return Kept(arguments, self._environment | own, self.folder / f"{name}.log")
 
     def client(self) -> Client:
-        """A client that outlasts what happens to the API."""
+        """A client that retries until the API is back."""
         url = f"http://127.0.0.1:{self.port}"
         return Client(url, timeout=120, retries=Retries(limit=1000, longest=1.0))
 
     def processes(self) -> dict[str, list[int]]:
-        """Ids of the living processes that are ours, by what they are."""
+        """Ids of our living processes, by kind."""
         table = process_table()
         roots = {kept.process.pid for kept in self._kept if kept.process is not None}
         found: dict[str, list[int]] = {kind: [] for kind in KINDS.values()}
@@ -152,21 +149,21 @@ class Site:
         return found
 
     def wait_ready(self) -> None:
-        """Return once the API answers and all attack workers are there."""
+        """Wait until the API answers and all attack workers are registered."""
         wait_until(lambda: sum(worker.alive for worker in self.store.workers()) == WORKERS, seconds=180, story=self.log)
         with self.client() as client:
             client.workers()
 
     def folder_of(self, job: Job) -> Path:
-        """Where the files of a job are."""
+        """Folder of a job."""
         return Path(self.settings.store_url) / "jobs" / job.id
 
     def log(self) -> str:
-        """The last words of all processes."""
+        """The end of all logs."""
         return "\n".join(f"--- {file.name}\n{file.read_text()[-2500:]}" for file in sorted(self.folder.glob("*.log")))
 
     def said(self, words: str) -> int:
-        """How often a process has said something."""
+        """Number of occurrences in all logs."""
         return sum(file.read_text().count(words) for file in self.folder.glob("*.log"))
 
     def __enter__(self) -> Self:
@@ -190,41 +187,41 @@ class Site:
         self.store.close()
 
 
-class Mischief:
-    """What happens to the processes of ``site``; ``story`` tells what happened when, ``deeds`` counts it."""
+class Faults:
+    """Faults injected into the processes of ``site``. ``story`` lists them with times, ``counts`` counts them."""
 
     def __init__(self, site: Site, *, seed: int) -> None:
         self._site, self._random = site, random.Random(seed)
         self._started = time.monotonic()
         self._told: list[str] = [f"seed {seed}"]
-        self.deeds: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()
 
     def tell(self, words: str) -> None:
-        """Note what happened just now."""
+        """Log an event."""
         self._told.append(f"{time.monotonic() - self._started:7.1f} s  {words}")
         logger.info(self._told[-1])
 
     def story(self) -> str:
-        """All that happened, and the last words of all processes."""
+        """All events and the end of all logs."""
         return "\n".join([*self._told, self._site.log()])
 
     def kill(self) -> None:
-        """Kill one process of those that are there; each of API, attack workers and renderers as often as another."""
+        """Kill a random process."""
         kind = self._random.choice(SHARES)
         place = self._random.random()
         pids = self._site.processes()[kind]
         if not pids:
-            self.tell(f"no {kind} is there to be killed")
+            self.tell(f"no {kind} to kill")
             return
         pid = pids[int(place * len(pids))]
         self.tell(f"kill -9 {kind} {pid}, of {pids}; running: {self._running()}")
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-            self.deeds[f"{kind} killed"] += 1
+            self.counts[f"{kind} killed"] += 1
 
     def freeze(self, *, seconds: float) -> None:
-        """Stop an attack worker that has a job, an attack if there is one, and let it go on after so many seconds."""
-        busy = {job.worker: is_real(job.spec.seed) for job in self._site.store.page(state=JobState.running).jobs}
+        """Stop an attack worker with a job, preferably a real attack, for ``seconds``."""
+        busy = {job.worker: is_real(job.spec.search.seed) for job in self._site.store.page(state=JobState.running).jobs}
         pids = [pid for pid in self._site.processes()["attack worker"] if worker_name_of(pid) in busy]
         pids = [pid for pid in pids if busy.get(worker_name_of(pid))] or pids
         if not pids:
@@ -232,7 +229,7 @@ class Mischief:
         pid = self._random.choice(pids)
         self.tell(f"SIGSTOP {worker_name_of(pid)} {pid}, of {pids}; running: {self._running()}")
         os.kill(pid, signal.SIGSTOP)
-        self.deeds["attack worker frozen"] += 1
+        self.counts["attack worker frozen"] += 1
         try:
             time.sleep(seconds)
         finally:
@@ -244,17 +241,17 @@ class Mischief:
             jobs = self._site.store.page(state=JobState.running, limit=20).jobs
         except Exception as error:
             return f"unknown ({type(error).__name__})"
-        return ", ".join(f"{job.spec.seed} ({job.progress.phase}) by {job.worker}" for job in jobs) or "nothing"
+        return ", ".join(f"{job.spec.search.seed} ({job.progress.phase}) by {job.worker}" for job in jobs) or "nothing"
 
     @contextmanager
-    def every(self, pause: float, deed: Callable[[], None]) -> Iterator[None]:
-        """Do it again and again during the block, with so many seconds in between."""
+    def every(self, pause: float, fault: Callable[[], None]) -> Iterator[None]:
+        """Inject ``fault`` every ``pause`` seconds during the block."""
         stop = threading.Event()
 
         def repeat() -> None:
             while not stop.wait(pause):
                 try:
-                    deed()
+                    fault()
                 except Exception as error:
                     self.tell(f"FAILED: {type(error).__name__}: {error}")
 
@@ -269,20 +266,20 @@ class Mischief:
 
 @dataclass(frozen=True)
 class Run:
-    """What came of the jobs of one run: each with its history and, by name, the digests of its artifacts."""
+    """Jobs of one run with their events and the digests of their artifacts."""
 
     jobs: Mapping[int, Job]
     events: Mapping[int, Sequence[Event]]
     digests: Digests
     seconds: float
     repeated: int
-    """Phases of pretending jobs that were begun more than once."""
+    """Phases of fake jobs started more than once."""
     left: int
-    """Files that jobs left in the store beside their artifacts."""
+    """Files left in the store besides the artifacts."""
 
     @property
     def figures(self) -> dict[str, Any]:
-        """The run in a few numbers."""
+        """Summary of the run."""
         moved = [job for job in self.jobs.values() if job.attempts > 1]
         most = max(job.attempts for job in self.jobs.values())
         return {
@@ -290,7 +287,7 @@ class Run:
             "seconds": round(self.seconds, 1),
             "ended": dict(Counter(job.state.value for job in self.jobs.values())),
             "jobs taken up again": len(moved),
-            "attacks among them": sum(is_real(job.spec.seed) for job in moved),
+            "attacks among them": sum(is_real(job.spec.search.seed) for job in moved),
             "attempts beyond the first": sum(job.attempts - 1 for job in moved),
             "most attempts": most,
             "phases begun again": self.repeated,
@@ -299,7 +296,7 @@ class Run:
 
 
 class Submission:
-    """Jobs that are handed in one after the other, ``pause`` seconds apart, while other things happen."""
+    """Submits jobs in a thread, ``pause`` seconds apart."""
 
     def __init__(self, site: Site, count: int, *, pause: float) -> None:
         self._site, self._count, self._pause = site, count, pause
@@ -319,7 +316,7 @@ class Submission:
             self._error = error
 
     def ended(self) -> int:
-        """How many have ended; fewer while the database cannot say."""
+        """Number of ended jobs; 0 while the database is away."""
         if self._error is not None:
             raise self._error
         with suppress(Exception):
@@ -328,21 +325,21 @@ class Submission:
         return 0
 
     def wait(self, *, seconds: float, story: Callable[[], str] = str) -> None:
-        """Return once all were submitted and have ended."""
+        """Wait until all are submitted and have ended."""
         wait_until(lambda: self.ended() >= self._count, seconds=seconds, story=story)
         self._thread.join()
         self.seconds = time.monotonic() - self._started
 
     def run(self) -> Run:
-        """What came of them, as the API tells it."""
+        """The jobs as reported by the API."""
         with self._site.client() as client:
             handles = list(client.jobs(labels={"run": "chaos"}))
             assert sorted(handle.id for handle in handles) == sorted(self._ids), (
                 "there are more or fewer than submitted"
             )
-            jobs = {handle.status.spec.seed: handle.status for handle in handles}
-            digests = {handle.status.spec.seed: self._digests(handle) for handle in handles}
-        events = {number: self._site.store.events(job.id) for number, job in jobs.items()}  # a client stops at the end
+            jobs = {handle.status.spec.search.seed: handle.status for handle in handles}
+            digests = {handle.status.spec.search.seed: self._digests(handle) for handle in handles}
+        events = {number: self._site.store.events(job.id) for number, job in jobs.items()}  # a client stops early
         repeated = sum(self._repeated(job) for job in jobs.values())
         return Run(jobs, events, digests, self.seconds, repeated, sum(self._left(job) for job in jobs.values()))
 
@@ -360,7 +357,7 @@ class Submission:
 
 
 def without_times(file: Path) -> bytes:
-    """The bytes of an artifact; of a report, those of all that does not tell how long things took."""
+    """Bytes of an artifact; of result.json without the seconds."""
     if file.name != "result.json":
         return file.read_bytes()
     result = json.loads(file.read_bytes())
@@ -369,7 +366,7 @@ def without_times(file: Path) -> bytes:
 
 
 def check_history(job: Job, events: Sequence[Event]) -> str | None:
-    """What is wrong with the history of a job; ``None`` where it was taken up, given back and ended as it should."""
+    """The fault in the history of a job, or ``None``."""
     if [event.id for event in events] != list(range(1, len(events) + 1)):
         return f"its events are numbered {[event.id for event in events]}"
     letters = "".join(_letter(event) for event in events)
@@ -381,16 +378,16 @@ def check_history(job: Job, events: Sequence[Event]) -> str | None:
 
 
 def _letter(event: Event) -> str:
-    """q: waits, s: is taken up by a worker, r: runs, f: has ended."""
+    """q: queued, s: started, r: running, f: ended."""
     if event.state.final:
         return "f"
     if event.state is JobState.queued:
         return "q"
-    return "s" if event.message is not None and event.message.startswith(("started", "goes on with")) else "r"
+    return "s" if event.message is not None and event.message.startswith(("started", "continued by")) else "r"
 
 
 def process_table() -> dict[int, int]:
-    """The parent of each living process."""
+    """Parent of each living process."""
     table = {}
     for entry in Path("/proc").iterdir():
         with suppress(FileNotFoundError, ProcessLookupError, ValueError):
@@ -410,26 +407,19 @@ def ancestry(pid: int, table: Mapping[int, int]) -> Iterator[int]:
 
 
 def kind_of(pid: int) -> str | None:
-    """What a process of ours is; ``None`` where it is something else."""
+    """Kind of one of our processes; ``None`` for others."""
     with suppress(FileNotFoundError, ProcessLookupError, PermissionError):
         words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
-        if "trompe_server.jobs.leash" in words:
-            return KINDS.get(words[words.index("trompe_server.jobs.leash") + 1])
+        if CHILD[-1] in words:
+            return KINDS.get(words[words.index(CHILD[-1]) + 1])
     return None
 
 
 def worker_name_of(pid: int) -> str | None:
-    """The name of an attack worker, by the lock file that it holds."""
+    """Name of an attack worker, from its lock file."""
     with suppress(FileNotFoundError, ProcessLookupError, PermissionError):
         for entry in Path(f"/proc/{pid}/fd").iterdir():
             file = Path(os.readlink(entry))
             if slot := re.fullmatch(r"worker-(\d+)\.lock", file.name):
-                return f"{socket.gethostname()}-{slot[1]}-{file.read_text().strip()}"
+                return f"{socket.gethostname()}-{slot[1]}-{file.with_suffix('.token').read_text()}"
     return None
-
-
-def free_port() -> int:
-    """A port that nobody listens on."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port: int = free.getsockname()[1]
-        return port

@@ -1,14 +1,14 @@
-"""What the workers of the failure run do: for a job of one step something short, for the others a real attack."""
+"""Jobs of the chaos tests: a fake job for one step, a real attack for more."""
 
 from typing import Any
 
-from trompe_server.attack_job import open_pipeline as open_attack
-from trompe_server.jobs.fake import open_pipeline as open_fake
-from trompe_server.pipeline import Pipeline
+from tests.fake_job import open_job as open_fake
+from trompe_server.job.protocol import PhasedJob
+from trompe_server.job.texture_attack import open_job as open_attack
 from trompe_shared.api import JobSpec
 
 
-def open_pipeline(spec: JobSpec, **parts: Any) -> Pipeline:
-    """See ``trompe_server.attack_job.open_pipeline``."""
-    pipeline: Pipeline = open_fake(spec, **parts) if spec.steps == 1 else open_attack(spec, **parts)
-    return pipeline
+def open_job(spec: JobSpec, **parts: Any) -> PhasedJob:
+    """Open a job, with the arguments of ``trompe_server.job.texture_attack.open_job``."""
+    job: PhasedJob = open_fake(spec, **parts) if spec.search.steps == 1 else open_attack(spec, **parts)
+    return job

@@ -1,26 +1,26 @@
-"""What the tests of the service share: databases of both kinds, and worker processes that run fake pipelines."""
+"""Databases of both kinds, and worker processes with fake jobs."""
 
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from postgres import Postgres, find_programs
-from processes import Service, listening
 
-from trompe_server.jobs.store import JobStore
+from tests.service.postgres import Postgres, find_programs
+from tests.service.processes import Service, listening
+from trompe_server.queue.store import JobStore
 from trompe_server.settings import Settings
 
 
 @pytest.fixture(scope="session")
 def shared_postgres() -> Iterator[Any]:
-    """A PostgreSQL that all tests share, each in a database of its own."""
+    """A PostgreSQL shared by all tests, each in its own database."""
     yield from _running()
 
 
 @pytest.fixture
 def postgres() -> Iterator[Any]:
-    """A PostgreSQL that a test has for itself, to stop it."""
+    """A PostgreSQL for one test, which may stop it."""
     yield from _running()
 
 
@@ -38,7 +38,7 @@ def _running() -> Iterator[Any]:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """The URL of an empty database; a test that asks for it runs once on each kind."""
+    """The URL of an empty database; a test runs once on each kind."""
     if request.param == "sqlite":
         return f"sqlite:///{tmp_path / 'trompe.sqlite'}"
     url: str = request.getfixturevalue("shared_postgres").database()
@@ -56,14 +56,14 @@ def store(database_url: str) -> Iterator[JobStore]:
 
 @pytest.fixture
 def renderer() -> Iterator[int]:
-    """The port of something that plays a renderer for fake pipelines."""
+    """The port of a listener that passes for a renderer."""
     with listening() as port:
         yield port
 
 
 @pytest.fixture
 def service(database_url: str, tmp_path: Path, renderer: int) -> Iterator[Any]:
-    """A service whose workers count as dead after two seconds of silence; on each kind of database."""
+    """A service on each kind of database. Workers count as dead after two seconds without a heartbeat."""
     service = Service(Settings(data=tmp_path, database=database_url, silence=2.0), renderer)
     yield service
-    service.close()
+    service.store.close()

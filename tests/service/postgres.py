@@ -1,21 +1,22 @@
-"""A PostgreSQL of our own for the tests: a private cluster on a free port, which can be stopped and started again."""
+"""A private PostgreSQL cluster on a free port, which tests can stop and restart."""
 
 import os
 import pwd
 import secrets
 import shutil
-import socket
 import subprocess
 import tempfile
 from pathlib import Path
 
 import psycopg
 
+from tests.served import free_port
+
 OPTIONS = "-c fsync=off -c full_page_writes=off -c max_connections=200"
 
 
 def find_programs() -> Path | None:
-    """The newest folder that has initdb."""
+    """The newest folder with initdb."""
     found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda each: int(each.parts[-3]))
     if found:
         return found[-1].parent
@@ -24,7 +25,7 @@ def find_programs() -> Path | None:
 
 
 class Postgres:
-    """A cluster in a temporary folder. It must not run as root, so that root borrows the user nobody for it."""
+    """A cluster in a temporary folder. PostgreSQL refuses to run as root, so root runs it as nobody."""
 
     def __init__(self, programs: Path) -> None:
         self._programs = programs
@@ -32,8 +33,7 @@ class Postgres:
         self.folder = Path(tempfile.mkdtemp(prefix="trompe-pg-"))
         if self._user is not None:
             os.chown(self.folder, pwd.getpwnam(self._user).pw_uid, -1)
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.port = free.getsockname()[1]
+        self.port = free_port()
         self._do("initdb", "--username=trompe", "--auth=trust", "--encoding=UTF8", "--no-sync", "-D", self._data)
 
     @property
@@ -45,7 +45,7 @@ class Postgres:
         self._do("pg_ctl", "start", "--wait", "-D", self._data, "-l", str(self.folder / "log"), "-o", options)
 
     def stop(self) -> None:
-        """Stop at once, as a crash would: connections are cut, nobody is waited for."""
+        """Stop at once and cut connections, like a crash."""
         self._do("pg_ctl", "stop", "--wait", "--mode=immediate", "-D", self._data)
 
     def database(self) -> str:

@@ -1,69 +1,54 @@
-"""Real attack workers that run fake pipelines, and the API's side of what they work on."""
+"""Real attack workers with fake jobs, and the API's side of their queue."""
 
 import os
 import signal
 import socket
 import subprocess
-import sys
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Final
 
-from trompe_server.artifacts import JobArtifacts, job_artifacts, open_folder
-from trompe_server.jobs.store import JobStore
-from trompe_server.jobs.worker import prepare_data
+from tests.served import CHILD, FAKE, Queue, wait_until
+from trompe_server.executor.worker import prepare_data
 from trompe_server.settings import Settings
-from trompe_shared.api import Job, JobRequest, JobState
+from trompe_server.storage.folders import JobArtifacts, job_artifacts, open_folder
+from trompe_shared.api import Job, JobState
+from trompe_shared.sailenv import COMMANDS, LIGHT_NOT_FOUND, REGISTER
 
-FAKE = "trompe_server.jobs.fake:open_pipeline"
-
-
-def wait_until(condition: Callable[[], Any], *, seconds: float = 60.0, story: Callable[[], str] = str) -> Any:
-    """What ``condition`` returns once it is true; fails after ``seconds`` with ``story``."""
-    deadline = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < deadline, f"waited {seconds:.0f} s in vain\n{story()}"
-        time.sleep(0.02)
-    return value
+REGISTER_BYTES: Final = len(REGISTER.encode_request(width=1, height=1, gzip=False))
 
 
 @contextmanager
 def listening() -> Iterator[int]:
-    """A port that accepts connections and never says anything: enough of a renderer for a fake pipeline."""
+    """A port with a SAILenv renderer that answers the handshake alone: renderer enough for fake jobs."""
     with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=_greet, args=(server,), daemon=True)
+        thread.start()
         yield server.getsockname()[1]
+        server.shutdown(socket.SHUT_RDWR)
+        thread.join()
 
 
-@contextmanager
-def serving(
-    data: Path, *options: str, log: Path, environment: Mapping[str, str]
-) -> Iterator[tuple["subprocess.Popen[str]", str]]:
-    """``trompe serve`` for the time of the block: its process, and its URL. What it says goes to ``log``."""
-    command = [sys.executable, "-m", "trompe_server.jobs.leash", "serve", "--port", "0", "--data", str(data), *options]
-    pipe, own = subprocess.PIPE, os.environ | environment
-    with (
-        log.open("wb") as words,
-        subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=words, text=True, env=own) as process,
-    ):
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        assert line.startswith("trompe serving on http://127.0.0.1:"), log.read_text()
-        try:
-            yield process, line.split()[-1]
-        finally:
-            process.terminate()
+def _greet(server: socket.socket) -> None:
+    with suppress(OSError):
+        while True:
+            connection, _ = server.accept()
+            with connection, connection.makefile("rb") as stream, suppress(OSError):
+                if stream.read(REGISTER_BYTES):
+                    connection.sendall(REGISTER.encode_reply(0, []))
+                if stream.read(1):
+                    connection.sendall(COMMANDS["get_light_type"].encode_reply(LIGHT_NOT_FOUND))
 
 
 class WorkerProcess:
-    """A worker of ``settings``, whose log goes to a file."""
+    """A worker of ``settings`` with its log in a file."""
 
     def __init__(self, settings: Settings, renderers: list[str], **environment: str) -> None:
         self.log = settings.data / f"worker-{time.monotonic_ns()}.log"
         settings.data.mkdir(parents=True, exist_ok=True)
-        own = {
-            "TROMPE_PIPELINE": FAKE,
+        own = FAKE | {
             "TROMPE_DATA": str(settings.data),
             "TROMPE_DATABASE": settings.database_url,
             "TROMPE_STORE": settings.store_url,
@@ -71,7 +56,7 @@ class WorkerProcess:
         }
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "trompe_server.jobs.leash", "worker", *renderers],
+                [*CHILD, "worker", *renderers],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
@@ -94,7 +79,7 @@ class WorkerProcess:
         return self.process.wait(60)
 
     def words(self) -> str:
-        """What the process has said on standard error."""
+        """Standard error of the process so far."""
         return self.log.read_text()
 
     def close(self) -> None:
@@ -105,46 +90,33 @@ class WorkerProcess:
             pipe.close()
 
 
-class Service:
-    """The API's side, and workers on demand."""
+class Service(Queue):
+    """A queue with workers on demand."""
 
     def __init__(self, settings: Settings, renderer: int) -> None:
-        self.settings, self.renderer = settings, renderer
         prepare_data(settings)
-        self.store = JobStore(settings.database_url)
+        super().__init__(settings)
+        self.renderer = renderer
 
     @contextmanager
     def worker(self, *, renderers: list[str] | None = None, **environment: str) -> Iterator[WorkerProcess]:
-        """A worker that takes jobs, for the time of the block."""
+        """A running worker."""
         running = WorkerProcess(self.settings, renderers or ["--renderer", f"127.0.0.1:{self.renderer}"], **environment)
         try:
             yield running.ready()
         finally:
             running.close()
 
-    def submit(self, label: str, **options: Any) -> str:
-        request = JobRequest.model_validate({"object": "mug", "label": label} | options)
-        return self.store.create(request)[0].id
+    def kill_worker_in_gate(self, job: str) -> None:
+        """Start a worker and kill it in the middle of ``job``."""
+        with self.worker() as running:
+            wait_until(lambda: self.in_gate(job))
+            running.end(signal.SIGKILL)
+        assert self.state(job).state is JobState.running
 
-    def state(self, job: str) -> JobState:
-        return self.store.get(job).state
-
-    def ended(self, job: str, *, seconds: float = 60.0) -> Job:
-        wait_until(lambda: self.state(job).final, seconds=seconds)
-        return self.store.get(job)
+    def ended(self, job: str) -> Job:
+        wait_until(lambda: self.state(job).state.final)
+        return self.state(job)
 
     def artifacts(self, job: str) -> JobArtifacts:
         return job_artifacts(open_folder(self.settings.store_url), job)
-
-    def folder(self, job: str) -> Path:
-        return Path(self.settings.store_url) / "jobs" / job
-
-    def in_gate(self, job: str) -> bool:
-        found = self.store.get(job)
-        return found.state is JobState.running and found.progress.phase == "attack-001"
-
-    def open_gate(self, job: str) -> None:
-        (self.folder(job) / "go").touch()
-
-    def close(self) -> None:
-        self.store.close()

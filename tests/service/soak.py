@@ -1,43 +1,43 @@
-"""A watch over a running service: what its processes hold and its folder takes, sample by sample; and what grows."""
+"""Samples of the memory, handles, threads and files of a running service, and their trends."""
 
 import csv
 import os
-import subprocess
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
-from chaos import KINDS, ancestry, kind_of, process_table
 from numpy.typing import ArrayLike
-from processes import serving
+
+from tests.served import Served
+from tests.service.chaos import KINDS, ancestry, kind_of, process_table
 
 MIB: Final = 2**20
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 ALLOWED: Final = {"MiB": (0.05, 16.0), "handles": (0.0, 3.0), "threads": (0.0, 3.0), "files": (0.05, 20.0)}
-"""By its unit, how much a quantity may seem to grow in all: a share of its median, and so much more."""
+"""Allowed total growth by unit: a share of the median, and an absolute amount."""
 LEAST_SAMPLES: Final = 20
 PASSING: Final = ("data/jobs", "data/library/calibrations")
-"""What retention deletes."""
+"""Folders cleared by retention."""
 
 Row = dict[str, float]
 
 
-@dataclass(frozen=True)
-class Soaked:
-    """A running ``trompe serve``; ``folder`` holds its data and what it keeps for the moment."""
+class Soaked(Served):
+    """A ``trompe serve`` that deletes jobs ``kept`` seconds after their end. ``home`` has its data and TMPDIR."""
 
-    process: "subprocess.Popen[str]"
-    url: str
-    folder: Path
-    log: Path
+    def __init__(self, folder: Path, *, kept: float) -> None:
+        self.home = folder / "service"
+        (self.home / "tmp").mkdir(parents=True)
+        own = {"TMPDIR": str(self.home / "tmp"), "TROMPE_RETENTION_DAYS": str(kept / 86_400)}
+        super().__init__(self.home / "data", environment=own)
 
     def processes(self) -> dict[str, list[int]]:
-        """Ids of its processes by what they are, without those that read one upload and end."""
+        """Ids of its processes by kind, without the short-lived readers of uploads."""
         table = process_table()
         found: dict[str, list[int]] = {kind: [] for kind in KINDS.values()}
         for pid in sorted(table):
@@ -48,7 +48,7 @@ class Soaked:
         return found
 
     def sample(self) -> Row:
-        """What it takes now, by process and quantity."""
+        """Current sample: values by process and unit."""
         row: Row = {}
         for kind, pids in self.processes().items():
             held = [_held(pid) for pid in pids]
@@ -58,26 +58,16 @@ class Soaked:
         return row
 
     def passing(self) -> list[int]:
-        """Bytes of each file that is there for a time only: more where more was done of late."""
-        return [size for place in PASSING for size in _sizes(self.folder / place)]
+        """Sizes of the files deleted by retention."""
+        return [size for place in PASSING for size in _sizes(self.home / place)]
 
     def _lasting(self) -> list[int]:
-        """Bytes of each other file."""
-        return _sizes(self.folder, without=[self.folder / place for place in PASSING])
-
-
-@contextmanager
-def soaking(folder: Path, *, kept: float) -> Iterator[Soaked]:
-    """A service that deletes jobs which ended more than ``kept`` seconds ago."""
-    home, log = folder / "service", folder / "serve.log"
-    (home / "moment").mkdir(parents=True)
-    own = {"TMPDIR": str(home / "moment"), "TROMPE_RETENTION_DAYS": str(kept / 86_400)}
-    with serving(home / "data", log=log, environment=own) as (process, url):
-        yield Soaked(process, url, home, log)
+        """Sizes of the other files."""
+        return _sizes(self.home, without=[self.home / place for place in PASSING])
 
 
 class Watch:
-    """Takes a sample of ``service`` every so many seconds, for the time of the block, and writes each to ``file``."""
+    """Samples ``service`` every ``every`` seconds during the block, and writes the samples to ``file``."""
 
     def __init__(self, service: Soaked, file: Path, *, every: float) -> None:
         self._service, self._file, self._every = service, file, every
@@ -108,7 +98,7 @@ class Watch:
 
 @dataclass(frozen=True)
 class Trend:
-    """How one quantity went: its ``median``, what it ``grew`` in all, and how much of that is ``allowed``."""
+    """Trend of one quantity: its median, its total growth and the allowed growth."""
 
     name: str
     median: float
@@ -117,7 +107,7 @@ class Trend:
 
     @property
     def flat(self) -> bool:
-        """Whether it stayed as it was."""
+        """Whether it did not grow."""
         return self.grew <= self.allowed
 
     def __str__(self) -> str:
@@ -126,9 +116,9 @@ class Trend:
 
 
 def trends(rows: Sequence[Row], *, warm: float) -> list[Trend]:
-    """The trend of each quantity from ``warm`` seconds on, but for what passes."""
+    """Trends from ``warm`` seconds on, without the files deleted by retention."""
     used = [row for row in rows if row["seconds"] >= warm]
-    assert len(used) >= LEAST_SAMPLES, f"{len(used)} samples after the warm-up tell nothing; soak for longer"
+    assert len(used) >= LEAST_SAMPLES, f"{len(used)} samples after the warm-up are too few; soak for longer"
     times = [row["seconds"] for row in used]
     return [
         trend(name, times, [row[name] for row in used])
@@ -138,25 +128,22 @@ def trends(rows: Sequence[Row], *, warm: float) -> list[Trend]:
 
 
 def trend(name: str, times: ArrayLike, values: ArrayLike) -> Trend:
-    """The trend of one quantity, which is named ``... UNIT``.
-
-    Growth is the median slope (Theil and Sen) times the time: what is just running, or just open, does not count.
-    """
+    """Trend of the quantity ``... UNIT``. Growth is the median slope (Theil-Sen) times the time, robust to peaks."""
     run, rise = (np.subtract.outer(*[np.asarray(each, float)] * 2) for each in (times, values))
     grew = float(np.median(rise[run > 0] / run[run > 0]) * run.max())
     share, more = ALLOWED[name.split()[-1]]
-    median = float(np.median(values))
+    median = float(np.median(np.asarray(values, float)))
     return Trend(name, median, grew, share * median + more)
 
 
 def _reads_an_upload(pid: int) -> bool:
     with suppress(OSError):
-        return b"trompe_server.sandbox" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        return b"trompe_server.system.sandbox" in Path(f"/proc/{pid}/cmdline").read_bytes()
     return True
 
 
 def _held(pid: int) -> Row:
-    """What a process holds; nothing where it has just ended."""
+    """Resources of a process; zeros if it has ended."""
     folder = Path("/proc", str(pid))
     with suppress(OSError):
         resident = int((folder / "statm").read_text().split()[1]) * PAGE
@@ -166,7 +153,7 @@ def _held(pid: int) -> Row:
 
 
 def _sizes(folder: Path, *, without: Sequence[Path] = ()) -> list[int]:
-    """Bytes of each file below ``folder`` and not below ``without``; files come and go meanwhile."""
+    """Sizes of the files below ``folder`` but not below ``without``."""
     sizes: list[int] = []
     for place, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if Path(place, name) not in without]
@@ -177,5 +164,5 @@ def _sizes(folder: Path, *, without: Sequence[Path] = ()) -> list[int]:
 
 
 def summary(found: Sequence[Trend], counts: dict[str, Any]) -> str:
-    """What was done, and all trends, a line each."""
+    """Counts of the actions and all trends, a line each."""
     return "\n".join([str(counts), *map(str, found)])

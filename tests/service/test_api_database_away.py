@@ -1,4 +1,4 @@
-"""The API while PostgreSQL is away: 503 at once, nothing lost, and all is well when it is back."""
+"""The API while PostgreSQL is away: 503 at once, and nothing lost when it is back."""
 
 import asyncio
 from collections.abc import Iterator
@@ -8,16 +8,16 @@ from typing import Any
 import httpx
 import pytest
 
-from trompe_server.access import Right, Tokens
 from trompe_server.api import guard
 from trompe_server.api.services import Services
-from trompe_server.app import create_app
-from trompe_server.artifacts import open_folder
-from trompe_server.jobs.store import JobStore
 from trompe_server.library import Library
+from trompe_server.queue.store import JobStore
+from trompe_server.service.app import create_app
 from trompe_server.settings import Settings
+from trompe_server.storage.folders import open_folder
+from trompe_server.storage.tokens import Right, Tokens
 
-JOB = {"object": "mug", "label": "mug"}
+JOB = {"object": "mug", "goal": {"label": "mug"}}
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
-"""The failure run: while jobs are handed in, processes are killed, frozen and stopped; all jobs end as if nothing were.
+"""Chaos tests: processes are killed, frozen and stopped while jobs run; all jobs end with the same bytes as without.
 
-Everything is real: processes, databases, renderers, the client, and one job of 12 is an attack. What is killed when is
-drawn from a seed, and each failure tells it.
+Everything is real: processes, databases, renderers, the client, and one in 12 jobs is an attack. A seed draws the
+faults, and each failure prints it.
 """
 
 import logging
@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from chaos import Digests, Mischief, Run, Site, Submission, check_history, is_real
 
+from tests.service.chaos import Digests, Faults, Run, Site, Submission, check_history, is_real
 from trompe_shared.api import JobState
 
 pytestmark = pytest.mark.chaos
@@ -22,9 +22,9 @@ pytestmark = pytest.mark.chaos
 logger = logging.getLogger(__name__)
 
 PATIENCE = 1800.0
-"""Seconds that a run may take on a machine that is busy with other things."""
+"""Time limit of a run on a busy machine, seconds."""
 SILENCE = 6.0
-"""Seconds after which a worker counts as dead."""
+"""Seconds without a heartbeat after which a worker counts as dead."""
 FEW = 40
 """Jobs of a short run."""
 
@@ -33,20 +33,20 @@ OpenSite = Callable[..., AbstractContextManager[Site]]
 
 @pytest.fixture(autouse=True)
 def _quiet(caplog: pytest.LogCaptureFixture) -> None:
-    """What the client asks is no part of the story."""
+    """Keep the client's requests out of the log."""
     caplog.set_level(logging.WARNING, "httpx")
 
 
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Digests]:
-    """What comes of so many jobs when nothing happens."""
+    """Digests of the first ``count`` jobs without faults."""
     known: dict[int, Digests] = {}
 
     def digests(count: int) -> Digests:
         if count not in known:
             folder = tmp_path_factory.mktemp("undisturbed")
             url = f"sqlite:///{folder / 'trompe.sqlite'}"
-            with Site(folder, url, scattered=False, silence=60, dawdle=0) as site:
+            with Site(folder, url, scattered=False, silence=60, phase_seconds=0) as site:
                 submission = Submission(site, count, pause=0)
                 submission.wait(seconds=PATIENCE, story=site.log)
                 known[count] = submission.run().digests
@@ -57,61 +57,61 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Dig
 
 @pytest.fixture
 def open_site(database_url: str, tmp_path: Path) -> OpenSite:
-    """Starts a service: on SQLite `trompe serve` with its children, on PostgreSQL each process by itself."""
+    """Starts a service: `trompe serve` with children on SQLite, separate processes on PostgreSQL."""
     return lambda **options: Site(
         tmp_path, database_url, scattered=database_url.startswith("postgres"), **{"silence": SILENCE} | options
     )
 
 
-def check(run: Run, undisturbed: Digests, mischief: Mischief, site: Site) -> None:
-    """Every job succeeded, ended once, and made what it makes when nothing happens."""
-    figures = run.figures | dict(mischief.deeds) | {"tracebacks": site.said("Traceback (most recent call last)")}
+def check(run: Run, undisturbed: Digests, faults: Faults, site: Site) -> None:
+    """Check that every job succeeded, ended once and made the same bytes as without faults."""
+    figures = run.figures | dict(faults.counts) | {"tracebacks": site.said("Traceback (most recent call last)")}
     logger.info("the run in figures: %s", figures)
     wrong = {
         number: [event.message for event in run.events[number] if event.message]
         for number, job in run.jobs.items()
         if job.state is not JobState.succeeded
     }
-    assert not wrong, f"not all succeeded: {wrong}\n{mischief.story()}"
+    assert not wrong, f"not all succeeded: {wrong}\n{faults.story()}"
     histories = {number: check_history(job, run.events[number]) for number, job in run.jobs.items()}
-    assert not any(histories.values()), f"{ {k: v for k, v in histories.items() if v} }\n{mischief.story()}"
+    assert not any(histories.values()), f"{ {k: v for k, v in histories.items() if v} }\n{faults.story()}"
     assert run.jobs.keys() == undisturbed.keys()
     for number, expected in undisturbed.items():
         other = {
             name for name in {*expected, *run.digests[number]} if expected.get(name) != run.digests[number].get(name)
         }
-        assert not other, f"job {number} (real: {is_real(number)}) made other {sorted(other)}\n{mischief.story()}"
+        assert not other, f"job {number} (real: {is_real(number)}) made other {sorted(other)}\n{faults.story()}"
 
 
 def survive(
-    site: Site, mischief: Mischief, expected: Digests, *, meanwhile: AbstractContextManager[None], pause: float
+    site: Site, faults: Faults, expected: Digests, *, meanwhile: AbstractContextManager[None], pause: float
 ) -> Run:
-    """Hand in jobs, one every ``pause`` seconds; from the first to the end of the last one things happen."""
+    """Submit jobs every ``pause`` seconds, with faults until the last one has ended."""
     with meanwhile:
         submission = Submission(site, len(expected), pause=pause)
-        submission.wait(seconds=PATIENCE, story=mischief.story)
+        submission.wait(seconds=PATIENCE, story=faults.story)
     run = submission.run()
-    check(run, expected, mischief, site)
+    check(run, expected, faults, site)
     return run
 
 
 def survive_kills(open_site: OpenSite, expected: Digests, *, every: float, seed: int) -> None:
-    """A process is killed every few seconds until all jobs have ended."""
-    with open_site(dawdle=0.3) as site:
-        mischief = Mischief(site, seed=seed)
-        survive(site, mischief, expected, meanwhile=mischief.every(every, mischief.kill), pause=0.5)
-        assert mischief.deeds.total() >= 5, mischief.story()
+    """Kill a process every few seconds until all jobs have ended."""
+    with open_site(phase_seconds=0.3) as site:
+        faults = Faults(site, seed=seed)
+        survive(site, faults, expected, meanwhile=faults.every(every, faults.kill), pause=0.5)
+        assert faults.counts.total() >= 5, faults.story()
 
 
-def survive_freezing(open_site: OpenSite, expected: Digests, *, beyond: float, dawdle: float, seed: int) -> None:
-    """One worker after the other is frozen, for so long beyond the limit that its job goes to another."""
-    with open_site(dawdle=dawdle, silence=4.0) as site:
-        mischief = Mischief(site, seed=seed)
-        freezing = mischief.every(1.0, lambda: mischief.freeze(seconds=4.0 + beyond))
-        run = survive(site, mischief, expected, meanwhile=freezing, pause=dawdle)
+def survive_freezing(open_site: OpenSite, expected: Digests, *, beyond: float, phase_seconds: float, seed: int) -> None:
+    """Freeze one worker after another, so long that its job goes to another worker."""
+    with open_site(phase_seconds=phase_seconds, silence=4.0) as site:
+        faults = Faults(site, seed=seed)
+        freezing = faults.every(1.0, lambda: faults.freeze(seconds=4.0 + beyond))
+        run = survive(site, faults, expected, meanwhile=freezing, pause=phase_seconds)
         reasons = [event.message or "" for events in run.events.values() for event in events]
-        assert any("has been silent for" in reason for reason in reasons), f"nobody lost a job\n{mischief.story()}"
-        assert site.said("goes on elsewhere"), f"nobody noticed\n{mischief.story()}"
+        assert any("sent no heartbeat for" in reason for reason in reasons), f"nobody lost a job\n{faults.story()}"
+        assert site.said("was lost"), f"nobody noticed\n{faults.story()}"
 
 
 @pytest.mark.timeout(PATIENCE)
@@ -121,7 +121,7 @@ def test_jobs_end_once_and_alike_whoever_is_killed(open_site: OpenSite, undistur
 
 @pytest.mark.timeout(PATIENCE)
 def test_workers_that_were_frozen_do_no_harm(open_site: OpenSite, undisturbed: Callable[[int], Digests]) -> None:
-    survive_freezing(open_site, undisturbed(FEW), beyond=8.0, dawdle=0.5, seed=3)
+    survive_freezing(open_site, undisturbed(FEW), beyond=8.0, phase_seconds=0.5, seed=3)
 
 
 @pytest.mark.timeout(PATIENCE)
@@ -129,25 +129,25 @@ def test_nothing_is_lost_while_postgresql_is_away(
     postgres: Any, tmp_path: Path, undisturbed: Callable[[int], Digests]
 ) -> None:
     expected = undisturbed(FEW)
-    with Site(tmp_path, postgres.database(), scattered=True, silence=SILENCE, dawdle=0.3) as site:
-        mischief = Mischief(site, seed=0)
-        run = survive(site, mischief, expected, meanwhile=away(postgres, mischief, seconds=10.0), pause=0.7)
-        assert mischief.deeds["PostgreSQL stopped"] == 1
-        assert {job.attempts for job in run.jobs.values()} == {1}, f"nobody had died\n{mischief.story()}"
+    with Site(tmp_path, postgres.database(), scattered=True, silence=SILENCE, phase_seconds=0.3) as site:
+        faults = Faults(site, seed=0)
+        run = survive(site, faults, expected, meanwhile=away(postgres, faults, seconds=10.0), pause=0.7)
+        assert faults.counts["PostgreSQL stopped"] == 1
+        assert {job.attempts for job in run.jobs.values()} == {1}, f"nobody had died\n{faults.story()}"
 
 
 @contextmanager
-def away(postgres: Any, mischief: Mischief, *, seconds: float) -> Iterator[None]:
-    """During the block, PostgreSQL is away for so many seconds."""
+def away(postgres: Any, faults: Faults, *, seconds: float) -> Iterator[None]:
+    """Stop PostgreSQL for ``seconds`` during the block."""
 
     def stop() -> None:
         time.sleep(5.0)
-        mischief.tell("PostgreSQL stops at once")
+        faults.tell("PostgreSQL stops at once")
         postgres.stop()
         time.sleep(seconds)
         postgres.start()
-        mischief.tell("PostgreSQL is back")
-        mischief.deeds["PostgreSQL stopped"] += 1
+        faults.tell("PostgreSQL is back")
+        faults.counts["PostgreSQL stopped"] += 1
 
     thread = threading.Thread(target=stop)
     thread.start()
@@ -168,4 +168,4 @@ def test_200_jobs_end_once_and_alike_while_a_process_is_killed_every_5_seconds(
 def test_workers_that_were_frozen_for_long_do_no_harm(
     open_site: OpenSite, undisturbed: Callable[[int], Digests]
 ) -> None:
-    survive_freezing(open_site, undisturbed(FEW), beyond=45.0, dawdle=2.0, seed=4)
+    survive_freezing(open_site, undisturbed(FEW), beyond=45.0, phase_seconds=2.0, seed=4)

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from trompe_server.artifacts import LocalArtifacts
 from trompe_server.attack import AttackState
-from trompe_server.job_files import JobFiles
-from trompe_server.pipeline import DamagedFileError
+from trompe_server.job.files import JobFiles
+from trompe_server.job.protocol import DamagedFileError
+from trompe_server.storage.folders import LocalArtifacts
 
 
 def state(step: int) -> AttackState:
@@ -47,7 +47,7 @@ def test_a_checkpoint_whose_place_a_later_one_has_taken_is_not_used(files: JobFi
 def test_a_missing_checkpoint_is_a_damaged_one(files: JobFiles) -> None:
     with pytest.raises(DamagedFileError, match="state-1"):
         files.load_state(1, step=5)
-    assert not files.has_calibration()
+    assert not files.has_calibration(0)
     with pytest.raises(DamagedFileError, match="views_before"):
         files.load("views_before")
 

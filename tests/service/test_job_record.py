@@ -1,25 +1,34 @@
-"""The record of jobs, on both databases: submit, list, take, tell, end, and never twice."""
+"""The record of jobs on both databases: submit, list, claim, report, end, and never twice."""
 
-import contextlib
-import sqlite3
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import sqlalchemy as sa
+from alembic.autogenerate import compare_metadata
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
-from trompe_server.database import write
-from trompe_server.errors import ConflictError, NotFoundError
-from trompe_server.jobs.desk import Claim, Ending, JobDesk, LostJobError
-from trompe_server.jobs.roll import WorkerRoll, take_lease
-from trompe_server.jobs.store import JobStore
-from trompe_server.jobs.tables import jobs, workers
+from trompe_server.errors import ConflictError, NotFoundError, ServiceError
+from trompe_server.queue import migrations
+from trompe_server.queue.claims import Claim, Claims, Ending, LostJobError
+from trompe_server.queue.leases import take_lease
+from trompe_server.queue.migrations import HEAD
+from trompe_server.queue.store import JobStore
+from trompe_server.queue.tables import jobs, metadata, workers
+from trompe_server.queue.workers import WorkerRegistry
+from trompe_server.storage import tokens
+from trompe_server.storage.database import write
 from trompe_shared.api import JobRequest, JobState, Progress
 from trompe_shared.errors import SpecError
 
@@ -28,19 +37,19 @@ HALF = Progress(phase="attack", fraction=0.5)
 
 
 def request(**options: Any) -> JobRequest:
-    return JobRequest.model_validate({"object": "mug", "label": "mug"} | options)
+    return JobRequest.of(**{"object": "mug", "label": "mug"} | options)
 
 
 def create(store: JobStore, **options: Any) -> str:
     return store.create(request(**options))[0].id
 
 
-def desk(store: JobStore, name: str = "w") -> JobDesk:
-    return JobDesk(store.engine, name)
+def claims_of(store: JobStore, name: str = "w") -> Claims:
+    return Claims(store.engine, name)
 
 
 def claim(store: JobStore, name: str = "w", needs: tuple[str, ...] = ("any", "cpu")) -> Claim:
-    found = desk(store, name).claim(needs)
+    found = claims_of(store, name).claim(needs)
     assert found is not None
     return found
 
@@ -51,8 +60,8 @@ def fall_silent(store: JobStore, name: str, *, seconds: float = 100.0) -> None:
         connection.execute(workers.update().where(workers.c.id == name).values(seen=workers.c.seen - seconds))
 
 
-def roll(store: JobStore, name: str) -> WorkerRoll:
-    return WorkerRoll(store.engine, name, device="cpu")
+def registry(store: JobStore, name: str) -> WorkerRegistry:
+    return WorkerRegistry(store.engine, name, device="cpu")
 
 
 def test_a_job_is_kept_as_it_was_asked_for(store: JobStore) -> None:
@@ -76,7 +85,7 @@ def test_the_same_idempotency_key_gives_the_same_job_however_many_ask_at_once(st
         made = list(pool.map(lambda _: store.create(request(), idempotency_key="k"), range(16)))
     assert len({job.id for job, _ in made}) == 1
     assert [new for _, new in made].count(True) == 1
-    with pytest.raises(ConflictError, match="'k' came with another request"):
+    with pytest.raises(ConflictError, match="'k' was used with another request"):
         store.create(request(epsilon=0.2), idempotency_key="k")
     assert store.create(request(), idempotency_key="l")[1]
 
@@ -126,69 +135,20 @@ def test_jobs_are_taken_by_priority_then_by_age(store: JobStore) -> None:
     assert order == [made["interactive"], made["normal"], later, made["sweep"]]
 
 
-@pytest.mark.parametrize(
-    ("number", "name"), [(-1, "interactive"), (11, "normal"), (100, "normal"), (500, "sweep"), (9999, "sweep")]
-)
-def test_a_priority_without_a_name_is_called_by_what_comes_no_sooner_and_holds_nobody_up(
-    store: JobStore, number: int, name: str
-) -> None:
-    odd, after = create(store), create(store, priority="sweep")
-    with write(store.engine) as connection:
-        connection.execute(jobs.update().where(jobs.c.id == odd).values(priority=number))
-    taken = [claim(store, worker).job for worker in ("v", "w")]
-    assert {job.id: job.priority for job in taken} == {odd: name, after: "sweep"}
-    assert [job.id for job in store.page().jobs] == [after, odd]
-
-
-@pytest.mark.parametrize(
-    ("change", "unknown"),
-    [
-        ({"glitter": 3}, ["glitter"]),
-        ({"loss": "of another version", "alpha": 0.02}, ["loss"]),
-        ({"glitter": 3, "loss": "of another version"}, ["glitter", "loss"]),
-    ],
-)
-def test_a_job_of_another_version_is_left_to_that_version_and_holds_nobody_up(
-    store: JobStore, change: dict[str, Any], unknown: list[str]
-) -> None:
-    """It is shown as far as it is understood, and nothing of it is lost."""
-    foreign, after = create(store, epsilon=0.1), create(store)
-    row = jobs.c.id == foreign
-    with write(store.engine) as connection:
-        spec = connection.execute(sa.select(jobs.c.spec).where(row)).scalar_one() | change
-        connection.execute(jobs.update().where(row).values(spec=spec))
-    taking = desk(store)
-    taken = taking.claim(("any", "cpu"))
-    assert taken is not None
-    assert taken.job.id == after
-    taking.finish(taken, DONE)
-    assert taking.claim(("any", "cpu")) is None
-    shown = store.get(foreign)
-    assert store.page().jobs == [store.get(after), shown]
-    assert (shown.state, shown.spec.epsilon) == (JobState.queued, 0.1)
-    assert shown.note == f"Not understood by this version of Trompe and not shown: the options {unknown}."
-    with store.engine.connect() as connection:
-        assert connection.execute(sa.select(jobs.c.spec).where(row)).scalar_one() == spec
-    assert store.request_cancel(foreign).state == JobState.cancelled
-
-
-def test_a_worker_that_comes_back_as_an_older_version_does_not_go_on_with_what_it_no_longer_understands(
-    store: JobStore,
-) -> None:
+@pytest.mark.parametrize("change", [{"priority": 11}, {"spec": {"object": "mug", "glitter": 3}}])
+def test_a_malformed_row_is_an_error(store: JobStore, change: dict[str, Any]) -> None:
     job = create(store)
-    assert claim(store, "w").job.id == job
     with write(store.engine) as connection:
-        spec = connection.execute(sa.select(jobs.c.spec).where(jobs.c.id == job)).scalar_one() | {"glitter": 3}
-        connection.execute(jobs.update().where(jobs.c.id == job).values(spec=spec))
-    assert desk(store, "w").claim(("any", "cpu")) is None
-    assert store.get(job).state == JobState.queued
+        connection.execute(jobs.update().where(jobs.c.id == job).values(change))
+    with pytest.raises(ValidationError):
+        store.get(job)
 
 
 def test_a_worker_takes_what_it_can_serve_and_no_more(store: JobStore) -> None:
     cuda, either, cpu = (create(store, needs=needs) for needs in ("cuda", "any", "cpu"))
     assert claim(store, "c", ("any", "cpu")).job.id == either
     assert claim(store, "d", ("any", "cpu")).job.id == cpu
-    assert desk(store, "e").claim(("any", "cpu")) is None
+    assert claims_of(store, "e").claim(("any", "cpu")) is None
     assert claim(store, "f", ("any", "cuda")).job.id == cuda
 
 
@@ -197,7 +157,7 @@ def test_many_workers_take_each_job_once(store: JobStore) -> None:
     taken: list[str] = []
 
     def work(name: str) -> None:
-        mine = desk(store, name)
+        mine = claims_of(store, name)
         while (found := mine.claim(("any",))) is not None:
             taken.append(found.job.id)
             mine.finish(found, DONE)
@@ -219,7 +179,7 @@ def test_a_claim_whose_answer_was_lost_is_given_again(store: JobStore) -> None:
 def test_events_tell_the_whole_story_and_their_ids_grow_by_one(store: JobStore) -> None:
     job = create(store)
     taken = claim(store)
-    mine = desk(store)
+    mine = claims_of(store)
     threads = [threading.Thread(target=lambda: [mine.advance(taken, HALF) for _ in range(5)]) for _ in range(4)]
     for thread in threads:
         thread.start()
@@ -235,7 +195,7 @@ def test_events_tell_the_whole_story_and_their_ids_grow_by_one(store: JobStore) 
 
 def test_phases_that_are_done_are_remembered_with_their_artifacts(store: JobStore) -> None:
     job = create(store)
-    mine, taken = desk(store), claim(store)
+    mine, taken = claims_of(store), claim(store)
     mine.advance(taken, HALF, done=1, public=("a.png",))
     mine.advance(taken, HALF, done=2, public=("a.png", "b.png"))
     mine.give_back(taken)
@@ -246,10 +206,10 @@ def test_phases_that_are_done_are_remembered_with_their_artifacts(store: JobStor
 
 def test_whoever_lost_a_job_can_write_nothing_more(store: JobStore) -> None:
     job = create(store)
-    roll(store, "frozen").arrive()
-    frozen, old = desk(store, "frozen"), claim(store, "frozen")
+    registry(store, "frozen").register()
+    frozen, old = claims_of(store, "frozen"), claim(store, "frozen")
     fall_silent(store, "frozen")
-    assert roll(store, "healthy").reap(30) == [job]
+    assert registry(store, "healthy").reap(30) == [job]
     new = claim(store, "healthy")
     before = store.get(job), store.events(job)
     for write_late in (
@@ -257,12 +217,12 @@ def test_whoever_lost_a_job_can_write_nothing_more(store: JobStore) -> None:
         lambda: frozen.finish(old, DONE),
         lambda: frozen.give_back(old),
     ):
-        with pytest.raises(LostJobError, match="attempt 1 of it is over"):
+        with pytest.raises(LostJobError, match=r"Attempt 1 of job .* is over"):
             write_late()
     assert (store.get(job), store.events(job)) == before
     assert not frozen.holds(old)
-    assert desk(store, "healthy").holds(new)
-    desk(store, "healthy").finish(new, DONE)
+    assert claims_of(store, "healthy").holds(new)
+    claims_of(store, "healthy").finish(new, DONE)
     with pytest.raises(LostJobError):
         frozen.finish(old, Ending(JobState.failed, error="late"))
     assert store.get(job).state is JobState.succeeded
@@ -271,9 +231,9 @@ def test_whoever_lost_a_job_can_write_nothing_more(store: JobStore) -> None:
 def test_ending_a_job_twice_is_as_good_as_once(store: JobStore) -> None:
     job = create(store)
     taken = claim(store)
-    desk(store).finish(taken, DONE)
+    claims_of(store).finish(taken, DONE)
     ended = store.get(job), store.events(job)
-    desk(store).finish(taken, DONE)
+    claims_of(store).finish(taken, DONE)
     assert (store.get(job), store.events(job)) == ended
     assert store.request_cancel(job) == ended[0]
 
@@ -281,14 +241,14 @@ def test_ending_a_job_twice_is_as_good_as_once(store: JobStore) -> None:
 def test_a_job_that_three_workers_died_of_is_failed_with_the_reason(store: JobStore) -> None:
     job = create(store)
     for _ in range(3):
-        roll(store, "w").arrive()
+        registry(store, "w").register()
         claim(store)
-    roll(store, "w").arrive()
+    registry(store, "w").register()
     found = store.get(job)
     assert (found.state, found.attempts) == (JobState.failed, 3)
     assert found.error is not None
     assert "3 workers died" in found.error
-    assert "w ended without a word" in found.error
+    assert "w died and was restarted" in found.error
     assert found.finished is not None
 
 
@@ -296,70 +256,68 @@ def test_a_job_that_gets_on_outlives_any_number_of_workers(store: JobStore) -> N
     job = create(store)
     for done in range(1, 6):
         for _ in range(2):
-            roll(store, "w").arrive()
+            registry(store, "w").register()
             taken = claim(store)
-        desk(store, "w").advance(taken, Progress(phase="attack", fraction=0.1), done=done)
-    desk(store, "w").finish(taken, DONE)
+        claims_of(store, "w").advance(taken, Progress(phase="attack", fraction=0.1), done=done)
+    claims_of(store, "w").finish(taken, DONE)
     assert (store.get(job).state, store.get(job).attempts) == (JobState.succeeded, 10)
 
 
 def test_a_job_given_back_does_not_count_as_lost(store: JobStore) -> None:
     job = create(store)
     for _ in range(5):
-        desk(store).give_back(claim(store))
-    desk(store).finish(claim(store), DONE)
+        claims_of(store).give_back(claim(store))
+    claims_of(store).finish(claim(store), DONE)
     assert (store.get(job).state, store.get(job).attempts) == (JobState.succeeded, 6)
 
 
 def test_only_the_silent_lose_their_jobs(store: JobStore) -> None:
     jobs = {name: create(store) for name in ("alive", "dead", "struck off")}
     for name in jobs:
-        roll(store, name).arrive()
+        registry(store, name).register()
         claim(store, name)
     fall_silent(store, "dead")
-    roll(store, "struck off").leave()
-    assert set(roll(store, "alive").reap(30)) == {jobs["dead"], jobs["struck off"]}
+    registry(store, "struck off").unregister()
+    assert set(registry(store, "alive").reap(30)) == {jobs["dead"], jobs["struck off"]}
     assert store.get(jobs["alive"]).state is JobState.running
-    assert roll(store, "alive").reap(30) == []
+    assert registry(store, "alive").reap(30) == []
 
 
 def test_two_reapers_at_once_count_a_lost_attempt_once(store: JobStore) -> None:
     job = create(store)
-    roll(store, "dead").arrive()
+    registry(store, "dead").register()
     claim(store, "dead")
     fall_silent(store, "dead")
     with ThreadPoolExecutor(4) as pool:
-        reaped = list(pool.map(lambda number: roll(store, f"r{number}").reap(30), range(4)))
+        reaped = list(pool.map(lambda number: registry(store, f"r{number}").reap(30), range(4)))
     assert sorted(map(len, reaped)) == [0, 0, 0, 1]
-    lost = [event for event in store.events(job) if event.message and "silent" in event.message]
+    lost = [event for event in store.events(job) if event.message and "heartbeat" in event.message]
     assert len(lost) == 1
 
 
 def test_a_job_that_was_to_be_cancelled_when_its_worker_died_is_cancelled(store: JobStore) -> None:
     job = create(store)
-    roll(store, "w").arrive()
+    registry(store, "w").register()
     taken = claim(store)
     assert store.request_cancel(job).state is JobState.running
-    assert desk(store).advance(taken, HALF)
+    assert claims_of(store).advance(taken, HALF)
     fall_silent(store, "w")
-    roll(store, "other").reap(30)
+    registry(store, "other").reap(30)
     assert store.get(job).state is JobState.cancelled
 
 
 def test_workers_are_listed_with_what_they_do(store: JobStore) -> None:
-    roll(store, "a").arrive()
-    roll(store, "b").arrive()
-    roll(store, "a").beat("job1", {"attack_steps": 3, "step_seconds": 1.5})
-    roll(store, "b").beat(None, {"attack_steps": 4})
+    registry(store, "a").register()
+    registry(store, "b").register()
+    registry(store, "a").beat("job1")
+    registry(store, "b").beat(None)
     fall_silent(store, "b")
     infos = store.workers()
     assert [(info.id, info.alive, info.job, info.device) for info in infos] == [
         ("a", True, "job1", "cpu"),
         ("b", False, None, "cpu"),
     ]
-    statistics = store.statistics()
-    assert (statistics.attack_steps, statistics.step_seconds, statistics.target_renders) == (7, 1.5, 0)
-    roll(store, "b").beat(None, {})
+    registry(store, "b").beat(None)
     assert all(info.alive for info in store.workers())
 
 
@@ -376,9 +334,9 @@ def test_statistics_count_jobs_and_tell_how_long_the_oldest_waits(store: JobStor
 
 def test_only_jobs_that_have_ended_are_deleted_and_nothing_of_them_stays(store: JobStore) -> None:
     job = create(store, labels={"a": "b"})
-    with pytest.raises(ConflictError, match="only jobs that have ended"):
+    with pytest.raises(ConflictError, match="only ended jobs"):
         store.delete(job)
-    desk(store).finish(claim(store), DONE)
+    claims_of(store).finish(claim(store), DONE)
     assert store.ended_before(3600) == []
     assert store.ended_before(-1) == [job]
     store.delete(job)
@@ -400,16 +358,6 @@ def test_work_for_one_is_given_to_one_until_its_time_is_over(store: JobStore) ->
     assert take_lease(store.engine, "retention", seconds=60)
 
 
-def test_migrating_again_or_from_many_sides_changes_nothing(store: JobStore) -> None:
-    job = create(store)
-    with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda _: store.migrate(), range(4)))
-    assert store.get(job).state is JobState.queued
-
-
-Step = Callable[[], object]
-
-
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     moves=st.lists(st.sampled_from(["claim", "advance", "finish", "give back", "die", "reap", "cancel"]), max_size=25)
@@ -419,21 +367,21 @@ def test_whatever_happens_a_job_is_held_by_one_and_ends_once(store: JobStore, mo
     job = create(store)
     names = ("left", "right")
     for name in names:
-        roll(store, name).arrive()
+        registry(store, name).register()
     claims: dict[str, Claim] = {}
     endings = 0
     for number, move in enumerate(moves):
         name = names[number % 2]
-        mine, held = desk(store, name), claims.get(name)
+        mine, held = claims_of(store, name), claims.get(name)
         current = held is not None and mine.holds(held)
         if move == "claim" and not current:
             taken = mine.claim(("any",))
             claims |= {name: taken} if taken is not None and taken.job.id == job else {}
         elif move in {"advance", "finish", "give back"} and held is not None:
-            write_it: dict[str, Step] = {
-                "advance": lambda mine=mine, held=held: mine.advance(held, HALF),
-                "finish": lambda mine=mine, held=held: mine.finish(held, DONE),
-                "give back": lambda mine=mine, held=held: mine.give_back(held),
+            write_it: dict[str, Callable[[], object]] = {
+                "advance": partial(mine.advance, held, HALF),
+                "finish": partial(mine.finish, held, DONE),
+                "give back": partial(mine.give_back, held),
             }
             if current:
                 write_it[move]()
@@ -444,48 +392,58 @@ def test_whatever_happens_a_job_is_held_by_one_and_ends_once(store: JobStore, mo
         elif move == "die":
             fall_silent(store, name)
         elif move == "reap":
-            roll(store, name).reap(30)
-            roll(store, name).beat(None, {})
+            registry(store, name).reap(30)
+            registry(store, name).beat(None)
         elif move == "cancel":
             store.request_cancel(job)
-        holders = [each for each in names if each in claims and desk(store, each).holds(claims[each])]
+        holders = [each for each in names if each in claims and claims_of(store, each).holds(claims[each])]
         found = store.get(job)
         assert len(holders) == (found.state is JobState.running)
         assert endings <= 1
         assert [event.id for event in store.events(job)] == list(range(1, len(store.events(job)) + 1))
 
 
-V0_1 = """
-CREATE TABLE jobs (number INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, id VARCHAR NOT NULL UNIQUE,
-    state VARCHAR NOT NULL, spec JSON NOT NULL, created FLOAT NOT NULL, started FLOAT, finished FLOAT,
-    progress JSON NOT NULL,
-    attempts INTEGER NOT NULL, lost INTEGER NOT NULL, cancel_requested BOOLEAN NOT NULL, error VARCHAR, note VARCHAR,
-    artifacts JSON NOT NULL);
-CREATE INDEX ix_jobs_state ON jobs (state);
-CREATE TABLE job_events (job VARCHAR NOT NULL, id INTEGER NOT NULL, time FLOAT NOT NULL, state VARCHAR NOT NULL,
-    progress JSON NOT NULL, message VARCHAR, PRIMARY KEY (job, id));
-INSERT INTO jobs VALUES (1, 'a', 'succeeded', '{"object": "mug", "label": 3, "classifier": "tiny"}', 1.0, 2.0, 3.0,
-    '{"phase": "judge"}', 1, 0, 0, NULL, 'well', '["result.json"]');
-INSERT INTO jobs VALUES (2, 'b', 'running', '{"object": "cup", "label": 3, "classifier": "tiny"}', 4.0, 5.0, NULL,
-    '{"phase": "x"}', 1, 0, 0, NULL, NULL, '[]');
-INSERT INTO job_events VALUES ('a', 1, 1.0, 'queued', '{}', 'queued');
-INSERT INTO job_events VALUES ('a', 2, 3.0, 'succeeded', '{}', NULL);
-INSERT INTO job_events VALUES ('b', 1, 4.0, 'running', '{}', 'started');
-"""
+def test_the_migrated_tables_are_those_of_the_code(store: JobStore) -> None:
+    with store.engine.connect() as connection:
+        context = MigrationContext.configure(connection)
+        assert compare_metadata(context, [metadata, tokens.metadata]) == []  # type: ignore[arg-type]
+        assert context.get_current_revision() == HEAD
+    assert ScriptDirectory(str(Path(migrations.__file__).parent)).get_current_head() == HEAD
 
 
-def test_a_database_of_version_0_1_is_carried_over(tmp_path: Path) -> None:
-    with contextlib.closing(sqlite3.connect(tmp_path / "old.sqlite")) as old:
-        old.executescript(V0_1)
-    store = JobStore(f"sqlite:///{tmp_path / 'old.sqlite'}")
-    for _ in range(2):
-        store.migrate()
-    ended, running = store.get("a"), store.get("b")
-    assert (ended.state, ended.note, ended.artifacts, ended.spec.label) == ("succeeded", "well", ["result.json"], 3)
-    assert (running.state, running.priority, running.labels) == ("queued", "normal", {})
-    assert store.page(object="cup").jobs == [running]
-    again = claim(store)
-    assert (again.job.id, again.attempt, again.done) == ("b", 2, 0)
-    assert [event.id for event in store.events("b")] == [1, 2]
-    assert create(store) != "b"
+def test_processes_that_migrate_at_once_make_the_tables_once(database_url: str) -> None:
+    code = "import sys; from trompe_server.queue.store import JobStore; JobStore(sys.argv[1]).migrate()"
+    processes = [subprocess.Popen([sys.executable, "-c", code, database_url], stderr=subprocess.PIPE) for _ in range(3)]
+    assert [process.communicate()[1] for process in processes] == [b""] * 3
+    store = JobStore(database_url)
+    job = create(store)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: store.migrate(), range(4)))
+    assert store.get(job).state is JobState.queued
     store.close()
+
+
+def test_the_tables_of_an_earlier_version_are_upgraded_with_their_jobs(store: JobStore) -> None:
+    job = create(store)
+    with write(store.engine) as connection:
+        for statement in ("ALTER TABLE jobs DROP COLUMN names", "UPDATE alembic_version SET version_num = '1'"):
+            connection.exec_driver_sql(statement)
+    store.migrate()
+    assert store.get(job).names == {}
+    assert store.get(store.create(request(), names={"0af3": "cup"})[0].id).names == {"0af3": "cup"}
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        pytest.param("DROP TABLE alembic_version", r"made by Trompe 0\.1.*--data.*keep Trompe 0\.1", id="0.1"),
+        pytest.param("UPDATE alembic_version SET version_num = '99'", "cannot be upgraded.*'99'", id="newer"),
+    ],
+)
+def test_tables_of_another_version_are_refused_and_stay(store: JobStore, statement: str, message: str) -> None:
+    job = create(store)
+    with write(store.engine) as connection:
+        connection.exec_driver_sql(statement)
+    with pytest.raises(ServiceError, match=message):
+        store.migrate()
+    assert store.get(job).id == job

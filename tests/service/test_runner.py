@@ -1,33 +1,31 @@
-"""How a worker runs a job, without processes: the pipeline is a few lines, the database one that fails on demand."""
+"""How a worker runs a job, without processes: jobs of a few lines, and a database that fails on demand."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
+from prometheus_client import REGISTRY
 
-from trompe_server import database
-from trompe_server.database import DatabaseDownError, write
-from trompe_server.jobs import heart as heart_module
-from trompe_server.jobs import runner as runner_module
-from trompe_server.jobs.desk import Claim, Ending, JobDesk, lose
-from trompe_server.jobs.heart import Heart
-from trompe_server.jobs.roll import WorkerRoll
-from trompe_server.jobs.runner import JobRunner, OpenedJob
-from trompe_server.jobs.store import JobStore
-from trompe_server.jobs.tables import fresh
-from trompe_server.meter import Meter
-from trompe_server.pipeline import DamagedFileError, OnProgress, PhaseReport
+from trompe_server.executor.heartbeat import Heartbeat
+from trompe_server.executor.runner import JobRunner, OpenedJob
+from trompe_server.job.protocol import DamagedFileError, OnProgress, PhaseReport
+from trompe_server.queue.claims import Claim, Claims, Ending, lose
+from trompe_server.queue.store import JobStore
+from trompe_server.queue.tables import fresh
+from trompe_server.queue.workers import WorkerRegistry
+from trompe_server.storage.database import DatabaseDownError, write
 from trompe_shared.api import JobRequest, JobState, Progress
 from trompe_shared.errors import RendererError
 
+T = TypeVar("T")
 Phase = Callable[[OnProgress], None]
 
 
 class Scripted:
-    """A pipeline whose phases are functions; a phase that was run is noted in ``ran``."""
+    """A job whose phases are functions. ``ran`` lists the phases run."""
 
     def __init__(self, **phases: Phase) -> None:
         self._phases, self.ran = phases, list[str]()
@@ -53,16 +51,20 @@ def store(tmp_path: Path) -> Iterator[JobStore]:
     store.close()
 
 
-@pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(database, "PATIENCE", (0.001, 0.01))
+def runner_of(claims: Claims, job: Scripted, **options: Any) -> JobRunner:
+    """A runner that always opens ``job`` and retries at once."""
+    return JobRunner(claims, lambda _: OpenedJob(job, lambda: None), retry_waits=(0.001, 0.01), **options)
 
 
-def run(store: JobStore, pipeline: Scripted, *, desk: JobDesk | None = None) -> JobState | None:
+def submit(store: JobStore) -> str:
+    return store.create(JobRequest.of("mug", label="mug"))[0].id
+
+
+def run(store: JobStore, scripted: Scripted, *, claims: Claims | None = None, **options: Any) -> JobState | None:
     """Submit a job and run it."""
-    job = store.create(JobRequest.model_validate({"object": "mug", "label": "mug"}))[0].id
-    runner = JobRunner(desk or JobDesk(store.engine, "w"), lambda _: OpenedJob(pipeline, lambda: None))
-    claim = runner.desk.claim(("any",))
+    job = submit(store)
+    runner = runner_of(claims or Claims(store.engine, "w"), scripted, **options)
+    claim = runner.claims.claim(("any",))
     assert claim is not None
     state = runner.run(claim)
     assert runner.current is None
@@ -70,10 +72,7 @@ def run(store: JobStore, pipeline: Scripted, *, desk: JobDesk | None = None) -> 
     return state
 
 
-def test_progress_is_written_once_a_second_at_most_and_tells_how_long_it_takes(
-    store: JobStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(runner_module, "PROGRESS_INTERVAL", 0.05)
+def test_progress_is_written_at_most_once_per_interval(store: JobStore) -> None:
 
     def eager(on_progress: OnProgress) -> None:
         for step in range(100):
@@ -81,17 +80,14 @@ def test_progress_is_written_once_a_second_at_most_and_tells_how_long_it_takes(
             time.sleep(0.002)
 
     began = time.monotonic()
-    run(store, Scripted(only=eager))
+    run(store, Scripted(only=eager), progress_interval=0.05)
     intervals = (time.monotonic() - began) / 0.05
     (job,) = store.page().jobs
-    told = [event.progress for event in store.events(job.id) if event.progress.step]
-    assert 2 <= len(told) <= 1 + intervals
-    assert all(progress.eta_seconds is not None for progress in told[1:])
-    assert told[-1].eta_seconds < told[1].eta_seconds  # type: ignore[operator]
+    assert 2 <= len([event for event in store.events(job.id) if event.progress.step]) <= 1 + intervals
 
 
-class Deaf(JobDesk):
-    """A desk whose every call fails twice: once before it is done, once after, so that its answer is lost."""
+class Deaf(Claims):
+    """Claims whose every call fails twice: before the commit, and after it, so that the answer is lost."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -101,10 +97,9 @@ class Deaf(JobDesk):
         return self._deaf(lambda: super(Deaf, self).advance(*args, **options))
 
     def finish(self, *args: Any, **options: Any) -> list[str]:
-        kept: list[str] = self._deaf(lambda: super(Deaf, self).finish(*args, **options))
-        return kept
+        return self._deaf(lambda: super(Deaf, self).finish(*args, **options))
 
-    def _deaf(self, call: Callable[[], Any]) -> Any:
+    def _deaf(self, call: Callable[[], T]) -> T:
         self.calls += 1
         if self.calls % 3 == 1:
             raise DatabaseDownError("not now")
@@ -116,21 +111,22 @@ class Deaf(JobDesk):
 
 def test_a_database_that_goes_away_at_every_write_costs_time_alone(store: JobStore) -> None:
     pipeline = Scripted(a=nothing, b=nothing, c=nothing)
-    assert run(store, pipeline, desk=Deaf(store.engine, "w")) is JobState.succeeded
+    assert run(store, pipeline, claims=Deaf(store.engine, "w")) is JobState.succeeded
     assert pipeline.ran == ["a", "b", "c"]
     (job,) = store.page().jobs
     assert (job.attempts, job.progress.fraction) == (1, 1.0)
     assert len([event for event in store.events(job.id) if event.state.final]) == 1
 
 
-def test_progress_that_cannot_be_written_stops_nothing(store: JobStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runner_module, "PROGRESS_INTERVAL", 0.0)
+def test_progress_that_cannot_be_written_stops_nothing(store: JobStore) -> None:
 
     def chatty(on_progress: OnProgress) -> None:
         for _ in range(4):
             on_progress(Progress(phase="only", fraction=0.5))
 
-    assert run(store, Scripted(only=chatty), desk=Deaf(store.engine, "w")) is JobState.succeeded
+    assert (
+        run(store, Scripted(only=chatty), claims=Deaf(store.engine, "w"), progress_interval=0.0) is JobState.succeeded
+    )
 
 
 def test_a_phase_that_finds_damage_has_the_one_before_run_again(store: JobStore) -> None:
@@ -174,7 +170,7 @@ def test_a_full_disk_is_told_in_words(store: JobStore, tmp_path: Path, monkeypat
     import errno
     import os
 
-    from trompe_server.artifacts import LocalArtifacts
+    from trompe_server.storage.folders import LocalArtifacts
 
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -191,17 +187,17 @@ def test_a_full_disk_is_told_in_words(store: JobStore, tmp_path: Path, monkeypat
 
 def test_a_job_that_is_lost_unwinds_at_its_next_step(store: JobStore) -> None:
     def robbed(on_progress: OnProgress) -> None:
-        roll = WorkerRoll(store.engine, "w", device="cpu")
-        roll.arrive()  # as if another process had come up under this name
-        heart.beat()
+        registry.register()  # as if another process had started under this name
+        heartbeat.beat()
         on_progress(Progress(phase="a", fraction=0.5))
         pytest.fail("it went on")
 
     pipeline = Scripted(a=robbed, b=nothing)
-    store.create(JobRequest.model_validate({"object": "mug", "label": "mug"}))
-    runner = JobRunner(JobDesk(store.engine, "w"), lambda _: OpenedJob(pipeline, lambda: None))
-    heart = Heart(WorkerRoll(store.engine, "w", device="cpu"), runner, Meter(), silence=30)
-    claim = runner.desk.claim(("any",))
+    submit(store)
+    runner = runner_of(Claims(store.engine, "w"), pipeline)
+    registry = WorkerRegistry(store.engine, "w", device="cpu")
+    heartbeat = Heartbeat(registry, runner, silence=30)
+    claim = runner.claims.claim(("any",))
     assert claim is not None
     assert runner.run(claim) is None
     assert pipeline.ran == ["a"]
@@ -222,7 +218,7 @@ def test_a_lost_attempt_tidies_up_after_itself_where_nobody_else_will(
     def overtaken(on_progress: OnProgress) -> None:
         with write(store.engine) as connection:
             lose(connection, fresh(connection, job), "it was silent")
-        other = JobDesk(store.engine, "other")
+        other = Claims(store.engine, "other")
         taken = other.claim(("any",))
         assert taken is not None
         if meanwhile != "taken":
@@ -233,43 +229,38 @@ def test_a_lost_attempt_tidies_up_after_itself_where_nobody_else_will(
         pytest.fail("it went on")
 
     tidied: list[list[str]] = []
-    job = store.create(JobRequest.model_validate({"object": "mug", "label": "mug"}))[0].id
-    pipeline = Scripted(a=overtaken)
-    runner = JobRunner(
-        JobDesk(store.engine, "w"), lambda _: OpenedJob(pipeline, lambda: None), lambda _, names: tidied.append(names)
-    )
-    claim = runner.desk.claim(("any",))
+    job = submit(store)
+    runner = runner_of(Claims(store.engine, "w"), Scripted(a=overtaken), tidy_job=lambda _, names: tidied.append(names))
+    claim = runner.claims.claim(("any",))
     assert claim is not None
     assert runner.run(claim) is None
     assert tidied == kept
 
 
-def test_nobody_is_called_dead_right_after_all_were_held_up(store: JobStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_is_called_dead_right_after_all_were_held_up(store: JobStore) -> None:
     now = 0.0
 
-    class HeldUp(WorkerRoll):
+    class HeldUp(WorkerRegistry):
         """The database is locked during the beat at 35 s."""
 
-        def beat(self, job: str | None, done: Mapping[str, float]) -> None:
+        def beat(self, job: str | None) -> None:
             nonlocal now
             now += 20.0 if now == 35.0 else 0.0
-            super().beat(job, done)
+            super().beat(job)
 
-    monkeypatch.setattr(heart_module, "time", SimpleNamespace(monotonic=lambda: now))
-    job = store.create(JobRequest.model_validate({"object": "mug", "label": "mug"}))[0].id
-    heart = Heart(
-        HeldUp(store.engine, "w", device="cpu"), JobRunner(JobDesk(store.engine, "w"), _nothing), Meter(), silence=30
-    )
+    job = submit(store)
+    registry, runner = HeldUp(store.engine, "w", device="cpu"), JobRunner(Claims(store.engine, "w"), _nothing)
+    heartbeat = Heartbeat(registry, runner, silence=30, clock=lambda: now)
     while now < 30.0:
         now += 5.0
-        heart.beat()
-    assert JobDesk(store.engine, "never seen").claim(("any",)) is not None
+        heartbeat.beat()
+    assert Claims(store.engine, "never seen").claim(("any",)) is not None
     now = 35.0
-    heart.beat()
+    heartbeat.beat()
     assert store.get(job).state is JobState.running, "the other one could not be heard, either"
     while now < 90.0:
         now += 5.0
-        heart.beat()
+        heartbeat.beat()
     assert store.get(job).state is JobState.queued
 
 
@@ -277,25 +268,19 @@ def _nothing(_: Claim) -> OpenedJob:
     raise AssertionError("there is nothing to open")
 
 
-def test_what_was_done_is_counted() -> None:
-    import torch
+def test_phases_count_their_seconds_and_their_work_by_kind(store: JobStore) -> None:
+    def sample(name: str, **labels: str) -> float:
+        return REGISTRY.get_sample_value(f"trompe_{name}_total", labels) or 0.0
 
-    from trompe_server.classifiers.metered import meter_network
-    from trompe_server.meter import MeteredPipeline
+    class Counting(Scripted):
+        def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
+            return replace(super().run(phase, on_progress), counts={"attack_steps": 5, "target_renders": 2})
 
-    def steps(on_progress: OnProgress) -> None:
-        for step in (1, 1, 2, 3):
-            on_progress(Progress(phase="a", fraction=0.5, step=step))
-
-    meter, network = Meter(), torch.nn.Linear(4, 2)
-    meter_network(network, meter)
-    MeteredPipeline(Scripted(a=steps), meter).run("a", lambda _: None)
-    images = torch.zeros(5, 4, requires_grad=True)
-    network(images).sum().backward()
-    with torch.no_grad():
-        network(images)
-    counted = meter.take()
-    assert (counted["attack_steps"], counted["classifier_images"]) == (3, 10)
-    assert counted["classifier_seconds"] > 0
-    assert counted["step_seconds"] > 0
-    assert meter.take() == {}
+    names = [("attack_steps", {}), ("target_renders", {}), ("phase_seconds", {"phase": "attack"})]
+    before = [sample(name, **labels) for name, labels in names]
+    run(store, Counting(**{"attack-000": lambda _: time.sleep(0.01), "attack-001": nothing}))
+    steps, renders, seconds = (
+        sample(*name, **labels) - old for (*name, labels), old in zip(names, before, strict=True)
+    )
+    assert (steps, renders) == (10, 4)
+    assert 0.01 <= seconds < 10

@@ -1,10 +1,11 @@
-"""Folders of files, local and remote, by one contract; the files of a job; the library; what retention leaves."""
+"""Folders of files, local and remote, by one contract; files of a job; the library; deletion and retention."""
 
 import errno
 import importlib.util
 import io
 import os
 import secrets
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,14 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trompe_server import library as library_module
-from trompe_server.artifacts import Folder, JobArtifacts, LocalArtifacts, job_artifacts, open_folder
-from trompe_server.database import connect
-from trompe_server.errors import NotFoundError, ServiceError
-from trompe_server.jobs.desk import Ending, JobDesk
-from trompe_server.jobs.retention import Retention
-from trompe_server.jobs.store import JobStore
+from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.library import Library
+from trompe_server.queue.claims import Claims, Ending
+from trompe_server.queue.retention import Retention, delete_job
+from trompe_server.queue.store import JobStore
+from trompe_server.storage.database import connect
+from trompe_server.storage.folders import Folder, JobArtifacts, LocalArtifacts, job_artifacts, open_folder
+from trompe_server.system.files import exclusive
 from trompe_shared.api import JobRequest, JobState
 from trompe_shared.errors import ClassifierError, SpecError
 from trompe_shared.object3d import pack_zip
@@ -100,11 +101,12 @@ def test_folders_lie_within_folders_and_go_with_them(folder: Folder) -> None:
     assert folder.within("other").names() == []
 
 
-@pytest.mark.parametrize("name", ["", "..", "../a", "a/b", ".hidden", "a\0b"])
-def test_a_name_that_could_leave_the_folder_is_refused(folder: Folder, name: str) -> None:
-    for call in (folder.read, folder.exists, folder.within, folder.delete):
-        with pytest.raises(SpecError, match="cannot be the name of an artifact"):
-            call(name)
+def test_a_name_that_could_leave_the_folder_is_refused(folder: Folder, tmp_path: Path) -> None:
+    for name in ("", ".", "..", "../a", "a/b", "a\\b", ".hidden", "-rf", "a\0b", "ä.png", "a\n", "x" * 201):
+        for call in (folder.read, folder.exists, folder.within, folder.delete, lambda name: folder.write(name, b"")):
+            with pytest.raises(SpecError, match="not a valid file name"):
+                call(name)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_store_that_nobody_knows_is_refused_with_a_remedy() -> None:
@@ -119,19 +121,25 @@ def test_a_store_that_cannot_be_reached_is_told_in_words(monkeypatch: pytest.Mon
         raise ConnectionError("nobody there")
 
     monkeypatch.setattr(type(folder.system), "cat_file", unreachable)  # type: ignore[attr-defined]
-    with pytest.raises(ServiceError, match=r"cannot be used just now.*TROMPE_STORE"):
+    with pytest.raises(ServiceError, match=r"is not available.*TROMPE_STORE"):
         folder.read("a")
 
 
-def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("fault", "expected"),
+    [(OSError(errno.ENOSPC, "full"), ServiceError), (OSError(errno.EIO, "no space left by chance"), OSError)],
+)
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(
+    fault: OSError, expected: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = LocalArtifacts(tmp_path / "full")
     folder.write("a.bin", b"old")
 
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+    def fail(_: int) -> None:
+        raise fault
 
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(ServiceError, match="no space left"):
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(expected, match="no space left"):
         folder.write("a.bin", b"new")
     assert folder.read("a.bin") == b"old"
     assert [file.name for file in (tmp_path / "full").iterdir()] == ["a.bin"]
@@ -151,7 +159,7 @@ def test_an_older_attempt_never_replaces_what_a_newer_one_wrote(folder: Folder) 
         assert file.read() == b"new"
     with pytest.raises(FileNotFoundError):
         reader.read("nothing")
-    with pytest.raises(ServiceError, match="opened to be read"):
+    with pytest.raises(ServiceError, match="read-only"):
         reader.write("state", b"")
     reader.keep(["only"])
     assert reader.names() == ["only"]
@@ -173,11 +181,10 @@ def _inspect(_: str) -> dict[str, object]:
 
 
 def test_the_library_is_the_same_wherever_it_is(
-    folder: Folder, tmp_path: Path, make_object: Any, make_quad: Any, monkeypatch: pytest.MonkeyPatch
+    folder: Folder, tmp_path: Path, make_object: Any, make_quad: Any
 ) -> None:
     archive = pack_zip(dict(make_object(make_quad(np.zeros((8, 8, 3), np.uint8))).files))
-    monkeypatch.setattr(library_module, "_inspect", _inspect)
-    library = Library(folder, cache=tmp_path / "cache")
+    library = Library(folder, cache=tmp_path / "cache", inspect=_inspect)
     info = library.add_object(io.BytesIO(archive), "square.zip")
     assert library.add_object(io.BytesIO(archive), "again.zip").id == info.id
     net = library.add_classifier(io.BytesIO(b"weights"), "net.pt2", classes=["a", "b", "c"])
@@ -192,12 +199,9 @@ def test_the_library_is_the_same_wherever_it_is(
         again.object("nothing")
 
 
-def test_a_classifier_whose_stored_bytes_are_damaged_is_not_loaded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(library_module, "_inspect", _inspect)
+def test_a_classifier_whose_stored_bytes_are_damaged_is_not_loaded(tmp_path: Path) -> None:
     folder = open_folder(f"memory://{secrets.token_hex(4)}")
-    library = Library(folder, cache=tmp_path / "cache")
+    library = Library(folder, cache=tmp_path / "cache", inspect=_inspect)
     net = library.add_classifier(io.BytesIO(b"weights"), "net.pt2")
     folder.within("classifiers").within(net.id).write("data.pt2", b"rubbish")
     with pytest.raises(ClassifierError, match="damaged"):
@@ -210,11 +214,8 @@ def test_retention_deletes_what_is_old_and_nothing_else(store: JobStore, tmp_pat
     old, running, queued = (_job(store) for _ in range(3))
     for job in (old, running, queued):
         job_artifacts(files, job, attempt=1).write("result.json", b"{}")
-    desk = JobDesk(store.engine, "w")
-    claim = desk.claim(("any",))
-    assert claim is not None
-    desk.finish(claim, Ending(JobState.succeeded))
-    assert desk.claim(("any",)) is not None
+    _end(store)
+    assert Claims(store.engine, "w").claim(("any",)) is not None
     calibrations = LocalArtifacts(tmp_path / "files" / "library" / "calibrations")
     for name, age in (("used.npz", 0.0), ("unused.npz", 10 * 86400.0)):
         calibrations.write(name, b"0")
@@ -243,8 +244,60 @@ def test_retention_looks_often_enough_that_little_is_kept_for_longer(
     assert Retention(store, open_folder(tmp_path), days=days).interval == pytest.approx(seconds)
 
 
+def test_a_job_whose_files_cannot_be_deleted_stays_until_they_can(
+    store: JobStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files, job = open_folder(f"memory://{secrets.token_hex(4)}"), _job(store)
+    job_artifacts(files, job, attempt=1).write("result.json", b"{}")
+    with pytest.raises(ConflictError, match="Cancel it first"):
+        delete_job(store, files, job)
+    assert job_artifacts(files, job).names() == ["result.json"]
+    _end(store)
+
+    def away(*_: Any, **__: Any) -> None:
+        raise ConnectionError("nobody there")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(files.system), "rm", away)  # type: ignore[attr-defined]
+        with pytest.raises(ServiceError, match="not available"):
+            delete_job(store, files, job)
+        assert store.get(job).state is JobState.succeeded
+    delete_job(store, files, job)
+    assert files.within("jobs").folders() == []
+    with pytest.raises(NotFoundError):
+        delete_job(store, files, job)
+
+
+def test_a_local_folder_that_cannot_be_deleted_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = open_folder(tmp_path / "job")
+    folder.write("a", b"1")
+
+    def refused(*_: Any, **__: Any) -> None:
+        raise PermissionError("read-only")
+
+    monkeypatch.setattr(shutil, "rmtree", refused)
+    with pytest.raises(ServiceError, match="cannot be deleted"):
+        folder.delete_all()
+
+
+def test_a_lock_is_held_by_one_and_free_again_afterwards(tmp_path: Path) -> None:
+    lock = tmp_path / "folder" / "x.lock"
+    with exclusive(lock, "taken"), pytest.raises(ServiceError, match="taken"), exclusive(lock, "taken"):
+        pytest.fail("two hold one lock")
+    with exclusive(lock, "taken"):
+        pass
+
+
 def _job(store: JobStore) -> str:
-    return store.create(JobRequest.model_validate({"object": "mug", "label": "mug"}))[0].id
+    return store.create(JobRequest.of("mug", label="mug"))[0].id
+
+
+def _end(store: JobStore) -> None:
+    """Claim the next job and end it."""
+    claims = Claims(store.engine, "w")
+    claim = claims.claim(("any",))
+    assert claim is not None
+    claims.finish(claim, Ending(JobState.succeeded))
 
 
 def test_a_database_url_that_cannot_be_used_is_quoted_without_its_password() -> None:

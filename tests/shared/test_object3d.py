@@ -1,4 +1,4 @@
-"""The object format: what is read, what comes back unchanged, and what is refused with a word that helps."""
+"""The object format: reading, exact round trips, and refusals that name the place and the remedy."""
 
 import io
 import json
@@ -7,6 +7,7 @@ import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from trompe_shared.errors import ObjectError
-from trompe_shared.object3d import Object3D, decode_rgb, encode_png, load_object, object_from_files, pack_zip
+from trompe_shared.object3d import decode_rgb, encode_png, load_object, object_from_files, pack_zip
 from trompe_shared.wavefront import parse_mtl, parse_obj
 
 MESH = """# a triangle
@@ -97,7 +98,7 @@ def test_a_zip_a_folder_and_the_obj_itself_are_the_same_object(tmp_path: Path) -
     }
 
 
-def test_an_mtl_will_do_where_there_is_no_material_definition() -> None:
+def test_an_mtl_replaces_a_missing_material_definition() -> None:
     mtl = (
         "# blender\nnewmtl other\nmap_Kd other.png\nnewmtl paint\nKd 1 1 1\n"
         "map_Kd C:\\my textures\\paint.png\nbump -bm 1.0 ../maps/bumps.png\n"
@@ -128,6 +129,20 @@ def test_several_materials_become_parts_in_the_order_of_their_first_use() -> Non
     assert obj.n_texels == 28
 
 
+@given(st.integers(0, 2**31), st.integers(3, 60))
+@settings(max_examples=40)
+def test_the_sphere_holds_all_vertices_and_is_hardly_larger_than_needed(seed: int, n: int) -> None:
+    """Jung (1901): points at most d apart fit into a sphere of radius d * sqrt(3 / 8), and need at least d / 2."""
+    random = np.random.default_rng(seed)
+    points = (random.normal(size=(n, 3)) * random.uniform(0.1, 1, 3) + random.normal(size=3)).astype(np.float32)
+    obj = object_from_files(FILES)
+    part = replace(obj.parts[0], vertices=points)
+    centre, radius = replace(obj, parts=(part,)).sphere
+    apart = np.linalg.norm(points[:, None] - points, axis=2).max()
+    assert np.linalg.norm(points - np.array(centre), axis=1).max() <= radius + 1e-6
+    assert 0.5 * apart <= radius * (1 + 1e-6) <= 1.01 * np.sqrt(3 / 8) * apart
+
+
 def test_polygons_are_split_into_fans() -> None:
     mesh = MESH + "v 1 1 0\nvt 1 1\nv -1 0 0\nf 1/1 2/2 4/4 3/3 5/3\n"
     corners, _ = only_part(mesh)
@@ -155,12 +170,8 @@ def test_computed_normals_are_smooth_across_a_shared_edge() -> None:
     corners, normals = only_part(roof)
     on_the_edge = (corners[..., 0] == 0).all(axis=1, keepdims=True) | (corners[..., :2] == 0).all(axis=2)
     np.testing.assert_allclose(np.abs(normals[on_the_edge]), np.tile([0, 1, 0], (4, 1)), atol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=2), 1, atol=1e-6)
-
-
-def test_a_triangle_without_area_still_has_unit_normals() -> None:
-    _, normals = only_part(MESH.replace("v 0 1 0", "v 2 0 0"))
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=2), 1, atol=1e-6)
+    for mesh in (roof, MESH.replace("v 0 1 0", "v 2 0 0")):  # the second has no area
+        np.testing.assert_allclose(np.linalg.norm(only_part(mesh)[1], axis=2), 1, atol=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "P", "RGB", "RGBA", "1"])
@@ -194,13 +205,9 @@ def test_greys_of_16_bits_are_scaled_to_8_not_clipped(form: str, mode: str) -> N
     assert read.shape == (2, 4, 3)
 
 
-def test_every_file_comes_back_byte_for_byte() -> None:
-    again = load_object(load_object(zipped(FILES)).to_zip())
-    assert dict(again.files) == FILES
-
-
-def test_the_same_content_gives_the_same_bytes() -> None:
+def test_every_file_comes_back_byte_for_byte_and_the_same_content_gives_the_same_bytes() -> None:
     one, other = load_object(zipped(FILES)), load_object(zipped(FILES, method=zipfile.ZIP_STORED))
+    assert dict(load_object(one.to_zip()).files) == FILES
     assert one.to_zip() == other.to_zip() == pack_zip(FILES)
 
 
@@ -212,7 +219,7 @@ def test_a_packed_zip_holds_what_was_put_in(files: dict[str, bytes]) -> None:
         assert archive.namelist() == list(files)
 
 
-def test_a_repainted_object_differs_in_its_albedo_file_alone() -> None:
+def test_a_repainted_object_differs_in_its_albedo_file_alone_and_no_other_file_can_be_painted() -> None:
     obj, other = load_object(zipped(FILES)), 255 - PAINT
     painted = obj.with_textures({"paint.png": other})
     again = load_object(painted.to_zip())
@@ -220,33 +227,22 @@ def test_a_repainted_object_differs_in_its_albedo_file_alone() -> None:
     assert (again.textures["paint.png"] == other).all()
     assert {name for name in FILES if again.files[name] != FILES[name]} == {"paint.png"}
     assert (obj.textures["paint.png"] == PAINT).all()
-
-
-def with_alpha(mode: str) -> tuple[Object3D, np.ndarray]:
-    alpha = np.arange(24, dtype=np.uint8).reshape(4, 6) * 10
-    picture = Image.fromarray(PAINT)
-    picture.putalpha(Image.fromarray(alpha))
-    return object_from_files(with_files(paint__png=encode_png(picture.convert(mode)))), alpha
+    with pytest.raises(ObjectError, match=r"readme\.txt.*paint\.png"):
+        obj.with_textures({"readme.txt": PAINT})
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA"])
-def test_a_repainted_texture_keeps_its_opacity(mode: str) -> None:
-    obj, alpha = with_alpha(mode)
+def test_a_repainted_texture_keeps_its_opacity_and_may_change_its_size(mode: str) -> None:
+    alpha = np.arange(24, dtype=np.uint8).reshape(4, 6) * 10
+    picture = Image.fromarray(PAINT)
+    picture.putalpha(Image.fromarray(alpha))
+    obj = object_from_files(with_files(paint__png=encode_png(picture.convert(mode))))
     painted = obj.with_textures({"paint.png": 255 - PAINT})
     with Image.open(io.BytesIO(painted.files["paint.png"])) as image:
         assert (np.array(image.getchannel("A")) == alpha).all()
         assert (np.array(image.convert("RGB")) == 255 - PAINT).all()
-
-
-def test_a_texture_may_be_replaced_by_one_of_another_size() -> None:
-    obj, _ = with_alpha("RGBA")
-    painted = obj.with_textures({"paint.png": np.full((1, 1, 3), 7, np.uint8)})
-    assert load_object(painted.to_zip()).textures["paint.png"].tolist() == [[[7, 7, 7]]]
-
-
-def test_a_name_that_is_no_albedo_texture_cannot_be_painted() -> None:
-    with pytest.raises(ObjectError, match=r"readme\.txt.*paint\.png"):
-        load_object(zipped(FILES)).with_textures({"readme.txt": PAINT})
+    resized = obj.with_textures({"paint.png": np.full((1, 1, 3), 7, np.uint8)})
+    assert load_object(resized.to_zip()).textures["paint.png"].tolist() == [[[7, 7, 7]]]
 
 
 # What is refused
@@ -272,6 +268,10 @@ REFUSED = {
     "a table cut short": (with_files(thing_mat_def__json=TABLE[:-1]), ["thing_mat_def.json", '"albedo"']),
     "a table that is a list": (with_files(thing_mat_def__json=b"[1]"), ["thing_mat_def.json", '"albedo"']),
     "a material that is a text": (with_files(thing_mat_def__json=b'{"paint": "x"}'), ["thing_mat_def.json", "albedo"]),
+    "an opacity beyond 1": (
+        with_files(thing_mat_def__json=b'{"paint": {"albedo": "paint.png", "opacity": 2}}'),
+        ["opacity 2", "from 0 to 1"],
+    ),
     "a material without albedo": (with_files(thing_mat_def__json=b'{"paint": {}}'), ["albedo"]),
     "an albedo that is a number": (with_files(thing_mat_def__json=b'{"paint": {"albedo": 3}}'), ["albedo"]),
     "a table that is no text": (with_files(thing_mat_def__json=b"\xff\xfe\x00"), ["thing_mat_def.json"]),
@@ -293,7 +293,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("files", "words"), REFUSED.values(), ids=REFUSED)
-def test_what_does_not_hold_together_is_refused_with_the_place_and_the_remedy(
+def test_an_inconsistent_object_is_refused_with_the_place_and_the_remedy(
     files: dict[str, bytes], words: list[str]
 ) -> None:
     message = refusal(files)
@@ -308,16 +308,15 @@ def test_lines_may_end_in_any_way_and_are_counted_with_the_empty_ones(end: str) 
         parse_obj(f"v 0 0 0{end}" + end * 70_000 + f"v 1 0 0{end}# nothing{end}f 9{end}", "thing.obj")
 
 
-def test_a_mesh_of_empty_lines_takes_no_more_memory_than_its_text() -> None:
+def test_a_mesh_of_empty_lines_takes_no_more_memory_than_its_text_and_too_many_lines_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     text = "\n" * 2**23
     tracemalloc.start()
     with pytest.raises(ObjectError, match="no faces"):
         parse_obj(text, "bomb.obj")
     assert tracemalloc.get_traced_memory()[1] < len(text)
     tracemalloc.stop()
-
-
-def test_a_mesh_of_too_many_lines_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trompe_shared.wavefront.MAX_LINES", 100)
     with pytest.raises(ObjectError, match=r"'thing\.obj' has more than 100 lines; simplify"):
         parse_obj("#\n" * 101, "thing.obj")
@@ -331,6 +330,14 @@ def encrypted() -> bytes:
         while place >= 0:
             data[place + flags] |= 1
             place = data.find(signature, place + 4)
+    return bytes(data)
+
+
+def bomb() -> bytes:
+    """A small zip whose member claims 2 GiB."""
+    data = bytearray(zipped({"thing.obj": bytes(1000)}))
+    place = data.find(b"PK\x01\x02")
+    data[place + 24 : place + 28] = struct.pack("<I", 2**31)
     return bytes(data)
 
 
@@ -358,23 +365,14 @@ def scrambled() -> bytes:
         ),
         pytest.param(zipped(FILES | {"more/x.png": b""}), ["flat", "one folder"], id="two folders"),
         pytest.param(zipped({f"{k}.txt": b"" for k in range(300)}), ["300 files", "256"], id="too many files"),
+        pytest.param(bomb(), ["512 MiB"], id="zip bomb"),
+        pytest.param(Path("nowhere.zip"), ["nowhere.zip"], id="no such file"),
+        pytest.param(Path(__file__).parent, ["exactly one .obj"], id="a folder without a mesh"),
     ],
 )
-def test_archives_that_cannot_be_trusted_are_refused(archive: bytes, words: list[str]) -> None:
+def test_archives_that_cannot_be_trusted_are_refused(archive: bytes | Path, words: list[str]) -> None:
     message = refusal(archive)
     assert [word for word in words if word not in message] == []
-
-
-def test_a_zip_bomb_is_refused_unread() -> None:
-    data = bytearray(zipped({"thing.obj": bytes(1000)}))
-    place = data.find(b"PK\x01\x02")
-    data[place + 24 : place + 28] = struct.pack("<I", 2**31)
-    assert "512 MiB" in refusal(bytes(data))
-
-
-def test_a_path_that_leads_nowhere_is_named(tmp_path: Path) -> None:
-    assert "nowhere.zip" in refusal(tmp_path / "nowhere.zip")
-    assert "exactly one .obj" in refusal(tmp_path)
 
 
 def png_of_size(width: int, height: int) -> bytes:
@@ -387,26 +385,13 @@ def png_of_size(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
 
 
-@pytest.mark.parametrize("side", [8193, 12_000, 30_000], ids=["a little", "much", "absurdly"])
-def test_an_image_that_is_too_large_is_refused_undecoded(side: int) -> None:
+@pytest.mark.parametrize(
+    ("side", "word"), [(8193, "8192"), (12_000, "8192"), (30_000, "8192"), (0, "paint.png")], ids=str
+)
+def test_an_image_that_is_too_large_or_empty_is_refused_undecoded(side: int, word: str) -> None:
     message = refusal(with_files(paint__png=png_of_size(side, side)))
     assert "paint.png" in message
-    assert "8192" in message
-
-
-def test_an_image_without_pixels_is_refused() -> None:
-    assert "paint.png" in refusal(with_files(paint__png=png_of_size(0, 0)))
-
-
-@given(place=st.integers(0, len(FILES["paint.png"]) - 1), value=st.integers(0, 255))
-@settings(max_examples=400)
-def test_a_texture_with_any_byte_changed_is_read_or_refused(place: int, value: int) -> None:
-    data = bytearray(FILES["paint.png"])
-    data[place] = value
-    try:
-        assert decode_rgb(bytes(data), "paint.png").shape[2] == 3
-    except ObjectError as error:
-        assert "paint.png" in str(error)  # noqa: PT017
+    assert word in message
 
 
 ARCHIVE = zipped(FILES)
@@ -414,10 +399,14 @@ ARCHIVE = zipped(FILES)
 
 @given(place=st.integers(0, len(ARCHIVE) - 1), value=st.integers(0, 255))
 @settings(max_examples=400)
-def test_an_archive_with_any_byte_changed_is_read_or_refused(place: int, value: int) -> None:
-    data = bytearray(ARCHIVE)
-    data[place] = value
+def test_a_texture_or_archive_with_any_byte_changed_is_read_or_refused(place: int, value: int) -> None:
+    texture, archive = bytearray(FILES["paint.png"]), bytearray(ARCHIVE)
+    texture[place % len(texture)] = archive[place] = value
     try:
-        assert load_object(bytes(data)).parts
+        assert decode_rgb(bytes(texture), "paint.png").shape[2] == 3
+    except ObjectError as error:
+        assert "paint.png" in str(error)  # noqa: PT017
+    try:
+        assert load_object(bytes(archive)).parts
     except ObjectError as error:
         assert str(error)  # noqa: PT017

@@ -18,23 +18,24 @@ def saved(picture: Image.Image, kind: str = "PNG") -> bytes:
 RED = Image.new("RGB", (5, 3), (200, 0, 0))
 
 
-@pytest.mark.parametrize("kind", ["PNG", "JPEG", "BMP"])
-def test_a_picture_without_alpha_cuts_nothing_out(kind: str) -> None:
-    assert opacity_of(saved(RED, kind)) is None
-
-
-@pytest.mark.parametrize("alpha", [128, 255])
-def test_alpha_of_one_half_or_more_cuts_nothing_out(alpha: int) -> None:
+def with_alpha(alpha: int | Image.Image) -> Image.Image:
     picture = RED.copy()
     picture.putalpha(alpha)
-    assert opacity_of(saved(picture)) is None
+    return picture
+
+
+@pytest.mark.parametrize(
+    "data",
+    [*(saved(RED, kind) for kind in ("PNG", "JPEG", "BMP")), *(saved(with_alpha(alpha)) for alpha in (128, 255))],
+    ids=["PNG", "JPEG", "BMP", "one half", "opaque"],
+)
+def test_no_alpha_and_alpha_of_one_half_or_more_cut_nothing_out(data: bytes) -> None:
+    assert opacity_of(data) is None
 
 
 def test_alpha_below_one_half_is_read_texel_by_texel() -> None:
     alpha = np.random.default_rng(0).integers(0, 256, (3, 5), dtype=np.uint8)
-    picture = RED.copy()
-    picture.putalpha(Image.fromarray(alpha))
-    np.testing.assert_array_equal(opacity_of(saved(picture)), alpha)
+    np.testing.assert_array_equal(opacity_of(saved(with_alpha(Image.fromarray(alpha)))), alpha)
 
 
 def test_a_transparent_colour_of_a_palette_is_cut_out() -> None:

@@ -1,7 +1,8 @@
-"""The shipped objects: complete, well-formed, and what their script makes."""
+"""The shipped objects are complete, well-formed and equal to their script's output."""
 
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,55 +13,48 @@ from trompe_shared.shipped import ShippedObject, shipped_objects
 
 ROOT = Path(__file__).parents[2]
 SIDE = 512
-SHIPPED = [pytest.param(shipped, id=name) for name, shipped in shipped_objects().items()]
 
 
-def test_the_eight_kinds_are_shipped_under_their_names() -> None:
+@pytest.fixture(params=shipped_objects())
+def shipped(request: pytest.FixtureRequest) -> ShippedObject:
+    return shipped_objects()[request.param]
+
+
+@cache
+def loaded(name: str) -> Object3D:
+    return load_object(shipped_objects()[name].read())
+
+
+def test_the_eight_kinds_are_shipped_under_their_names_and_stay_small() -> None:
     assert list(shipped_objects()) == ["ball", "book", "bottle", "chair", "lamp", "mug", "table", "teapot"]
-
-
-def test_all_archives_together_stay_small() -> None:
     assert sum(len(shipped.read()) for shipped in shipped_objects().values()) < 3e6
 
 
-@pytest.mark.parametrize("shipped", SHIPPED)
-def test_the_archive_is_small_centred_and_of_the_size_of_the_real_thing(shipped: ShippedObject) -> None:
-    obj = load_object(shipped.read())
+def test_an_object_is_small_centred_and_of_the_size_of_the_real_thing(shipped: ShippedObject) -> None:
+    obj = loaded(shipped.name)
     points = np.concatenate([part.vertices for part in obj.parts])
     assert obj.name == shipped.name
     assert 300 <= sum(len(part.faces) for part in obj.parts) <= 3000
     assert np.abs(points.min(axis=0) + points.max(axis=0)).max() < 1e-5
     assert 0.05 < obj.radius < 1.0
-
-
-@pytest.mark.parametrize("shipped", SHIPPED)
-def test_the_camera_stands_where_all_of_the_object_is_seen(shipped: ShippedObject) -> None:
-    radius = load_object(shipped.read()).radius
-    assert 2.0 * radius < shipped.distance < 2.5 * radius
+    assert 2.0 < shipped.distance / obj.radius < 2.5  # the camera sees all of it
     assert -90 <= shipped.elevation[0] < shipped.elevation[1] <= 90
 
 
-@pytest.mark.parametrize("shipped", SHIPPED)
 def test_every_material_has_an_albedo_and_only_maps_of_one_size(shipped: ShippedObject) -> None:
-    obj = load_object(shipped.read())
+    obj = loaded(shipped.name)
     maps = {file for m in obj.materials.values() for file in (m.albedo, m.normal, m.metallic) if file is not None}
     assert {decode_rgb(obj.files[file], file).shape for file in maps} == {(SIDE, SIDE, 3)}
     assert maps == {file for file in obj.files if file.endswith(".png")}
 
 
-@pytest.mark.parametrize("shipped", SHIPPED)
-def test_faces_look_outwards_and_their_texture_is_not_mirrored(shipped: ShippedObject) -> None:
-    for part in load_object(shipped.read()).parts:
+def test_faces_look_outwards_and_use_most_texels_once_and_unmirrored(shipped: ShippedObject) -> None:
+    for part in loaded(shipped.name).parts:
         a, b, c = (part.vertices[part.faces[:, k]].astype(float) for k in range(3))
         across = np.cross(b - a, c - a)
         assert (np.einsum("fi,fki->fk", across, part.normals[part.faces]) > 0).all()
         u, v, w = (part.uvs[part.faces[:, k]].astype(float) for k in range(3))
         assert (_cross(v - u, w - u) > 0).all()
-
-
-@pytest.mark.parametrize("shipped", SHIPPED)
-def test_no_texel_is_used_twice_and_most_are_used(shipped: ShippedObject) -> None:
-    for part in load_object(shipped.read()).parts:
         uses = _uses(part)
         assert (uses > 1).mean() < 1e-3
         assert (uses > 0).mean() > 0.6
@@ -87,7 +81,7 @@ def test_the_script_makes_the_shipped_objects_again(tmp_path: Path) -> None:
     command = [sys.executable, str(ROOT / "scripts" / "make_objects.py"), "--out", str(tmp_path), "--only", "bottle"]
     subprocess.run(command, check=True, capture_output=True)
     # Another zlib packs the same texels into other bytes, and another NumPy may round one of them differently.
-    made, shipped = load_object(tmp_path / "bottle.zip"), load_object(shipped_objects()["bottle"].read())
+    made, shipped = load_object(tmp_path / "bottle.zip"), loaded("bottle")
     assert list(made.files) == list(shipped.files)
     assert _mesh_difference(made, shipped) < 1e-5
     for file in (file for file in made.files if file.endswith(".png")):

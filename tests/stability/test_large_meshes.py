@@ -1,4 +1,4 @@
-"""A million faces and a 4096 x 4096 texture: what preparing them takes is bounded."""
+"""Memory for the geometry of a million faces and a 4096 x 4096 texture is bounded."""
 
 import subprocess
 import sys
@@ -36,8 +36,10 @@ PREPARE = """
 
 
 def prepared(*, rows: int, side: int) -> tuple[float, int, float]:
-    """(MiB that preparing four views took at most, object pixels, MiB of the operators) of a ball of 2 rows**2 faces
-    with a texture of side x side texels."""
+    """Peak MiB of preparing four views, object pixels, and MiB of the operators.
+
+    The object is a ball of 2 rows**2 faces with a texture of side x side texels.
+    """
     command = [sys.executable, "-c", textwrap.dedent(PREPARE.format(rows=rows, side=side))]
     numbers = subprocess.run(command, check=True, capture_output=True, text=True, timeout=240).stdout.split()
     return float(numbers[0]), int(numbers[1]), float(numbers[2])
@@ -47,10 +49,10 @@ def test_a_million_faces_and_4096_x_4096_texels_take_less_than_640_mib() -> None
     taken, pixels, operators = prepared(rows=707, side=4096)
     assert pixels > 4 * 10_000
     assert operators < 16
-    assert taken < 640  # 110 for the triangles themselves and 105 for two tables of the texels among them
+    assert taken < 640  # 110 for the triangles and 105 for two tables of texels
 
 
-def test_the_operators_take_no_more_for_a_finer_mesh_or_texture() -> None:
+def test_a_finer_mesh_or_texture_needs_no_larger_operators() -> None:
     (_, few, small), (_, many, large) = prepared(rows=50, side=512), prepared(rows=300, side=2048)
     assert abs(few - many) < 0.02 * few
     assert large < 1.5 * small

@@ -1,9 +1,7 @@
-"""``trompe completion``: what a shell needs to complete Trompe's commands and options."""
+"""``trompe completion``: shell completion of commands and options."""
 
 import click
 from click.shell_completion import get_completion_class
-
-__all__ = ["completion"]
 
 
 @click.command()

@@ -1,37 +1,23 @@
-"""Exit codes: what a script can tell from them. ``trompe --help`` and docs/cli.md list the same table."""
+"""Exit codes, listed by ``trompe --help`` and docs/cli.md."""
 
 from typing import Final
 
-from trompe_client._errors import (
-    BadRequest,
-    Conflict,
-    EmbeddedServerError,
-    Forbidden,
-    JobCancelled,
-    JobFailed,
-    NotFound,
-    ServerUnreachable,
-    TooMany,
-    Unauthorized,
-    WaitTimeout,
-)
+from trompe_client import _errors as errors
 from trompe_shared.errors import ClassifierError, LabelError, ObjectError, SpecError
-
-__all__ = ["EXITS", "INTERRUPTED", "exit_code"]
 
 INTERRUPTED: Final = 130
 
 EXITS: Final = {
-    0: "done; a job that ends as n.a. is done, too",
-    1: "an error that none of the others describes; `doctor` found something wrong",
-    2: "wrong usage: options or files are not right",
+    0: "success; n.a. is a success too",
+    1: "any other error; `doctor` found a fault",
+    2: "invalid options or files",
     3: "no server answers",
-    4: "refused: no token, a wrong one, one without the right to do this; or too many requests",
-    5: "there is no such job, object, classifier or file, or it is in no state for this",
+    4: "refused: missing or wrong token, or missing right; or too many requests",
+    5: "no such job, object, classifier or file, or not possible in its state",
     6: "the job failed",
     7: "the job was cancelled",
-    8: "the job was still going on when --timeout was over; it goes on",
-    INTERRUPTED: "interrupted by Ctrl-C; a job on a server goes on",
+    8: "--timeout is over; the job continues",
+    INTERRUPTED: "interrupted by Ctrl-C; a job on a server continues",
 }
 
 _CODES: Final[dict[type[Exception], int]] = {
@@ -39,20 +25,20 @@ _CODES: Final[dict[type[Exception], int]] = {
     ObjectError: 2,
     ClassifierError: 2,
     LabelError: 2,
-    BadRequest: 2,
-    ServerUnreachable: 3,
-    EmbeddedServerError: 3,
-    Unauthorized: 4,
-    Forbidden: 4,
-    TooMany: 4,
-    NotFound: 5,
-    Conflict: 5,
-    JobFailed: 6,
-    JobCancelled: 7,
-    WaitTimeout: 8,
+    errors.BadRequest: 2,
+    errors.ServerUnreachable: 3,
+    errors.EmbeddedServerError: 3,
+    errors.Unauthorized: 4,
+    errors.Forbidden: 4,
+    errors.TooMany: 4,
+    errors.NotFound: 5,
+    errors.Conflict: 5,
+    errors.JobFailed: 6,
+    errors.JobCancelled: 7,
+    errors.WaitTimeout: 8,
 }
 
 
 def exit_code(error: Exception) -> int:
-    """The exit code that stands for an error."""
+    """Exit code of an error."""
     return next((code for kind, code in _CODES.items() if isinstance(error, kind)), 1)

@@ -1,33 +1,42 @@
-"""What several commands do with a job: see it through, deliver what came out."""
+"""Follow a job to its end and deliver its results."""
 
+import time
 from contextlib import suppress
 from pathlib import Path
 
 import click
 
-from trompe_client._delivery import ADVERSARIAL, in_the_form_of
+from trompe_client._delivery import in_the_form_of
 from trompe_client._job import JobHandle
-from trompe_client._progress import Progress
+from trompe_client._progress import Progress, shown
 from trompe_client.cli.output import as_json, console, print_json
-from trompe_shared.api import JobState
+from trompe_shared.api import Event, JobState, in_flags
 from trompe_shared.errors import TrompeError
-
-__all__ = ["deliver", "follow", "follow_our_own"]
 
 
 def follow(job: JobHandle, *, timeout: float | None = None, progress: Progress = True) -> JobHandle:
-    """See a job through on a server that outlives us. Ctrl-C leaves it running and says how to come back."""
+    """Follow a job on a running server. Ctrl-C leaves the job running and prints how to follow it again."""
     try:
-        return job.wait(timeout, progress=progress)
+        return _wait(job, timeout, progress)
     except KeyboardInterrupt:
-        click.echo(f"\nJob {job.id} goes on. Come back by: trompe watch {job.id} --server {job.server}", err=True)
+        click.echo(f"\nJob {job.id} continues. Follow it: trompe watch {job.id} --server {job.server}", err=True)
         raise
 
 
+def _wait(job: JobHandle, timeout: float | None, progress: Progress) -> JobHandle:
+    """Wait for the end. Messages for people name flags."""
+
+    def with_flags(event: Event) -> Event:
+        return event.model_copy(update={"message": event.message and in_flags(event.message)})
+
+    with shown(progress) as show:
+        return job.wait(timeout, progress=(lambda event: show(with_flags(event))) if progress is True else show)
+
+
 def follow_our_own(job: JobHandle) -> JobHandle:
-    """See a job through on a server that ends with this command; so Ctrl-C cancels the job."""
+    """Follow a job on the embedded server, which ends with the command: Ctrl-C cancels the job."""
     try:
-        return job.wait(progress=True)
+        return _wait(job, None, True)
     except KeyboardInterrupt:
         with suppress(TrompeError):
             job.cancel()
@@ -35,19 +44,25 @@ def follow_our_own(job: JobHandle) -> JobHandle:
         raise
 
 
-def deliver(job: JobHandle, out: Path | None, *, source: str | None = None) -> None:
-    """Download the results and say them; with ``source``, give the object back in its form. No ``out``: no files."""
+def deliver(
+    job: JobHandle, out: Path | None, *, source: str | None = None, began: float | None = None, start_up: float = 0.0
+) -> None:
+    """Print the results and download them to ``out``, if any, with the object in the form of ``source``.
+
+    began: when the command began, on the monotonic clock; ``start_up``: its seconds until the job was submitted.
+    """
     files = job.download(out) if out else []
     if source is not None:
-        files = [in_the_form_of(source, file) if file.name == ADVERSARIAL else file for file in files]
+        files = [in_the_form_of(source, file) for file in files]
     result = job.result()
     if as_json():
         print_json({"job": job.status, "result": result, "files": [str(file) for file in files]}, indent=2)
         return
-    from trompe_client._report import result_report
+    from trompe_client._report import result_report, spent
 
     note = job.status.note if job.state is JobState.not_applicable else None
     screen = console()
-    screen.print(result_report(result, note=note))
+    wall = None if began is None else time.monotonic() - began
+    screen.print(result_report(result, note=note, seconds=spent(result, job.status, start_up=start_up, wall=wall)))
     if files:
         screen.print("written:", *(f"  {file}" for file in files), sep="\n")

@@ -1,4 +1,4 @@
-"""The command ``trompe``. Its commands, and those of the other packages, are imported only when they are called."""
+"""The command ``trompe``. Its subcommands are imported when they are called."""
 
 from dataclasses import dataclass
 from importlib import import_module, metadata
@@ -10,8 +10,6 @@ from trompe_client.cli.exits import EXITS, INTERRUPTED, exit_code
 from trompe_client.cli.output import show_error
 from trompe_shared.errors import TrompeError
 
-__all__ = ["main"]
-
 COMMANDS_GROUP: Final = "trompe.commands"
 
 OWN: Final = {
@@ -20,20 +18,19 @@ OWN: Final = {
     "cancel": "trompe_client.cli.jobs",
     "classifiers": "trompe_client.cli.library",
     "completion": "trompe_client.cli.completion",
-    "experiment": "trompe_client.experiments.cli",
     "jobs": "trompe_client.cli.jobs",
     "objects": "trompe_client.cli.library",
-    "renderers": "trompe_client.cli.fleet",
+    "renderers": "trompe_client.cli.library",
     "report": "trompe_client.cli.jobs",
     "watch": "trompe_client.cli.jobs",
-    "workers": "trompe_client.cli.fleet",
+    "workers": "trompe_client.cli.library",
 }
-"""The commands of this package, and the modules that hold them under their names."""
+"""Commands of this package, and their modules."""
 
 
 @dataclass(frozen=True)
 class _Extension:
-    """A command of another package: the extra that installs what it needs, and its line in ``trompe --help``."""
+    """A command of another package: the extra that installs it, and its line in ``trompe --help``."""
 
     extra: str
     help: str
@@ -41,17 +38,18 @@ class _Extension:
 
 EXTENSIONS: Final = {
     "serve": _Extension("server", "Run the service: API, attack worker and renderer."),
-    "worker": _Extension("server", "Run one more attack worker."),
-    "demo": _Extension("server", "Attack an object that comes with Trompe, and show the result."),
-    "doctor": _Extension("server", "Check this machine, and say how to mend what is wrong."),
-    "migrate": _Extension("server", "Make the service's database, or bring it up to date."),
+    "worker": _Extension("server", "Run an additional attack worker."),
+    "demo": _Extension("server", "Attack a shipped object and show the result."),
+    "doctor": _Extension("server", "Check this machine and suggest repairs."),
+    "experiment": _Extension("experiments", "Run grids of jobs and report their results."),
+    "migrate": _Extension("server", "Create or upgrade the service's database."),
     "render": _Extension("renderer", "Run a renderer worker (SAILenv's protocol)."),
-    "token": _Extension("server", "Make, list and revoke the tokens that a server asks for."),
+    "token": _Extension("server", "Create, list and revoke access tokens."),
 }
 
 
 class _Trompe(click.Group):
-    """A group that finds its commands by name or by entry point, and turns errors into words and an exit code."""
+    """A group with commands by name or entry point; reports errors as messages and exit codes."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return sorted({*OWN, *EXTENSIONS, *metadata.entry_points(group=COMMANDS_GROUP).names})
@@ -64,14 +62,14 @@ class _Trompe(click.Group):
         return _load_extension(cmd_name) if cmd_name in self.list_commands(ctx) else None
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
-        """As click's own, but without importing any command."""
+        """Complete names without importing commands."""
         from click.shell_completion import CompletionItem
 
         names = [name for name in self.list_commands(ctx) if name.startswith(incomplete)]
         return [CompletionItem(name) for name in names] + click.Command.shell_complete(self, ctx, incomplete)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """As click's own, but without importing the commands of other packages."""
+        """List the commands without importing those of other packages."""
         lines = {name: extension.help for name, extension in EXTENSIONS.items()}
         for name in OWN:
             command = self.get_command(ctx, name)
@@ -91,17 +89,17 @@ class _Trompe(click.Group):
             ctx.exit(INTERRUPTED)
         except BrokenPipeError:
             raise
-        except ModuleNotFoundError as error:  # commands import what they need when they are called
+        except ModuleNotFoundError as error:  # raised when the command runs
             if ctx.invoked_subcommand not in EXTENSIONS:
                 raise
             raise _missing_extra(ctx.invoked_subcommand, error) from error
         except (TrompeError, OSError) as error:
-            show_error(ctx, error, code=exit_code(error))
+            show_error(ctx, error, code=exit_code(error), flags=ctx.invoked_subcommand in OWN)
             ctx.exit(exit_code(error))
 
 
 def _load_extension(name: str) -> click.Command:
-    """Import a command of another package. Raises ``ClickException`` when what it needs is not installed."""
+    """Import a command of another package. Raises ``ClickException`` for a missing extra."""
     found = list(metadata.entry_points(group=COMMANDS_GROUP, name=name))
     try:
         if not found:
@@ -114,7 +112,6 @@ def _load_extension(name: str) -> click.Command:
 
 
 def _missing_extra(name: str, error: ModuleNotFoundError) -> click.ClickException:
-    """The error that names the extra to install."""
     if name not in EXTENSIONS:
         return click.ClickException(f"`trompe {name}` cannot be loaded: {error}.")
     extra = EXTENSIONS[name].extra

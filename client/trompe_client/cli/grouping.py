@@ -1,16 +1,14 @@
-"""Groups of commands that list what they are about when nothing else is said: ``trompe jobs --state failed``."""
+"""Groups with ``list`` as the default command: ``trompe jobs --state failed``."""
 
 from typing import Any, Final
 
 import click
 
-__all__ = ["ListedByDefault"]
-
 LIST: Final = "list"
 
 
 class ListedByDefault(click.Group):
-    """A group whose command ``list`` can be left out."""
+    """A group with ``list`` as its default command."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         names = {*self.commands, *self.get_help_option_names(ctx)}
@@ -18,7 +16,7 @@ class ListedByDefault(click.Group):
         return super().parse_args(ctx, args if named else [LIST, *args])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
-        """Commands, and the options of the one that can be left out."""
+        """Complete commands, and the options of ``list``."""
         options = self.commands[LIST].shell_complete(ctx, incomplete) if incomplete.startswith("-") else []
         return super().shell_complete(ctx, incomplete) + [each for each in options if each.value != "--help"]
 

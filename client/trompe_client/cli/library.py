@@ -1,90 +1,76 @@
-"""Commands about what is stored: ``trompe objects``, ``trompe classifiers``, ``trompe backgrounds``."""
+"""Lists of stored things and of processes: ``trompe objects``, ``classifiers``, ``backgrounds``, ``workers``..."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
+from trompe_client import _core
 from trompe_client._client import Client
-from trompe_client._report import backgrounds_table, classifiers_table, objects_table
+from trompe_client._report import records_table
 from trompe_client.cli.connection import with_client
 from trompe_client.cli.grouping import ListedByDefault
-from trompe_client.cli.output import json_option, say
-
-__all__ = ["backgrounds", "classifiers", "objects"]
+from trompe_client.cli.output import say
+from trompe_shared.api import BackgroundInfo, ClassifierInfo, ObjectInfo, RendererInfo, WorkerInfo
 
 _file = click.argument("file", type=click.Path(exists=True))
-_name = click.option("--name", help="What it shall be called. Default: as the file.")
+_name = click.option("--name", help="Name to store it under; default: the file's name.")
 
 
-@click.group(cls=ListedByDefault)
-def objects() -> None:
-    """Stored objects: list them, add one."""
+def _list_command(kind: type[Any], name: str, help: str) -> click.Command:
+    """A command that lists the records of a kind."""
+
+    @click.command(name, help=help)
+    @with_client
+    def command(client: Client) -> None:
+        found = client.send(_core.listed(kind))
+        say(found, lambda: records_table(kind, found))
+
+    return command
 
 
-@objects.command("list")
-@json_option
-@with_client
-def list_objects(client: Client) -> None:
-    """List stored objects."""
-    found = client.objects()
-    say(found, lambda: objects_table(found))
+def _group(kind: type[Any], plural: str) -> Callable[[click.Command], click.Group]:
+    """Make a group of a command that adds records, and of one that lists them."""
+
+    def grouped(add: click.Command) -> click.Group:
+        commands = [_list_command(kind, "list", f"List stored {plural}."), add]
+        return ListedByDefault(plural, commands=commands, help=f"Stored {plural}: list or add.")
+
+    return grouped
 
 
-@objects.command("add")
+workers = _list_command(WorkerInfo, "workers", "List the processes that run jobs.")
+renderers = _list_command(RendererInfo, "renderers", "List the renderer workers.")
+
+
+@_group(ObjectInfo, "objects")
+@click.command("add")
 @_file
 @_name
-@json_option
 @with_client
-def add_object(client: Client, file: str, name: str | None) -> None:
+def objects(client: Client, file: str, name: str | None) -> None:
     """Store an object: a zip, a model file (.obj, .glb, .gltf, .fbx, .ply, .stl), or a folder with one."""
     stored = client.upload_object(file, name=name)
     say(stored, lambda: f"Object {stored.name}: {stored.id}")
 
 
-@click.group(cls=ListedByDefault)
-def classifiers() -> None:
-    """Stored classifiers: list them, add one."""
-
-
-@classifiers.command("list")
-@json_option
-@with_client
-def list_classifiers(client: Client) -> None:
-    """List stored classifiers."""
-    found = client.classifiers()
-    say(found, lambda: classifiers_table(found))
-
-
-@classifiers.command("add")
+@_group(ClassifierInfo, "classifiers")
+@click.command("add")
 @_file
 @_name
-@json_option
 @with_client
-def add_classifier(client: Client, file: str, name: str | None) -> None:
-    """Store a classifier: a .pt2, TorchScript (.pt) or .onnx file, with its class names in a JSON file beside it."""
+def classifiers(client: Client, file: str, name: str | None) -> None:
+    """Store a classifier: a .pt2 or .onnx file, with its class names in a JSON file beside it."""
     stored = client.upload_classifier(file, name=name)
     say(stored, lambda: f"Classifier {stored.name}: {stored.id}")
 
 
-@click.group(cls=ListedByDefault)
-def backgrounds() -> None:
-    """Uploaded backgrounds: list them, add one."""
-
-
-@backgrounds.command("list")
-@json_option
-@with_client
-def list_backgrounds(client: Client) -> None:
-    """List uploaded backgrounds."""
-    found = client.backgrounds()
-    say(found, lambda: backgrounds_table(found))
-
-
-@backgrounds.command("add")
+@_group(BackgroundInfo, "backgrounds")
+@click.command("add")
 @_file
-@json_option
 @with_client
-def add_background(client: Client, file: str) -> None:
-    """Store a picture."""
+def backgrounds(client: Client, file: str) -> None:
+    """Store a background picture."""
     stored = client.upload_background(file)
     say({"id": stored, "name": Path(file).name}, lambda: f"Background {Path(file).name}: {stored}")

@@ -1,18 +1,15 @@
 """Kinds of options: listed by section in ``--help``, or labels."""
 
 from collections.abc import Callable
-from itertools import groupby
 from typing import Any, TypeVar
 
 import click
-
-__all__ = ["SectionOption", "Sectioned", "tag_option"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 class SectionOption(click.Option):
-    """An option that ``--help`` lists in a section."""
+    """An option in a section of ``--help``."""
 
     def __init__(self, *declarations: Any, section: str, **attributes: Any) -> None:
         super().__init__(*declarations, **attributes)
@@ -20,18 +17,20 @@ class SectionOption(click.Option):
 
 
 class Sectioned(click.Command):
-    """A command with so many options that ``--help`` lists them by section."""
+    """A command with its options listed by section in ``--help``."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """As click's own, section by section."""
-        options = (each for each in self.get_params(ctx) if isinstance(each, click.Option))
-        for title, section in groupby(options, lambda option: getattr(option, "section", "Server and results")):
+        """List the options section by section."""
+        options = [option for option in self.get_params(ctx) if isinstance(option, click.Option)]
+        sections = dict.fromkeys(option.section for option in options if isinstance(option, SectionOption))
+        for title in (*sections, "Server and results"):
             with formatter.section(title):
-                formatter.write_dl([record for option in section if (record := option.get_help_record(ctx))])
+                members = (each for each in options if getattr(each, "section", "Server and results") == title)
+                formatter.write_dl([record for each in members if (record := each.get_help_record(ctx))])
 
 
 def tag_option(help: str) -> Callable[[F], F]:
-    """--tag KEY=VALUE, a job's labels; given several times they come as one mapping, ``labels``."""
+    """--tag KEY=VALUE, repeatable; passed on as one mapping, ``labels``."""
     return click.option("--tag", "labels", multiple=True, metavar="KEY=VALUE", callback=_labels, help=help)
 
 

@@ -1,4 +1,4 @@
-"""The OpenAPI document: what FastAPI finds out by itself, and what it cannot know."""
+"""The OpenAPI document: FastAPI's, completed."""
 
 from typing import Any, Final
 
@@ -15,20 +15,20 @@ _OF_FASTAPI: Final = ("HTTPValidationError", "ValidationError")
 
 
 def contract(app: FastAPI) -> dict[str, Any]:
-    """The document of ``app``, made once."""
+    """The document of ``app``, cached."""
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         _name_schemas(document["components"]["schemas"])
         _ask_for_tokens(document)
         for operations in document["paths"].values():
             for operation in operations.values():
-                operation["responses"].pop("422", None)  # it is one of "4XX", and no HTTPValidationError
+                operation["responses"].pop("422", None)  # included in "4XX"
         app.openapi_schema = document
     return app.openapi_schema
 
 
 def _name_schemas(schemas: dict[str, Any]) -> None:
-    """Add those that no route returns by itself, and remove those of errors that are never sent."""
+    """Add models that no route declares, and remove FastAPI's own errors."""
     for model in (Event, Problem):
         schema = model.model_json_schema(ref_template=_REFERENCES)
         schemas |= schema.pop("$defs", {}) | {model.__name__: schema}
@@ -37,7 +37,7 @@ def _name_schemas(schemas: dict[str, Any]) -> None:
 
 
 def _ask_for_tokens(document: dict[str, Any]) -> None:
-    """Everything takes a token; without one only what is open, unless the service has no tokens at all."""
+    """Declare the token: optional for all paths, none for open ones."""
     document["components"]["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
     document["security"] = [{"token": []}, {}]
     for path in OPEN_PATHS & set(document["paths"]):

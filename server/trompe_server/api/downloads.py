@@ -1,4 +1,4 @@
-"""Files on their way out, in parts: whole or by range, with the hash of their bytes as ETag, or many as a zip."""
+"""Streamed downloads: a file or a range of it with its hash as ETag, or many files as a zip."""
 
 import hashlib
 import re
@@ -13,7 +13,7 @@ from fastapi import Request
 from fastapi.responses import Response, StreamingResponse
 
 from trompe_server.api.problems import problem_response
-from trompe_server.artifacts import JobArtifacts
+from trompe_server.storage.folders import JobArtifacts
 
 __all__ = ["Digests", "send_file", "zip_stream"]
 
@@ -21,17 +21,17 @@ PART: Final = 256 * 2**10
 REMEMBERED: Final = 10_000
 _RANGE: Final = re.compile(r"bytes=(\d*)-(\d*)")
 _PACKED: Final = frozenset({".gif", ".jpg", ".npz", ".png", ".webp", ".zip"})
-"""Endings of files that do not get smaller by packing them."""
+"""Suffixes of compressed files."""
 
 
 class Digests:
-    """SHA-256 of files that do not change any more, remembered: a file is read for it once."""
+    """SHA-256 of files, cached for files that no longer change."""
 
     def __init__(self) -> None:
         self._known: OrderedDict[tuple[str, str], str] = OrderedDict()
 
     def of(self, artifacts: JobArtifacts, job: str, name: str, *, lasting: bool) -> str:
-        """The hash of a file of a job, in hex; remembered where the file is ``lasting``."""
+        """Hash of a job's file in hexadecimal; cached if ``lasting``."""
         if lasting and (job, name) in self._known:
             return self._known[job, name]
         hashed = hashlib.sha256()
@@ -46,14 +46,14 @@ class Digests:
 
 
 def send_file(request: Request, artifacts: JobArtifacts, name: str, *, digest: str) -> Response:
-    """The file ``name``: 304 where the client has it, 206 for one range of it (several are answered with the whole)."""
+    """Response with the file ``name``: 200, 206 for one range, 304 if unchanged. Several ranges get the whole file."""
     size, etag = artifacts.size(name), f'"{digest}"'
     headers = {"ETag": etag, "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
     if _has(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     asked = _asked_range(request, size, etag)
     if asked is not None and not 0 <= asked.start < asked.stop:
-        detail = f"The file has {size} bytes; {request.headers['range']!r} asks for none of them."
+        detail = f"The file has {size} bytes; the range {request.headers['range']!r} is outside."
         response = problem_response(request, 416, code="no-such-range", detail=detail)
         response.headers["Content-Range"] = f"bytes */{size}"
         return response
@@ -67,7 +67,7 @@ def send_file(request: Request, artifacts: JobArtifacts, name: str, *, digest: s
 
 
 def zip_stream(artifacts: JobArtifacts, names: Iterable[str], *, time: datetime) -> Iterator[bytes]:
-    """A zip of the files ``names`` as it comes into being, all dated ``time``. No more than a part is in memory."""
+    """A zip of the files ``names``, dated ``time``, in parts: memory holds one part at a time."""
     sink = _Sink()
     with zipfile.ZipFile(cast(BinaryIO, sink), "w") as archive:
         for name in names:
@@ -82,7 +82,7 @@ def zip_stream(artifacts: JobArtifacts, names: Iterable[str], *, time: datetime)
 
 
 class _Sink:
-    """What a zip is written to: it can be asked for what was written since."""
+    """A write-only file; ``take`` removes and returns its content."""
 
     def __init__(self) -> None:
         self._written = bytearray()
@@ -110,12 +110,12 @@ def _parts(file: BinaryIO, wanted: range) -> Iterator[bytes]:
 
 
 def _has(header: str | None, etag: str) -> bool:
-    """Whether ``If-None-Match`` names this ETag; a weak one does for it."""
+    """Whether ``If-None-Match`` has this ETag, weak ones included."""
     return header is not None and any(each.strip().removeprefix("W/") in {etag, "*"} for each in header.split(","))
 
 
 def _asked_range(request: Request, size: int, etag: str) -> range | None:
-    """The bytes that the request asks for, which may be none; ``None`` where it asks for the whole."""
+    """The requested bytes, possibly none; ``None`` for the whole file."""
     match = _RANGE.fullmatch(request.headers.get("range", ""))
     if match is None or match[0] == "bytes=-" or request.headers.get("if-range", etag) != etag:
         return None

@@ -1,30 +1,6 @@
-"""The examples of the OpenAPI document. A test posts the requests and checks the answers against their schemas."""
+"""Examples of the OpenAPI document. A test posts the requests and checks the answers against their schemas."""
 
 from typing import Any, Final
-
-__all__ = [
-    "ARCHIVE",
-    "BACKGROUND",
-    "BACKGROUND_LIST",
-    "CLASSIFIER",
-    "CLASSIFIER_LIST",
-    "EVENT_STREAM",
-    "EXPERIMENT_LIST",
-    "FILE",
-    "HEALTHY",
-    "JOB",
-    "JOB_LIST",
-    "JOB_REQUESTS",
-    "OBJECT",
-    "OBJECT_LIST",
-    "PART_ANSWERS",
-    "READY",
-    "RENDERER_LIST",
-    "RESULT",
-    "WORKER_LIST",
-    "found",
-    "made",
-]
 
 Content = dict[str, Any]
 Answers = dict[int | str, dict[str, Any]]
@@ -34,12 +10,12 @@ def _json(example: Any) -> Content:
     return {"content": {"application/json": {"example": example}}}
 
 
-def found(content: Content, description: str = "What was asked for") -> Answers:
+def found(content: Content, description: str = "Found") -> Answers:
     """The answer 200 with this example."""
     return {200: {"description": description, **content}}
 
 
-def made(content: Content, description: str = "What was made") -> Answers:
+def made(content: Content, description: str = "Created") -> Answers:
     """The answer 201 with this example."""
     return {201: {"description": description, **content}}
 
@@ -47,29 +23,27 @@ def made(content: Content, description: str = "What was made") -> Answers:
 JOB_REQUESTS: Final[dict[str, Any]] = {
     "shortest": {
         "summary": "The shipped mug against the shipped classifier",
-        "value": {"object": "mug", "label": "mug"},
+        "value": {"object": "mug", "goal": {"label": "mug"}},
     },
     "labelled": {
-        "summary": "A job of a series: it waits behind others, and is found by its labels",
+        "summary": "A job of a series with low priority, found by its labels",
         "value": {
             "object": "mug",
-            "label": "mug",
-            "classifier": "tiny",
-            "epsilon": 0.02,
-            "steps": 60,
-            "seed": 7,
+            "goal": {"label": "mug"},
+            "victim": {"classifier": "tiny"},
+            "paint": {"epsilon": 0.02},
+            "search": {"steps": 60, "seed": 7},
             "priority": "sweep",
             "labels": {"experiment": "mugs", "epsilon": "0.02"},
         },
     },
     "targeted": {
-        "summary": "To be taken for a bottle, before two backgrounds, where saliency is highest",
+        "summary": "Targeted at a bottle, before two backgrounds, with a fifth of the texels",
         "value": {
             "object": "mug",
-            "label": "mug",
-            "target_label": "bottle",
-            "background": ["black", "#a0c0e0"],
-            "keep": 0.2,
+            "goal": {"label": "mug", "target": "bottle"},
+            "paint": {"keep": 0.2},
+            "views": {"background": ["black", "#a0c0e0"]},
         },
     },
 }
@@ -77,7 +51,8 @@ JOB_REQUESTS: Final[dict[str, Any]] = {
 _JOB: Final[dict[str, Any]] = {
     "id": "8f14e45fceea167a",
     "state": "running",
-    "spec": {"object": "mug", "label": "mug", "classifier": "tiny", "epsilon": 0.02, "alpha": 0.004},
+    "spec": {"object": "mug", "goal": {"label": ["mug"]}, "victim": {"classifier": "tiny"}, "paint": {"epsilon": 0.02}},
+    "names": {},
     "priority": "sweep",
     "labels": {"experiment": "mugs"},
     "needs": "any",
@@ -93,6 +68,7 @@ _JOB: Final[dict[str, Any]] = {
         "loss": 1.5,
         "fooled": 0.4,
         "eta_seconds": 12.0,
+        "eta_least_seconds": 4.5,
     },
     "attempts": 1,
     "error": None,
@@ -142,7 +118,9 @@ CLASSIFIER_LIST: Final = _json([_CLASSIFIER])
 BACKGROUND: Final = _json(_BACKGROUND)
 BACKGROUND_LIST: Final = _json([_BACKGROUND])
 WORKER_LIST: Final = _json([_WORKER])
-RENDERER_LIST: Final = _json([{"address": "127.0.0.1:8085", "alive": True}])
+RENDERER_LIST: Final = _json(
+    [{"address": "127.0.0.1:8085", "alive": True, "engine": "pyrender", "version": "0.1.45", "settings": ""}]
+)
 EXPERIMENT_LIST: Final = _json([_EXPERIMENT])
 HEALTHY: Final = _json({"status": "ok"})
 READY: Final = _json({"status": "ready"})
@@ -157,6 +135,7 @@ ARCHIVE: Final[dict[str, Any]] = {
 }
 _ACCURACY: Final = {
     "views": 60,
+    "distinct": 50,
     "a_before": 0.95,
     "a_after": 0.05,
     "a_drop": 0.947,
@@ -179,10 +158,12 @@ _VIEW: Final = {
 }
 RESULT: Final = _json(
     {
-        "spec": {"object": "mug", "label": "mug"},
+        "spec": {"object": "mug", "goal": {"label": ["mug"]}},
         "object": "mug",
         "label": 2,
         "label_name": "mug",
+        "labels": [2],
+        "label_names": ["mug"],
         "classifier": "tiny",
         "epsilon": 0.05,
         "alpha": 0.01,
@@ -196,12 +177,14 @@ RESULT: Final = _json(
         "target": _ACCURACY,
         "held_out": _ACCURACY,
         "transfer_gap": 0.0,
+        "disagreement": 0.0,
+        "margin_error": 0.02,
         "texels_altered": 0.62,
         "mean_texel_change": 0.031,
         "max_view_change": 0.049,
-        "seconds": {"prepare": 3.1, "calibrate": 6.4, "attack": 21.0, "judge": 3.0},
+        "seconds": {"open": 0.4, "prepare": 3.1, "calibrate": 6.4, "attack": 21.0, "judge": 3.0, "report": 2.2},
         "probe_renders": 304,
-        "versions": {"trompe": "0.1.0"},
+        "versions": {"trompe": "0.2.0"},
         "views": [_VIEW],
         "held_out_views": [_VIEW],
     }
@@ -210,6 +193,6 @@ RESULT: Final = _json(
 _BYTES: Final = {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}
 FILE: Final = _BYTES
 PART_ANSWERS: Final[Answers] = {
-    206: {"description": "The range of it that was asked for.", **_BYTES},
-    304: {"description": "The client has it already (If-None-Match)."},
+    206: {"description": "The requested range.", **_BYTES},
+    304: {"description": "Unchanged (If-None-Match)."},
 }

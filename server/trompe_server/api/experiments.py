@@ -1,4 +1,4 @@
-"""Routes for experiments. One is no record of its own: it is the jobs with the label ``experiment=<name>``."""
+"""Routes for experiments. An experiment is the jobs with the label ``experiment=<name>``."""
 
 from typing import Final
 
@@ -20,7 +20,7 @@ LABEL: Final = "experiment"
 
 @router.get("", responses=examples.found(examples.EXPERIMENT_LIST))
 def list_experiments(store: StoreDep) -> list[ExperimentInfo]:
-    """Experiments with their jobs counted by state, the newest first."""
+    """Experiments with the number of their jobs by state, newest first."""
     return [
         ExperimentInfo(name=group.value, jobs=dict(group.counts), created=group.created)
         for group in store.groups(LABEL)
@@ -29,8 +29,8 @@ def list_experiments(store: StoreDep) -> list[ExperimentInfo]:
 
 @router.get("/{name:path}", responses=examples.found(examples.JOB_LIST))
 def read_experiment(store: StoreDep, name: str, limit: Limit = 50, cursor: Cursor = None) -> JobList:
-    """The jobs of an experiment, newest first."""
+    """Jobs of an experiment, newest first."""
     page = store.page(labels={LABEL: name}, limit=limit, cursor=cursor)
     if not page.jobs and cursor is None:
-        raise NotFoundError(f"There is no experiment {name!r}. GET /v1/experiments lists them.")
+        raise NotFoundError(f"There is no experiment {name!r}. List the experiments to find its name.")
     return page

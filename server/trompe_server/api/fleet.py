@@ -1,4 +1,4 @@
-"""Routes for what does the work: attack workers and renderer workers."""
+"""Routes for attack workers and renderer workers."""
 
 from fastapi import APIRouter
 
@@ -14,11 +14,11 @@ router = APIRouter(prefix="/v1", tags=["workers"], responses=PROBLEMS)
 
 @router.get("/workers", responses=examples.found(examples.WORKER_LIST))
 def list_workers(store: StoreDep) -> list[WorkerInfo]:
-    """Attack workers, as their last heartbeats told."""
+    """Attack workers, by their latest heartbeats."""
     return store.workers()
 
 
 @router.get("/renderers", responses=examples.found(examples.RENDERER_LIST))
 def list_renderers(services: ServicesDep) -> list[RendererInfo]:
-    """Renderer workers that this server knows, and whether they accept connections."""
+    """Renderer workers of this server: whether they accept connections, and their engines."""
     return services.renderers()

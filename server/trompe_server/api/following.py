@@ -1,4 +1,4 @@
-"""A job's events as a stream (SSE) that a client can take up again where it broke off."""
+"""A job's events as a resumable stream (SSE)."""
 
 import asyncio
 import logging
@@ -8,9 +8,9 @@ from typing import Final
 import anyio
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
-from trompe_server.database import DatabaseDownError
 from trompe_server.errors import NotFoundError
-from trompe_server.jobs.store import JobStore
+from trompe_server.queue.store import JobStore
+from trompe_server.storage.database import DatabaseDownError
 from trompe_shared.api import Event
 
 __all__ = ["follow"]
@@ -18,17 +18,17 @@ __all__ = ["follow"]
 logger = logging.getLogger(__name__)
 
 INTERVAL: Final = 0.25
-"""Seconds between two looks for new events of a job in which something happens."""
+"""Seconds between two queries for new events of an active job."""
 PATIENCE: Final = 2.0
-"""The most that the interval grows to while nothing happens: hundreds of waiting jobs may be followed at once."""
+"""Longest interval for an idle job; hundreds of queued jobs may be followed at once."""
 KEEP_ALIVE: Final = 15
-"""Seconds between two comments that keep the connection from being taken for dead."""
+"""Seconds between two comments that keep the connection alive."""
 GRACE: Final = 2.0
-"""Seconds that streams have to end in good order when the server stops."""
+"""Seconds for streams to end when the server stops."""
 
 
 def follow(store: JobStore, job: str, *, after: int) -> EventSourceResponse:
-    """Events with ids above ``after`` until the job has ended or is deleted, or the server stops."""
+    """Stream events with ids above ``after`` until the job ends or is deleted, or the server stops."""
     stopping = anyio.Event()
     messages = _messages(store, job, after, stopping)
     return EventSourceResponse(messages, ping=KEEP_ALIVE, shutdown_event=stopping, shutdown_grace_period=GRACE)
@@ -49,9 +49,9 @@ async def _messages(store: JobStore, job: str, after: int, stopping: anyio.Event
 
 
 def _look(store: JobStore, job: str, after: int) -> tuple[list[Event], bool]:
-    """New events, and whether there will be no more. A database that is away is waited for.
+    """New events, and whether they are the last. If the database is down, none.
 
-    The state is read first: a job that had ended by then has all its events.
+    The state is read first: a job that has ended by then has all its events.
     """
     try:
         over = store.get(job).state.final
@@ -59,5 +59,5 @@ def _look(store: JobStore, job: str, after: int) -> tuple[list[Event], bool]:
     except NotFoundError:
         return [], True
     except DatabaseDownError:
-        logger.warning("the events of job %s cannot be read; its followers wait", job)
+        logger.warning("cannot read the events of job %s; retrying", job)
         return [], False

@@ -1,7 +1,7 @@
-"""Who may come in. Every path is closed unless it is listed as open, so that a new route is safe by default.
+"""Access control. Paths are closed unless listed as open, so that a new route is safe by default.
 
-Without any token the service is open, which ``serve`` allows on loopback alone. A page in a browser could still send
-requests there; two headers that browsers add and pages cannot forge tell them apart (``Host`` and ``Origin``).
+Without tokens the service is open, which ``serve`` allows on loopback only. Requests that a web page makes there are
+recognised by two headers that pages cannot forge: ``Host`` and ``Origin``.
 """
 
 import asyncio
@@ -16,27 +16,27 @@ from urllib.parse import SplitResult, urlsplit
 from fastapi import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from trompe_server.access import Right, Token, Tokens, hash_secret
 from trompe_server.api.problems import problem_response
 from trompe_server.api.rate import RateLimit
+from trompe_server.storage.tokens import Right, Token, Tokens, hash_secret
 
 __all__ = ["COOKIE", "OPEN_PATHS", "Guard"]
 
 OPEN_PATHS: Final = frozenset({"/docs", "/openapi.json", "/healthz", "/readyz", "/login", "/logout"})
-"""What needs no token: whether the service is up, what it offers, and where browsers sign in and out."""
+"""Paths without a token: health, documentation, sign-in and sign-out."""
 OPEN_FOLDER: Final = "/static/"
-"""Files that go with the pages and are the same everywhere."""
+"""Static files of the pages."""
 COOKIE: Final = "trompe_token"
-"""Holds the token of someone who signed in by a browser."""
+"""Cookie with the token of a signed-in browser."""
 UNLIMITED_PATHS: Final = frozenset({"/healthz"})
 READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 FRESH: Final = 1.0
-"""Seconds for which the tokens are not looked up again: so long a revoked one may still work."""
+"""Seconds between two reads of the tokens; a revoked token works no longer than that."""
 _CREATE: Final = "`trompe token create NAME --right read|write` makes one."
 
 
 class _RefusedError(Exception):
-    """A request that is not let in."""
+    """A refused request."""
 
     def __init__(self, status: int, code: str, detail: str, **headers: str) -> None:
         super().__init__(detail)
@@ -45,7 +45,7 @@ class _RefusedError(Exception):
 
 
 class Guard:
-    """Lets requests in by token, by rate and, where there are no tokens, by where they come from."""
+    """Admits requests by token and rate; without tokens, by origin."""
 
     def __init__(self, app: ASGIApp, *, tokens: Tokens, rate: float) -> None:
         self._app, self._tokens, self._limit = app, tokens, RateLimit(rate)
@@ -67,8 +67,8 @@ class Guard:
         await self._app(scope, receive, send)
 
     async def _admit(self, request: Request) -> None:
-        """Raise ``_RefusedError`` unless the request may be served."""
-        path = request.scope["path"]  # not request.url.path, which a made-up Host header can change
+        """Raise ``_RefusedError`` for a request to refuse."""
+        path = request.scope["path"]  # not request.url.path: a forged Host header can change it
         address = request.client.host if request.client else "unknown"
         try:
             _check_origin(request)
@@ -83,14 +83,14 @@ class Guard:
             await self._check_right(token, request)
 
     async def _identify(self, request: Request) -> Token | None:
-        """The token of a request; ``None`` where there are none to ask for."""
+        """The token of a request; ``None`` if the service has none."""
         known = await self._fresh_tokens()
         if not known:
             _check_host(request)
             return None
         token = _find(known, _secret(request))
         if token is None or token.revoked is not None:
-            raise _unauthorized(f"The token is not known, or was revoked. {_CREATE}", ', error="invalid_token"')
+            raise _unauthorized(f"The token is unknown or revoked. {_CREATE}", ', error="invalid_token"')
         request.scope["token"] = token.name
         return token
 
@@ -111,12 +111,12 @@ class Guard:
             raise _RefusedError(
                 429,
                 "too-many-requests",
-                f"That were too many requests; the next one is served in {wait:.2f} s (TROMPE_RATE_LIMIT).",
+                f"Too many requests; retry in {wait:.2f} s (limit: TROMPE_RATE_LIMIT).",
                 Retry_After=str(math.ceil(wait)),
             )
 
     async def _fresh_tokens(self) -> Mapping[str, Token]:
-        """The tokens as they were at most ``FRESH`` seconds ago."""
+        """The tokens, at most ``FRESH`` seconds old."""
         async with self._lock:
             if time.monotonic() - self._looked_up > FRESH:
                 self._known = await asyncio.to_thread(self._tokens.by_hash)
@@ -125,26 +125,26 @@ class Guard:
 
 
 def _secret(request: Request) -> str:
-    """The secret that a request shows: in its header, or in the cookie of a browser that signed in."""
+    """The secret in the request's header, or in the cookie of a signed-in browser."""
     if "authorization" not in request.headers and COOKIE in request.cookies:
         if request.method not in READING and "origin" not in request.headers:
-            raise _RefusedError(403, "other-origin", "A browser that writes must say from which page (Origin).")
+            raise _RefusedError(403, "other-origin", "A browser must send the header Origin with a write.")
         return request.cookies[COOKIE]
     scheme, _, secret = request.headers.get("authorization", "").partition(" ")
     if scheme.lower() != "bearer" or not secret:
-        raise _unauthorized("This needs a token: send `Authorization: Bearer trompe_...`.")
+        raise _unauthorized("A token is required: send `Authorization: Bearer trompe_...`.")
     return secret.strip()
 
 
 def _find(known: Mapping[str, Token], secret: str) -> Token | None:
-    """The token with this secret, in a time that does not tell how much of its hash was right."""
+    """The token with this secret, in constant time."""
     wanted = hash_secret(secret)
     found = [token for sha256, token in known.items() if hmac.compare_digest(sha256, wanted)]
     return found[0] if found else None
 
 
 def _check_origin(request: Request) -> None:
-    """Refuse a write that a page of another site makes: no other site is allowed in (CORS is closed)."""
+    """Refuse a write by a page of another site."""
     origin = request.headers.get("origin")
     if origin is None or request.method in READING:
         return
@@ -153,11 +153,11 @@ def _check_origin(request: Request) -> None:
 
 
 def _check_host(request: Request) -> None:
-    """Without tokens, refuse a public name: behind it may be a page whose name was made to point to this machine."""
+    """Without tokens, refuse public host names, against DNS rebinding."""
     name = _split(f"//{request.headers.get('host', '')}").hostname or ""
     if "." in name and not _is_address(name):
         raise _RefusedError(
-            403, "other-host", f"The service has no tokens and is known by its address, not as {name!r}. {_CREATE}"
+            403, "other-host", f"Without tokens the service answers by its address only, not as {name!r}. {_CREATE}"
         )
 
 
@@ -165,7 +165,7 @@ def _split(url: str) -> SplitResult:
     try:
         return urlsplit(url)
     except ValueError as error:
-        raise _RefusedError(400, "no-address", f"{url[:80]!r} is no address ({error}).") from error
+        raise _RefusedError(400, "no-address", f"{url[:80]!r} is not an address ({error}).") from error
 
 
 def _is_address(name: str) -> bool:

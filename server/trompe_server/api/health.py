@@ -1,4 +1,4 @@
-"""Whether the service lives, and whether it can work."""
+"""Liveness and readiness."""
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
@@ -20,7 +20,7 @@ def health() -> dict[str, str]:
 
 @router.get("/readyz", responses=examples.found(examples.READY))
 def readiness(services: ServicesDep, request: Request) -> Response:
-    """The database answers, the worker takes jobs and the renderer can be reached; 503 says what is missing."""
+    """Database, worker and renderer are up; 503 names the missing ones."""
     services.store.page(limit=1)
     missing = services.missing()
     if missing:

@@ -1,5 +1,6 @@
-"""Routes for jobs: submit, list, read, cancel, repeat, follow, fetch what came out, delete."""
+"""Routes for jobs: submit, list, read, cancel, retry, follow, download, delete."""
 
+from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Annotated, Any, Final
 
@@ -14,7 +15,8 @@ from trompe_server.api.problems import PROBLEMS
 from trompe_server.api.services import DigestsDep, ServicesDep, StoreDep
 from trompe_server.api.submission import checked_spec
 from trompe_server.errors import ConflictError, NotFoundError
-from trompe_server.jobs.store import JobStore
+from trompe_server.queue import retention
+from trompe_server.queue.store import JobStore
 from trompe_shared.api import Job, JobList, JobRequest, JobState, Result
 from trompe_shared.errors import SpecError
 
@@ -25,45 +27,42 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=PROBLEMS)
 RESULT: Final = "result.json"
 
 _NEW_OR_KNOWN: Final[dict[int | str, dict[str, Any]]] = {
-    200: {"model": Job, "description": "The job that the same request made before", **examples.JOB},
+    200: {"model": Job, "description": "The job of an earlier request with the same key", **examples.JOB},
     **examples.made(examples.JOB),
 }
 
 IdempotencyKey = Annotated[
     str | None,
     Header(
-        description="a text of your own choice: sending it again with the same request makes no second job",
+        description="a text of your choice; the same request with the same key makes one job",
         min_length=1,
         max_length=255,
     ),
 ]
 Limit = Annotated[int, Query(ge=1, le=500)]
-Cursor = Annotated[str | None, Query(description="next_cursor of the page before", max_length=200)]
+Cursor = Annotated[str | None, Query(description="next_cursor of the previous page", max_length=200)]
 LabelFilters = Annotated[
-    list[str], Query(alias="label", description="key:value; a job must have all of them", max_length=32)
+    list[str], Query(alias="label", description="key:value; a job must have all labels", max_length=32)
 ]
 
 
-@router.post(
-    "",
-    status_code=201,
-    responses=_NEW_OR_KNOWN,
-)
+@router.post("", status_code=201, responses=_NEW_OR_KNOWN)
 def submit(
     services: ServicesDep,
     request: Annotated[JobRequest, Body(openapi_examples=examples.JOB_REQUESTS)],
     response: Response,
     idempotency_key: IdempotencyKey = None,
 ) -> Job:
-    """Queue an attack. What it names must exist; the job keeps the ids, so that later uploads do not change it."""
-    return _create(services.store, checked_spec(request, services.library), response, idempotency_key)
+    """Queue an attack. Objects and networks must exist. The job keeps their ids: later uploads do not change it."""
+    spec, names = checked_spec(request, services.library)
+    return _create(services.store, spec, names, response, idempotency_key)
 
 
 @router.post("/check", status_code=204)
 def check_job(
     services: ServicesDep, request: Annotated[JobRequest, Body(openapi_examples=examples.JOB_REQUESTS)]
 ) -> None:
-    """Whether a job could be submitted: 204, or the problem that submitting it would meet. Nothing is queued."""
+    """Check a job without queueing it: 204, or the problem that submitting it would return."""
     checked_spec(request, services.library)
 
 
@@ -90,35 +89,25 @@ def read_job(store: StoreDep, job: str) -> Job:
 
 @router.delete("/{job}", status_code=204)
 def delete_job(services: ServicesDep, job: str) -> None:
-    """Delete a job that has ended, with all its files."""
-    services.store.delete(job)
-    services.artifacts(job).delete()
+    """Delete an ended job with all its files."""
+    retention.delete_job(services.store, services.files, job)
 
 
 @router.post("/{job}/cancel", responses=examples.found(examples.JOB))
 def cancel_job(store: StoreDep, job: str) -> Job:
-    """Cancel a job: a queued one at once, a running one within moments. A job that has ended stays as it is."""
+    """Cancel a job: a queued one at once, a running one within seconds. An ended job stays as it is."""
     return store.request_cancel(job)
 
 
-@router.post(
-    "/{job}/retry",
-    status_code=201,
-    responses=_NEW_OR_KNOWN,
-)
+@router.post("/{job}/retry", status_code=201, responses=_NEW_OR_KNOWN)
 def retry_job(services: ServicesDep, job: str, response: Response, idempotency_key: IdempotencyKey = None) -> Job:
-    """Queue the same attack once more, as a new job. The old one must have ended, and stays."""
+    """Queue the same attack as a new job. The old one must have ended, and stays."""
     old = services.store.get(job)
     if not old.state.final:
-        raise ConflictError(f"Job {job} is {old.state} and goes on by itself; cancel it first to start it anew.")
-    foreign = services.store.not_understood(job)
-    if foreign:
-        raise ConflictError(
-            f"Job {job} has the options {foreign}, which only another version of Trompe understands: start it there."
-        )
+        raise ConflictError(f"Job {job} is {old.state} and has not ended; cancel it before a retry.")
     queued = {"priority": old.priority, "labels": old.labels, "needs": old.needs}
-    request = JobRequest.of(old.spec).model_copy(update=queued)
-    return _create(services.store, request, response, idempotency_key)
+    request = JobRequest.model_validate(old.spec.model_dump() | queued)
+    return _create(services.store, request, old.names, response, idempotency_key)
 
 
 @router.get(
@@ -126,7 +115,7 @@ def retry_job(services: ServicesDep, job: str, response: Response, idempotency_k
     response_class=EventSourceResponse,
     responses={
         200: {
-            "description": "Server-sent events named `progress`; the data of each is an Event.",
+            "description": "Server-sent events named `progress`, each with an Event as data.",
             "content": {"text/event-stream": {"example": examples.EVENT_STREAM}},
         }
     },
@@ -134,9 +123,9 @@ def retry_job(services: ServicesDep, job: str, response: Response, idempotency_k
 def follow_job(
     store: StoreDep,
     job: str,
-    last_event_id: Annotated[str | None, Header(description="go on after this event")] = None,
+    last_event_id: Annotated[str | None, Header(description="resume after this event")] = None,
 ) -> EventSourceResponse:
-    """Events of a job from its beginning, or after ``Last-Event-ID``, until it has ended."""
+    """Events of a job from the first, or after ``Last-Event-ID``, to the last."""
     store.get(job)
     known = last_event_id is not None and last_event_id.isascii() and last_event_id.isdecimal()
     return follow(store, job, after=min(int(last_event_id or 0), 2**31 - 1) if known else 0)
@@ -144,12 +133,10 @@ def follow_job(
 
 @router.get("/{job}/result", response_model=Result, responses=examples.found(examples.RESULT) | examples.PART_ANSWERS)
 def read_result(services: ServicesDep, digests: DigestsDep, request: Request, job: str) -> Response:
-    """The result of a job that has ended well."""
+    """Result of a successful job."""
     found = services.store.get(job)
     if not found.state.final:
-        raise ConflictError(
-            f"Job {job} is {found.state}; its result is there once it has ended. Follow /v1/jobs/{job}/events."
-        )
+        raise ConflictError(f"Job {job} is {found.state} and has no result yet. Wait for its end.")
     if RESULT not in found.artifacts:
         raise ConflictError(
             f"Job {job} ended as {found.state} without a result: {found.error or found.note or 'no reason given'}"
@@ -162,7 +149,7 @@ def read_result(services: ServicesDep, digests: DigestsDep, request: Request, jo
     "/{job}/artifacts/{name}", response_class=Response, responses=examples.found(examples.FILE) | examples.PART_ANSWERS
 )
 def read_artifact(services: ServicesDep, digests: DigestsDep, request: Request, job: str, name: str) -> Response:
-    """A file that the job made, one of its ``artifacts``: whole, or a range of its bytes. The ETag is their SHA-256."""
+    """One of the job's ``artifacts``, or a range of its bytes. The ETag is the file's SHA-256."""
     found = services.store.get(job)
     if name not in found.artifacts:
         known = ", ".join(found.artifacts) or "none yet"
@@ -175,14 +162,14 @@ def read_archive(services: ServicesDep, job: str) -> StreamingResponse:
     """All artifacts of a job as one zip."""
     found = services.store.get(job)
     if not found.artifacts:
-        raise NotFoundError(f"Job {job} is {found.state} and has no artifacts to pack.")
+        raise NotFoundError(f"Job {job} is {found.state} and has no artifacts.")
     parts = zip_stream(services.artifacts(job), found.artifacts, time=found.finished or found.created)
     disposition = f'attachment; filename="trompe-{PurePath(job).name}.zip"'
     return StreamingResponse(parts, media_type="application/zip", headers={"Content-Disposition": disposition})
 
 
-def _create(store: JobStore, request: JobRequest, response: Response, key: str | None) -> Job:
-    job, new = store.create(request, idempotency_key=key)
+def _create(store: JobStore, request: JobRequest, names: Mapping[str, str], response: Response, key: str | None) -> Job:
+    job, new = store.create(request, names=names, idempotency_key=key)
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
@@ -194,9 +181,9 @@ def labels_of(texts: list[str]) -> dict[str, str]:
     for text in texts:
         name, _, value = text.partition(":")
         if not (name and value):
-            raise SpecError(f"{text!r} is not a label; write it as key:value, such as label=experiment:mugs.")
+            raise SpecError(f"{text!r} is not a label; write key:value, such as label=experiment:mugs.")
         if labels.setdefault(name, value) != value:
-            raise SpecError(f"The label {name!r} is asked for twice, and no job has two values of one label.")
+            raise SpecError(f"The label {name!r} has two values, and a job has one value per label; give one of them.")
     return labels
 
 
@@ -206,4 +193,4 @@ def _send(services: ServicesDep, digests: DigestsDep, request: Request, job: Job
         digest = digests.of(artifacts, job.id, name, lasting=job.state.final)
         return send_file(request, artifacts, name, digest=digest)
     except FileNotFoundError as error:
-        raise NotFoundError(f"The file {name!r} of job {job.id} is not in the store any more.") from error
+        raise NotFoundError(f"The file {name!r} of job {job.id} is no longer in the store.") from error

@@ -19,13 +19,13 @@ __all__ = ["UPLOADS", "router"]
 T = TypeVar("T")
 
 UPLOADS: Final = 2
-"""Uploads that are looked into at the same time. The others wait on disk: each may take a lot of memory."""
+"""Uploads that are read at the same time, since each may take a lot of memory. The others wait on disk."""
 
 router = APIRouter(prefix="/v1", responses=PROBLEMS)
 
-Name = Annotated[str | None, Form(description="what it shall be called; the file's name by default", max_length=200)]
+Name = Annotated[str | None, Form(description="name to store it under; default: the file's name", max_length=200)]
 MaxTexture = Annotated[
-    int | None, Form(description="longest side of a texture, texels; larger ones are made smaller", ge=16, le=8192)
+    int | None, Form(description="longest side of a texture in texels; larger textures are scaled down", ge=16, le=8192)
 ]
 _names: TypeAdapter[list[str]] = TypeAdapter(list[str])
 
@@ -39,7 +39,7 @@ TurnDep = Annotated[asyncio.Semaphore, Depends(_turn)]
 
 
 async def _in_turn(turn: asyncio.Semaphore, action: Callable[[], T]) -> T:
-    """What ``action`` returns, done in a thread once it is its turn."""
+    """Run ``action`` in a thread, ``UPLOADS`` at a time."""
     async with turn:
         return await run_in_threadpool(action)
 
@@ -64,7 +64,7 @@ def list_objects(library: LibraryDep) -> list[ObjectInfo]:
 
 @router.get("/objects/{reference}", responses=examples.found(examples.OBJECT), tags=["objects"])
 def read_object(library: LibraryDep, reference: str) -> ObjectInfo:
-    """One object, by its id, the beginning of its id, or its name."""
+    """One object, by id, beginning of the id, or name."""
     return library.object(reference)
 
 
@@ -76,7 +76,7 @@ async def add_classifier(
     classes: Annotated[str | None, Form(description="JSON list of class names in the order of the logits")] = None,
     name: Name = None,
 ) -> ClassifierInfo:
-    """Upload a classifier: a .pt2 file (can be attacked) or an .onnx file (only judges)."""
+    """Upload a classifier: a .pt2 file, or an .onnx file (scores only)."""
     names = _class_names(classes)
     return await _in_turn(
         turn, lambda: library.add_classifier(file.file, file.filename or "", classes=names, name=name)
@@ -91,13 +91,13 @@ def list_classifiers(library: LibraryDep) -> list[ClassifierInfo]:
 
 @router.get("/classifiers/{reference}", responses=examples.found(examples.CLASSIFIER), tags=["classifiers"])
 def read_classifier(library: LibraryDep, reference: str) -> ClassifierInfo:
-    """One classifier, by its id, the beginning of its id, or its name."""
+    """One classifier, by id, beginning of the id, or name."""
     return library.classifier(reference)
 
 
 @router.post("/backgrounds", status_code=201, responses=examples.made(examples.BACKGROUND), tags=["backgrounds"])
 async def add_background(library: LibraryDep, turn: TurnDep, file: UploadFile) -> BackgroundInfo:
-    """Upload a picture that views can have behind the object; its id is then a job's ``background``."""
+    """Upload a background picture. Jobs name it by its id."""
     return await _in_turn(turn, lambda: library.add_background(file.file.read(), file.filename or "background"))
 
 

@@ -1,18 +1,20 @@
-"""What Prometheus asks for: the requests of this process, and the jobs and workers of the whole service."""
+"""Metrics: requests of this process, the queue, and counters of the workers."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Final
 
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Histogram, generate_latest
-from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.metrics_core import GaugeMetricFamily, Metric
+from prometheus_client.multiprocess import MultiProcessCollector
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 from starlette.types import Scope
 
 from trompe_server.api.problems import PROBLEMS
 from trompe_server.api.services import ServicesDep
-from trompe_server.jobs.store import Statistics
+from trompe_server.queue.store import Statistics
 
 __all__ = ["HttpMetrics", "router"]
 
@@ -24,7 +26,7 @@ _EXAMPLE: Final = '# TYPE trompe_jobs gauge\ntrompe_jobs{state="running"} 2.0\n'
 
 
 class HttpMetrics:
-    """Counts requests by route and status. One for each application, so that several can live in a process."""
+    """Counts requests by route and status. One per application, since a process may have several."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -41,45 +43,39 @@ class HttpMetrics:
         )
 
     def count(self, scope: Scope, status: int, seconds: float) -> None:
-        """Count one request, by the pattern of its route: paths themselves would be without number."""
+        """Count one request by the pattern of its route, not by its path, so that labels stay few."""
         route = getattr(scope.get("route"), "path", "none")
         method = scope["method"] if scope["method"] in METHODS else "other"
         self._requests.labels(method, route, status).inc()
         self._seconds.labels(method, route).observe(seconds)
 
 
-class _ServiceCollector(Collector):
-    """Turns the figures of the service, asked for once, into metrics."""
+class _QueueCollector(Collector):
+    """Metrics of the queue from one query, made at a scrape."""
 
     def __init__(self, statistics: Callable[[], Statistics]) -> None:
         self._statistics = statistics
 
     def describe(self) -> list[Metric]:
-        """Nothing ahead of time: the database is asked at a scrape, not when the collector is registered."""
+        """Nothing: registering must not query the database."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics of this moment."""
+        """The current metrics."""
         figures = self._statistics()
         jobs = GaugeMetricFamily("trompe_jobs", "Jobs by state.", labels=["state"])
         for state, count in figures.jobs.items():
             jobs.add_metric([state.value], count)
         yield jobs
-        yield GaugeMetricFamily(
-            "trompe_queue_age_seconds", "Seconds that the oldest queued job waits.", figures.oldest_queued
-        )
-        for name, words in _TOTALS.items():
-            yield CounterMetricFamily(f"trompe_{name}", words, getattr(figures, name))
+        yield GaugeMetricFamily("trompe_queue_age_seconds", "Wait of the oldest queued job.", figures.oldest_queued)
 
 
-_TOTALS: Final = {
-    "attack_steps": "Steps of attacks.",
-    "step_seconds": "Seconds that steps of attacks took.",
-    "classifier_images": "Images shown to classifiers.",
-    "classifier_seconds": "Seconds that classifiers took.",
-    "target_renders": "Images rendered by the target.",
-    "target_seconds": "Seconds that the target took.",
-}
+def _of_workers(folder: Path) -> CollectorRegistry:
+    """Counters that the workers of this machine write to ``folder`` in Prometheus' multi-process mode."""
+    registry = CollectorRegistry()
+    if folder.is_dir():
+        MultiProcessCollector(registry, path=str(folder))  # type: ignore[no-untyped-call]
+    return registry
 
 
 @router.get(
@@ -88,8 +84,9 @@ _TOTALS: Final = {
     responses={200: {"description": "Prometheus text.", "content": {"text/plain": {"example": _EXAMPLE}}}},
 )
 def metrics(services: ServicesDep, request: Request) -> Response:
-    """Figures for Prometheus: requests of this process; jobs, steps, classifiers and renders of all workers."""
-    service = CollectorRegistry()
-    service.register(_ServiceCollector(services.store.statistics))
+    """Metrics for Prometheus: requests of this process, the queue, and the counters of this machine's workers."""
+    queue = CollectorRegistry()
+    queue.register(_QueueCollector(services.store.statistics))
     http: HttpMetrics = request.app.state.metrics
-    return Response(generate_latest(http.registry) + generate_latest(service), media_type=CONTENT_TYPE_LATEST)
+    registries = (http.registry, queue, _of_workers(services.settings.data / "metrics"))
+    return Response(b"".join(map(generate_latest, registries)), media_type=CONTENT_TYPE_LATEST)

@@ -1,5 +1,4 @@
-"""What happens to every request, from the outside in: it gets an id, a line in the log and headers that keep browsers
-strict; what goes wrong becomes problem details; a body that is too large is refused while it comes in."""
+"""Middleware, from the outside in: request ids, log and security headers; errors as problem details; body limit."""
 
 import logging
 import secrets
@@ -26,13 +25,13 @@ HEADERS: Final = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-"""Headers of each response that does not set them itself."""
+"""Default headers of responses."""
 
 
 class Envelope:
-    """Gives each request an id, in ``scope["request_id"]`` and on the response; counts it, and logs it when it is over.
+    """Gives each request an id, in ``scope["request_id"]`` and on the response, counts it and logs it.
 
-    Seconds are those until the response begins: a stream of events may last for hours.
+    Logged seconds end at the start of the response, since a stream of events may last for hours.
     """
 
     def __init__(self, app: ASGIApp, *, metrics: HttpMetrics) -> None:
@@ -72,7 +71,7 @@ class Envelope:
 
 
 class Failures:
-    """Answers with problem details when something goes wrong before the response has begun."""
+    """Answers exceptions before the start of the response with problem details."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -95,7 +94,7 @@ class Failures:
 
 
 class BodyLimit:
-    """Refuses bodies of more than ``limit`` bytes with 413, by what they announce and by what they turn out to be."""
+    """Refuses bodies of more than ``limit`` bytes with 413, by announced and by actual size."""
 
     def __init__(self, app: ASGIApp, *, limit: int) -> None:
         self._app, self._limit = app, limit
@@ -122,7 +121,7 @@ class BodyLimit:
         await self._app(scope, receive_within_limit, send)
 
     def _refusal(self) -> str:
-        return f"The upload is larger than the {self._limit / 2**20:g} MiB that this server takes (TROMPE_MAX_UPLOAD)."
+        return f"The upload is larger than {self._limit / 2**20:g} MiB, the limit of this server (TROMPE_MAX_UPLOAD)."
 
 
 def _job(scope: Scope) -> str | None:

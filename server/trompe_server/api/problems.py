@@ -12,8 +12,8 @@ from fastapi.responses import JSONResponse
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 
-from trompe_server.database import DatabaseDownError
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
+from trompe_server.storage.database import DatabaseDownError
 from trompe_shared.api import Problem
 from trompe_shared.errors import TrompeError
 from trompe_shared.faults import faults_of
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 REQUEST_ID: Final = "X-Request-ID"
 RETRY_AFTER: Final = 5
-"""Seconds after which a client may try again where something was not up."""
+"""Seconds until a retry, if a part of the service is down."""
 
 _STATUS: Final[dict[type[TrompeError], int]] = {
     NotFoundError: 404,
@@ -36,7 +36,8 @@ _EXAMPLE: Final = {
     "type": "urn:trompe:unknown-label",
     "title": "Unprocessable Entity",
     "status": 422,
-    "detail": "The classifier has no class 'mag'; did you mean 'mug'? An index works too.",
+    "detail": "'tiny' has no class 'mag'; did you mean 'mug'? Give a class, its index, or another network by "
+    "`classifier`.",
     "instance": "/v1/jobs",
     "request_id": "5f0c1e7a9b3d2846",
 }
@@ -45,15 +46,15 @@ _SCHEMA: Final = {"$ref": "#/components/schemas/Problem"}
 
 PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
     "4XX": {
-        "description": "What was wrong with the request: problem details (RFC 9457)",
+        "description": "Refusal: problem details (RFC 9457)",
         "content": {"application/problem+json": {"schema": _SCHEMA, "example": _EXAMPLE}},
     }
 }
-"""What routes document about their errors."""
+"""Documentation of errors, for all routes."""
 
 
 def answer_with_problems(app: FastAPI) -> None:
-    """Make ``app`` answer every error with problem details."""
+    """Make ``app`` answer all errors with problem details."""
     app.add_exception_handler(TrompeError, _trompe_error)
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(HTTPException, _http_error)
@@ -67,7 +68,7 @@ def problem_response(
     detail: str | None = None,
     errors: list[dict[str, Any]] | None = None,
 ) -> JSONResponse:
-    """A response with problem details; ``code`` is the error's short name, for programs."""
+    """A response with problem details. ``code``: the error's short name, for programs."""
     problem = Problem(
         type=f"urn:trompe:{code}" if code else "about:blank",
         title=HTTPStatus(status).phrase,
@@ -106,15 +107,15 @@ async def _http_error(request: Request, error: Exception) -> JSONResponse:
 
 
 def failure_response(request: Request, error: Exception) -> JSONResponse:
-    """What is answered to an error that came up: one of ours, a full disk, a database that is away, or a mistake."""
+    """Answer to an exception: an error of ours, a full disk, a database that is down, or a bug."""
     if _is_disk_full(error):
         return _disk_full(request, error)
     if isinstance(error, PoolTimeoutError):
-        error = DatabaseDownError("The database has no connection free for this request.")
+        error = DatabaseDownError("All connections of the database are in use; retry in a few seconds.")
     if isinstance(error, TrompeError):
         return _refusal(request, error)
     logger.error("request %s failed", request.scope.get("request_id"), exc_info=error)
-    detail = "The server made a mistake; its log says more under this request id."
+    detail = "Internal error; see the server's log for this request id."
     return problem_response(request, 500, code="internal", detail=detail)
 
 
@@ -129,13 +130,13 @@ def _refusal(request: Request, error: TrompeError) -> JSONResponse:
 
 def _disk_full(request: Request, error: Exception) -> JSONResponse:
     logger.error("request %s: the disk is full: %s", request.scope.get("request_id"), error)
-    general = "The server's disk is full; nothing of this request was kept. Whoever runs it must make room."
+    general = "The server's disk is full; nothing of this request was stored. Its operator must free space."
     detail = str(error) if isinstance(error, TrompeError) else general
     return problem_response(request, 507, code="disk-full", detail=detail)
 
 
 def _is_disk_full(error: BaseException | None) -> bool:
-    """Whether this error, or one that it was raised from, says that there is no room."""
+    """Whether the error, or one of its causes, is a full disk."""
     if error is None:
         return False
     return (
@@ -146,6 +147,6 @@ def _is_disk_full(error: BaseException | None) -> bool:
 
 
 def _field(place: str) -> str:
-    """Name of a field without the part of the request it came in: body.epsilon -> epsilon."""
+    """Name of a field without the part of the request: body.paint.epsilon -> paint.epsilon."""
     part, _, inner = place.partition(".")
     return (inner if part in {"body", "query", "path", "header"} else place) or "body"

@@ -1,4 +1,4 @@
-"""How many requests one client may make: a bucket for each, which refills all the time."""
+"""Rate limit of requests by client."""
 
 import time
 from collections.abc import Callable
@@ -7,23 +7,20 @@ from typing import Final
 __all__ = ["BURST", "RateLimit"]
 
 BURST: Final = 20.0
-"""A client that was quiet may make the requests of so many seconds at once."""
+"""Seconds of requests that an idle client may make at once."""
 MAX_CLIENTS: Final = 10_000
-"""Clients that are remembered; those heard of longest ago are forgotten first."""
+"""Clients in memory; the least recent ones are dropped."""
 
 
 class RateLimit:
-    """``rate`` requests per second for each client; 0 sets no limit.
-
-    Of each bucket one number is kept, the moment at which it will be full again (the generic cell rate algorithm).
-    """
+    """``rate`` requests per second for each client; 0 sets no limit. Implements the generic cell rate algorithm."""
 
     def __init__(self, rate: float, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._rate, self._clock = rate, clock
         self._full_at: dict[str, float] = {}
 
     def wait(self, client: str) -> float:
-        """Count one request of ``client``: 0 where it may be made, else the seconds until one may be."""
+        """Count one request of ``client``. Returns the seconds until it is allowed, 0 for at once."""
         if not self._rate:
             return 0.0
         now = self._clock()

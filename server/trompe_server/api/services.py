@@ -1,4 +1,4 @@
-"""What the routes work with, and how they get it."""
+"""Services behind the routes, and their dependencies."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,12 +6,12 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from trompe_server.access import Tokens
 from trompe_server.api.downloads import Digests
-from trompe_server.artifacts import Folder, JobArtifacts, job_artifacts
-from trompe_server.jobs.store import JobStore
 from trompe_server.library import Library
+from trompe_server.queue.store import JobStore
 from trompe_server.settings import Settings
+from trompe_server.storage.folders import Folder, JobArtifacts, job_artifacts
+from trompe_server.storage.tokens import Tokens
 from trompe_shared.api import RendererInfo
 
 __all__ = ["DigestsDep", "LibraryDep", "Services", "ServicesDep", "StoreDep"]
@@ -19,7 +19,7 @@ __all__ = ["DigestsDep", "LibraryDep", "Services", "ServicesDep", "StoreDep"]
 
 @dataclass(frozen=True)
 class Services:
-    """Everything behind the API. ``missing`` says what is not up right now, in words; ``renderers`` asks each."""
+    """Services behind the API. ``missing`` names the parts that are down; ``renderers`` checks each renderer."""
 
     settings: Settings
     library: Library
@@ -30,7 +30,7 @@ class Services:
     missing: Callable[[], list[str]]
 
     def artifacts(self, job: str) -> JobArtifacts:
-        """The files of a job, to be read."""
+        """The files of a job, for reading."""
         return job_artifacts(self.files, job)
 
 

@@ -5,7 +5,7 @@ from trompe_server.attack.backgrounds import Backgrounds
 from trompe_server.attack.budget import Budget
 from trompe_server.attack.few import FewTexels, few_texels
 from trompe_server.attack.goal import Goal
-from trompe_server.attack.saliency import image_gradients, rescale_each_view, saliency, saliency_masks
+from trompe_server.attack.saliency import image_gradients, saliency, saliency_masks
 from trompe_server.attack.state import AttackState, load_state, save_state, start
 from trompe_server.attack.texels import TexelMasks, best_texels, material_texels, movable, painted_texels, rank_texels
 from trompe_server.attack.views import ViewDistribution, grid_views
@@ -29,7 +29,6 @@ __all__ = [
     "movable",
     "painted_texels",
     "rank_texels",
-    "rescale_each_view",
     "saliency",
     "saliency_masks",
     "save_state",

@@ -1,15 +1,15 @@
 """Projected gradient ascent on the texture, over many views: the paper's algorithm, on one screen.
 
-It needs no server. With an object, views of it and a classifier that gives gradients:
+Needs no server. With an object, views of it and a classifier with gradients:
 
     geometry = prepare_geometry(obj, views, size=classifier.image_size, sampling=SamplingModel())
-    surrogate = diffuse_surrogate(geometry, views)  # or one measured on a target renderer: surrogate.calibration
+    surrogate = diffuse_surrogate(geometry, views)  # or measured on a target: surrogate.calibration
     textures, budget = textures_of(obj), Budget(epsilon=0.05, alpha=0.01)
     state = attack(start(textures), textures, surrogate, classifier, goal=Goal(label), budget=budget, steps=20)
     painted = budget.repaint(obj, state.deltas)
-    Path("adversarial.zip").write_bytes(painted.to_zip())
+    Path("mug-adversarial.zip").write_bytes(painted.to_zip())
 
-The whole of it, with a target: docs/library.md.
+docs/library.md has the whole example, with a target renderer.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,39 +20,44 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from trompe_server.attack.backgrounds import Backgrounds
-from trompe_server.attack.budget import Budget
+from trompe_server.attack.budget import Bound, Budget
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Objective, Textures, members_of
-from trompe_server.attack.optimiser import Box, Memory, OptimiserName, Point
-from trompe_server.attack.search import Schedule, Search
+from trompe_server.attack.optimiser import OPTIMISERS, Box, Iterate, Memory
+from trompe_server.attack.perception import perceptual_bounds
+from trompe_server.attack.search import Search
 from trompe_server.attack.state import AttackState
 from trompe_server.attack.texels import TexelMasks, movable
 from trompe_server.attack.view_budget import ViewBudget
 from trompe_server.classifiers import WhiteBoxClassifier
-from trompe_server.surrogate import Surrogate
+from trompe_server.image_pipelines import ImagePipeline
+from trompe_server.surrogate import AnySurrogate
+from trompe_shared.api import OptimiserName
+from trompe_shared.errors import SpecError
 
 __all__ = ["Step", "attack"]
 
 
 @dataclass(frozen=True)
 class Step:
-    """What one step saw where it took its gradient, before it moved.
+    """Figures of one step at the point of its gradient.
 
-    loss: mean over its views. fooled: share of them on whose surrogate images every classifier is fooled. evaluations:
-    images that each classifier has been shown so far, with those by which runs are compared where one ends. A view that
-    was safely won at its last look rests for some steps and counts as won.
+    loss: mean over its views. fooled: share of them on which every classifier is fooled in the surrogate. evaluations:
+    images shown to each classifier so far. least_left: further steps if all views are safely won from now on. A safely
+    won view is skipped for some steps and counts as won.
     """
 
     step: int
     loss: float
     fooled: float
     evaluations: int
+    least_left: int
 
 
 def attack(
     state: AttackState,
     textures: Textures,
-    surrogate: Surrogate,
+    surrogate: AnySurrogate,
     classifier: WhiteBoxClassifier | Sequence[WhiteBoxClassifier],
     *,
     goal: Goal,
@@ -60,34 +65,35 @@ def attack(
     steps: int,
     total_steps: int | None = None,
     optimiser: OptimiserName = "nesterov",
-    restarts: int = 0,
-    random_start: bool = False,
     masks: Bool[Tensor, "views H W"] | None = None,
     texels: TexelMasks | None = None,
     views_per_step: int | None = None,
     backgrounds: Backgrounds | None = None,
+    pipeline: ImagePipeline | None = None,
     seed: int = 0,
     on_step: Callable[[Step], None] = lambda _: None,
 ) -> AttackState:
-    """``steps`` more of the ``total_steps`` (by default those that end with this call) of a search for the change with
-    the highest expected loss over the surrogate's views.
+    """Take ``steps`` of the ``total_steps`` (default: up to the end of this call) of a search for the change with the
+    highest expected loss over the surrogate's views (the paper's equation 3, over many views).
 
-    ``textures`` are sRGB in [0, 1]. Of several classifiers the mean loss counts, and a view is fooled when all of them
-    are. ``restarts`` further runs from random points share the steps; ``random_start`` begins the first one so too.
-    What is left of the steps is left out once all views are won so safely that more would change nothing.
-    ``masks`` (saliency) let only those pixels' gradients through, and only ``texels`` (by default those ``movable``)
-    move. Each step looks at all views, or at ``views_per_step`` drawn by ``seed`` and its number, in front of some of
-    ``backgrounds`` drawn likewise (by default their own). After the last step the budget's bound on the images holds
-    for the textures that ``Budget.repaint`` saves. Deterministic, in one go or in several. It computes on the
-    surrogate's device, wherever the rest lies. Raises ``SpecError`` for options that contradict each other, before any
-    work.
+    ``textures`` are sRGB in [0, 1]. With several classifiers the loss is their mean, and a view is fooled when all of
+    them are. The search ends early once all views are safely won. ``masks`` (saliency) pass only the gradients of their
+    pixels, and only ``texels`` (default: ``movable``) move. Each step looks at all views, or at ``views_per_step``
+    drawn from ``seed`` and the step's number, in front of ``backgrounds`` drawn likewise (default: their own); each
+    image passes ``pipeline``, drawn anew. After the last step the budget's bound on the images holds for the textures
+    that ``Budget.repaint`` saves.
+
+    Deterministic, in one call or in several. Computes on the surrogate's device. Raises ``SpecError`` for contradictory
+    options, before any work.
     """
-    device = surrogate.geometry.device
+    device = surrogate.device
     state, textures = state.to(device), {name: texture.to(device) for name, texture in textures.items()}
     masks = masks if masks is None else masks.to(device)
     total = state.step + steps if total_steps is None else total_steps
-    schedule = Schedule(total, restarts, random_start, seed)
-    schedule.check(optimiser, last=state.step + steps)
+    if state.step + steps > total:
+        raise SpecError(f"Steps up to {state.step + steps} were asked for, but total_steps is {total}.")
+    if optimiser not in OPTIMISERS:
+        raise SpecError(f"Unknown optimiser {optimiser!r}; choose one of {', '.join(OPTIMISERS)}.")
     members = members_of(classifier, goal)
     wanted = movable(surrogate, budget, masks) if texels is None else texels
     moving = {name: mask.to(device) for name, mask in wanted.items()}
@@ -95,27 +101,36 @@ def attack(
     objective = Objective(textures, surrogate, members, goal, masks, surrogate.canvas(textures, touched))
     search = Search(
         objective,
-        schedule,
+        total,
+        seed,
         optimiser,
-        box=Box(budget, objective.source),
+        box=Box(budget, objective.source, _bound(objective, budget)),
         movable=objective.join(moving)[:, None].float().expand(-1, 3).contiguous(),  # booleans take seven times as long
-        within=ViewBudget.of(objective, budget.epsilon_view) if budget.epsilon_view is not None else None,
+        view_budget=ViewBudget.of(objective, budget.epsilon_view) if budget.epsilon_view is not None else None,
         views_per_step=views_per_step,
         backgrounds=backgrounds,
+        pipeline=pipeline,
     )
-    point = Point(objective.join(state.deltas), _joined(objective, state.memory))
+    point = Iterate(objective.join(state.deltas), _joined(objective, state.memory))
     for step in range(state.step, state.step + steps):
-        if search.over(point):
+        if search.finished(point):
             break
-        look, point = search.look(search.begin(point, step), step)
-        point = search.move(point, look, step)
-        on_step(Step(step, look.loss, look.fooled, search.shown(point)))
+        found, point = search.evaluate(point, step)
+        point = search.move(point, found, step)
+        on_step(Step(step, found.loss, found.fooled, search.shown(point), search.least_left(point, step)))
     delta = search.saved(point.delta) if state.step + steps == total else point.delta
     return AttackState(state.step + steps, objective.split(delta), _split(objective, point.memory))
 
 
+def _bound(objective: Objective, budget: Budget) -> Bound | None:
+    if not budget.perceptual:
+        return None
+    bounds = perceptual_bounds(objective.textures, objective.surrogate.footprint, epsilon=budget.epsilon)
+    return objective.join({name: bound[..., None] for name, bound in bounds.items()})
+
+
 def _joined(objective: Objective, memory: Memory) -> Memory:
-    """What is remembered of each texel, of those alone that may move."""
+    """Memory per texel of all textures (texels of all, n) as memory of the texels that may move; the rest as it is."""
     sizes = [texture.shape[:2] for texture in objective.textures.values()]
 
     def joined(value: Tensor) -> Tensor:
@@ -129,7 +144,7 @@ def _joined(objective: Objective, memory: Memory) -> Memory:
 
 
 def _split(objective: Objective, memory: Memory) -> Memory:
-    """The reverse of ``_joined``; zero for the texels that may not move."""
+    """The inverse of ``_joined``; zero for fixed texels."""
 
     def split(value: Tensor) -> Tensor:
         if value.ndim != 2:

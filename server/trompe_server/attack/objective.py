@@ -1,7 +1,6 @@
-"""What the search asks at each step: how a change of the textures looks to the classifiers, and where it should go.
+"""Loss and gradient of a change of the textures, over a surrogate's views.
 
-Textures are one flat tensor here, (texels, 3): those texels of all of the object's that may move, in the order of the
-surrogate's canvas.
+All textures are one flat tensor (texels, 3) here: the texels that may move, in the order of the surrogate's canvas.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,10 +14,11 @@ from torch import Tensor
 
 from trompe_server.attack.goal import Goal
 from trompe_server.classifiers import WhiteBoxClassifier
-from trompe_server.surrogate import Canvas, Surrogate
+from trompe_server.image_pipelines import Drawn
+from trompe_server.surrogate import AnyCanvas, AnySurrogate
 from trompe_shared.errors import SpecError
 
-__all__ = ["Look", "Objective", "Standing", "Textures", "members_of"]
+__all__ = ["Evaluation", "Flat", "Objective", "Score", "Textures", "members_of"]
 
 Textures = Mapping[str, Float[Tensor, "H W 3"]]
 Flat = Float[Tensor, "texels 3"]
@@ -27,22 +27,22 @@ Flat = Float[Tensor, "texels 3"]
 def members_of(
     classifier: WhiteBoxClassifier | Sequence[WhiteBoxClassifier], goal: Goal
 ) -> tuple[WhiteBoxClassifier, ...]:
-    """One classifier or several as a tuple. Raises ``SpecError`` where there is none or ``goal`` does not fit one."""
+    """One or several classifiers as a tuple. Raises ``SpecError`` for none, or for one that does not fit ``goal``."""
     members = tuple(classifier) if isinstance(classifier, Sequence) else (classifier,)
     if not members:
-        raise SpecError("There is no classifier to attack; give at least one.")
+        raise SpecError("No classifier to attack; give at least one.")
     for member in members:
         goal.check(member.n_classes)
     return members
 
 
 @dataclass(frozen=True)
-class Look:
-    """What one look at some views saw.
+class Evaluation:
+    """Loss and gradient over some views.
 
-    gradient: of the summed loss by each texel. loss: its mean, and fooled: the share of views that every classifier is
-    fooled on; views that were left out count as safely won. settled: views (of all) whose loss has no gradient for any
-    classifier. images: how many each classifier was shown.
+    gradient: of the summed loss. loss: mean over the views. fooled: share of views on which all classifiers are fooled.
+    Skipped views count as safely won in both. settled: indices of views with zero gradient for all classifiers.
+    images: number shown to each classifier.
     """
 
     gradient: Flat
@@ -52,9 +52,8 @@ class Look:
     images: int
 
 
-class Standing(NamedTuple):
-    """How well a change does on all views: the share of them that every classifier is fooled on, and the mean loss.
-    Compared by the share first."""
+class Score(NamedTuple):
+    """Quality of a change over all views, ordered by the share of fooled views, then by mean loss."""
 
     fooled: float
     loss: float
@@ -62,35 +61,37 @@ class Standing(NamedTuple):
 
 @dataclass(frozen=True)
 class Objective:
-    """The expected loss of a goal over a surrogate's views; of several classifiers, their mean.
+    """Expected loss of a goal over a surrogate's views, averaged over the classifiers.
 
-    ``masks`` (saliency) let only those pixels' gradients through. ``part``: the texels that a change may touch, by
-    default all. Raises ``SpecError`` for a classifier that takes images of another size than the surrogate's.
+    masks: pixels (saliency) that pass gradients; all by default. part: texels that may move; all by default. pipeline:
+    what happens to the images before the classifiers; nothing by default. Raises ``SpecError`` if a classifier's image
+    size differs from the surrogate's.
     """
 
     textures: Textures
-    surrogate: Surrogate
+    surrogate: AnySurrogate
     members: tuple[WhiteBoxClassifier, ...]
     goal: Goal
     masks: Bool[Tensor, "views H W"] | None
-    part: Canvas | None = None
+    part: AnyCanvas | None = None
+    pipeline: Drawn | None = None
 
     def __post_init__(self) -> None:
-        size = self.surrogate.geometry.size
+        size = self.surrogate.size
         for member in self.members:
             if tuple(member.image_size) != tuple(size):
                 raise SpecError(
-                    f"The classifier {member.name!r} takes images of {tuple(member.image_size)}, the surrogate's are "
+                    f"The classifier {member.name!r} takes images of {tuple(member.image_size)}, the surrogate renders "
                     f"{tuple(size)}: prepare the surrogate for that size, or resize the images for the classifier."
                 )
 
     @property
-    def canvas(self) -> Canvas:
+    def canvas(self) -> AnyCanvas:
         """The texels that may move."""
         return self._whole if self.part is None else self.part
 
     @cached_property
-    def _whole(self) -> Canvas:
+    def _whole(self) -> AnyCanvas:
         return self.surrogate.canvas(self.textures, {name: t[..., 0] >= 0 for name, t in self.textures.items()})
 
     @property
@@ -99,84 +100,91 @@ class Objective:
         return self.canvas.source
 
     def join(self, tables: Mapping[str, Tensor]) -> Tensor:
-        """One tensor (texels, ...) of what stands in tables (H, W, ...) by the textures' names."""
-        return self.canvas.join([tables[name] for name in self.surrogate.geometry.textures])
+        """One tensor (texels, ...) from tables (H, W, ...) by texture name."""
+        return self.canvas.join([tables[name] for name in self.surrogate.textures])
 
     def split(self, everything: Tensor) -> dict[str, Tensor]:
-        """The reverse of ``join``; zero where nothing may move."""
-        names = self.surrogate.geometry.textures
+        """The inverse of ``join``; zero for fixed texels."""
+        names = self.surrogate.textures
         tables = dict(zip(names, self.canvas.split(everything), strict=True))
         return {name: tables[name] for name in self.textures}
 
     def texels(self, change: Flat) -> Float[Tensor, "reads 3"]:
-        """What the views read of the textures with a ``change``. Differentiable."""
+        """The texels that the views read after a ``change``. Differentiable."""
         return self.canvas.read(self.source + change)
 
-    def look(self, change: Flat, batches: Sequence[int], awake: Bool[Tensor, " views"]) -> Look:
-        """Loss and gradient at ``change`` over the views of ``batches``, of which only those ``awake`` are looked at.
+    def evaluate(self, change: Flat, batches: Sequence[int], active: Bool[Tensor, " views"]) -> Evaluation:
+        """Loss and gradient at ``change`` over the ``active`` views of ``batches``.
 
         A gradient that is not finite counts as zero.
         """
         leaf = (self.source + change).requires_grad_()
         texels = self.canvas.read(leaf)
-        collected = texels.detach().requires_grad_()
+        read = texels.detach().requires_grad_()
         losses, won, settled, images = 0.0, 0, [], 0
         for batch in batches:
             views = self.surrogate.batches[batch]
-            chosen = awake[views.start : views.stop].nonzero()[:, 0]
-            resting = len(views) - len(chosen)
-            losses, won = losses + resting * self.goal.safe, won + resting
+            chosen = active[views.start : views.stop].nonzero()[:, 0]
+            skipped = len(views) - len(chosen)
+            losses, won = losses + skipped * self.goal.safe, won + skipped
             if len(chosen):
-                loss, reached, safe = self._pull(collected, batch, chosen)
+                loss, reached, safe = self._add_gradient(read, batch, chosen)
                 losses, won, images = losses + loss, won + reached, images + len(chosen)
                 settled.append(chosen[safe] + views.start)
         count = sum(len(self.surrogate.batches[batch]) for batch in batches)
-        return Look(
-            self._way_back(texels, leaf, collected.grad),
+        return Evaluation(
+            self._backward(texels, leaf, read.grad),
             losses / count,
             won / count,
-            torch.cat(settled) if settled else awake.new_zeros(0, dtype=torch.long),
+            torch.cat(settled) if settled else active.new_zeros(0, dtype=torch.long),
             images,
         )
 
-    def _pull(
-        self, collected: Float[Tensor, "texels 3"], batch: int, chosen: Int[Tensor, " chosen"]
+    def _add_gradient(
+        self, read: Float[Tensor, "reads 3"], batch: int, chosen: Int[Tensor, " chosen"]
     ) -> tuple[float, int, Bool[Tensor, " chosen"]]:
-        """Add the gradient of some views of a batch to ``collected``.
+        """Add the gradient of the ``chosen`` views of a batch to ``read.grad``.
 
-        Returns their summed loss, how many are fooled, and which are settled.
+        Returns their summed loss, the number of fooled ones, and a mask of the settled ones.
         """
-        shown = self.surrogate.render(collected, batch, masks=self.masks)
+        shown = self.surrogate.render(read, batch, masks=self.masks)
         everything = len(chosen) == len(shown)
         seen = (shown.detach() if everything else _rows(shown.detach(), chosen)).requires_grad_()
-        logits = [member.logits(seen) for member in self.members]
+        passed = self._through(seen, batch, chosen)
+        logits = [member.logits(passed) for member in self.members]
         loss = torch.stack([self.goal.losses(each).sum() for each in logits]).mean()
-        (pull,) = torch.autograd.grad(loss, seen)
-        back = pull if everything else torch.zeros_like(shown).index_copy_(0, chosen, pull)
-        shown.backward(back)  # type: ignore[no-untyped-call]
+        (gradient,) = torch.autograd.grad(loss, seen)
+        by_image = gradient if everything else torch.zeros_like(shown).index_copy_(0, chosen, gradient)
+        shown.backward(by_image)  # type: ignore[no-untyped-call]
         reached = torch.stack([self.goal.reached(each) for each in logits]).all(0)
         settled = torch.stack([self.goal.settled(each) for each in logits]).all(0)
         return float(loss.detach()), int(reached.sum()), settled
 
-    def _way_back(self, texels: Tensor, leaf: Flat, gathered: Tensor | None) -> Flat:
-        """The gradient by the textures, from that by what the views read of them."""
-        if gathered is None:
+    def _through(self, images: Tensor, batch: int, chosen: Int[Tensor, " chosen"]) -> Tensor:
+        """Images of the ``chosen`` views of a batch through the pipeline."""
+        if self.pipeline is None:
+            return images
+        first = self.surrogate.batches[batch].start
+        return self.pipeline.apply(images, [first + number for number in chosen.tolist()])
+
+    def _backward(self, texels: Tensor, leaf: Flat, by_texels: Tensor | None) -> Flat:
+        if by_texels is None:
             return torch.zeros_like(leaf)
-        (gradient,) = torch.autograd.grad(texels, leaf, gathered)
+        (gradient,) = torch.autograd.grad(texels, leaf, by_texels)
         return gradient.nan_to_num_(0, 0, 0)
 
     @torch.no_grad()
-    def standing(self, change: Flat) -> Standing:
-        """How well a ``change`` does on all views, masks or not; no gradient."""
+    def score(self, change: Flat) -> Score:
+        """Score of a ``change`` on all views, without masks."""
         texels, won, total = self.texels(change), 0, 0.0
         for batch in range(len(self.surrogate.batches)):
             images = self.surrogate.render(texels, batch)
             logits = [member.logits(images) for member in self.members]
             won += int(torch.stack([self.goal.reached(each) for each in logits]).all(0).sum())
             total += float(torch.stack([self.goal.losses(each).sum() for each in logits]).mean())
-        return Standing(won / self.surrogate.n_views, total / self.surrogate.n_views)
+        return Score(won / self.surrogate.n_views, total / self.surrogate.n_views)
 
 
 def _rows(images: Float[Tensor, "n 3 H W"], chosen: Int[Tensor, " chosen"]) -> Float[Tensor, "chosen 3 H W"]:
-    """Some of the images, channels last in memory as they all are."""
+    """The ``chosen`` images, in the same memory order (channels last)."""
     return images.permute(0, 2, 3, 1).index_select(0, chosen).permute(0, 3, 1, 2)

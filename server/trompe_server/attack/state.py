@@ -1,24 +1,29 @@
-"""What an attack leaves between two steps, in memory and as a file, so that one that was cut off goes on as it was."""
+"""State of an attack between two steps, in memory and as a file, for resuming."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from trompe_server.array_files import pack_arrays, unpack_arrays
 from trompe_server.attack.objective import Textures
+from trompe_server.storage.arrays import pack_arrays, unpack_arrays
 
 __all__ = ["AttackState", "load_state", "save_state", "start"]
+
+DELTA, MEMORY = "delta:", "memory:"
+"""Prefixes of array names in the file."""
+
+STEP: Final = "step"
 
 
 @dataclass(frozen=True)
 class AttackState:
-    """All that a step starts from.
+    """Input of the next step.
 
-    deltas: the change of each texture after ``step`` steps (sRGB in [0, 1] units); after the last one, the best that
-    was found. memory: what the search remembers, by names of its own.
+    deltas: change of each texture after ``step`` steps, in sRGB units of [0, 1]. memory: tensors of the search by name.
     """
 
     step: int
@@ -26,35 +31,31 @@ class AttackState:
     memory: Mapping[str, Tensor] = field(default_factory=dict)
 
     def to(self, device: torch.device) -> "AttackState":
-        """The same state on a device: one that was saved comes back on the CPU."""
+        """The same state on a device; a loaded state is on the CPU."""
         deltas, memory = ({key: value.to(device) for key, value in each.items()} for each in (self.deltas, self.memory))
         return AttackState(self.step, deltas, memory)
 
 
 def start(textures: Textures) -> AttackState:
-    """No change at all."""
+    """The state of unpainted textures."""
     return AttackState(0, {name: torch.zeros_like(texture) for name, texture in textures.items()})
 
 
 def save_state(state: AttackState) -> bytes:
-    """A state as the bytes of an .npz file; exact."""
-    tables = {_DELTA: state.deltas, _MEMORY: state.memory}
+    """A state as an .npz file; exact."""
+    tables = {DELTA: state.deltas, MEMORY: state.memory}
     arrays = {prefix + name: table[name].cpu().numpy() for prefix, table in tables.items() for name in table}
-    return pack_arrays({"step": np.array(state.step)} | arrays, compressed=False)
+    return pack_arrays({STEP: np.array(state.step)} | arrays, compressed=False)
 
 
 def load_state(data: bytes) -> AttackState:
-    """A state from ``save_state``'s bytes. Raises ``ValueError`` or ``OSError`` where they are damaged."""
+    """The state in ``save_state``'s bytes. Raises ``ValueError`` or ``OSError`` for damaged ones."""
     arrays = unpack_arrays(data)
-    if "step" not in arrays:
-        raise ValueError(f"These arrays are no attack state: there is no 'step' among {sorted(arrays)}.")
+    if STEP not in arrays:
+        raise ValueError(f"These arrays are not an attack state: {sorted(arrays)} lacks {STEP!r}.")
 
     def table(prefix: str) -> dict[str, Tensor]:
         names = [name for name in arrays if name.startswith(prefix)]
         return {name.removeprefix(prefix): torch.from_numpy(arrays[name]) for name in names}
 
-    return AttackState(int(arrays["step"]), table(_DELTA), table(_MEMORY))
-
-
-_DELTA = "delta:"
-_MEMORY = "memory:"
+    return AttackState(int(arrays[STEP]), table(DELTA), table(MEMORY))

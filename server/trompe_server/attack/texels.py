@@ -1,4 +1,4 @@
-"""Which texels an attack may touch: those that matter, that were painted, that are of a material, the best few."""
+"""Selection of texels: visible ones, ranked ones, by material, by painted masks."""
 
 from collections.abc import Mapping, Sequence
 from typing import Final
@@ -11,56 +11,65 @@ from torch import Tensor
 
 from trompe_server.attack.budget import Budget
 from trompe_server.attack.objective import Textures
-from trompe_server.checks import check_mask_size
-from trompe_server.surrogate import Surrogate
+from trompe_server.spec.checks import check_mask_size
+from trompe_server.surrogate import AnySurrogate
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D
 
-__all__ = ["TexelMasks", "best_texels", "collect", "material_texels", "movable", "painted_texels", "rank_texels"]
+__all__ = ["TexelMasks", "backproject", "best_texels", "material_texels", "movable", "painted_texels", "rank_texels"]
 
 TexelMasks = Mapping[str, Bool[Tensor, "H W"]]
+ImageMaps = Float[Tensor, "views H W"] | Float[Tensor, "views H W 3"]
+
+VISIBLE: Final = 4.0
+"""Change of all views together, in 8-bit levels, from which a texel counts as visible."""
 
 PAINTED: Final = 128
 """Grey level from which a pixel of a mask image counts as painted."""
 
 
 def movable(
-    surrogate: Surrogate,
+    surrogate: AnySurrogate,
     budget: Budget,
     masks: Bool[Tensor, "views H W"] | None = None,
     *,
     within: Sequence[TexelMasks] = (),
 ) -> TexelMasks:
-    """The texels worth moving: those whose whole budget changes the attack's pixels by half an 8-bit level or more in
-    total.
+    """The texels with a visible effect: the whole budget of as many of them as a pixel reads (``footprint``) changes
+    the views by at least ``VISIBLE`` 8-bit levels in total.
 
-    Coarse mip levels let a pixel at a grazing angle read a little of every texel. Without this rule a sign step would
-    move them all at full size for an effect nobody can see. ``masks`` (saliency): only those pixels count. ``within``:
-    only texels that are in all of these move. Raises ``SpecError`` where masks leave none.
+    Coarse mip levels let a pixel at a grazing angle read a little of every texel; without this rule a sign step would
+    move all of them at full size without visible effect. Texels of a fine texture act together, so the rule selects
+    the same part of a picture at any resolution. ``masks`` (saliency): count only these pixels. ``within``: keep only
+    texels in all of these masks. Raises ``SpecError`` if no texel is left.
     """
-    least = 0.5 / 255 / budget.epsilon
-    found = {name: weight >= least for name, weight in surrogate.influence(masks).items()}
+    least, footprint = VISIBLE / 255 / budget.epsilon, surrogate.footprint
+    found = {name: weight * footprint[name] >= least for name, weight in surrogate.influence(masks).items()}
     for mask in within:
         found = {name: texels & mask[name].to(texels.device) for name, texels in found.items()}
-    if (masks is not None or within) and not any(texels.any() for texels in found.values()):
-        raise SpecError(
-            f"No texel is left that the attack may move and that changes a pixel visibly at epsilon={budget.epsilon:g}"
-            f"{': the pixels of saliency tau or more show none of the object' if not within else ''}. "
-            f"{'Lower tau, or ' if masks is not None else ''}{'widen the texel masks, or ' if within else ''}"
-            "raise epsilon."
-        )
+    if not any(texels.any() for texels in found.values()):
+        raise _nothing_visible(budget, masked=masks is not None, within=bool(within))
     return found
 
 
-def painted_texels(obj: Object3D, images: Mapping[str, NDArray[np.uint8]]) -> TexelMasks:
-    """The texels that are white (128 or more on average) in mask images (H, W, 3) of the textures' own sizes.
+def _nothing_visible(budget: Budget, *, masked: bool, within: bool) -> SpecError:
+    hints = ["Lower `tau`"] * masked + ["widen the texel masks"] * within or ["Come closer by `distance`"]
+    why = ": the pixels of saliency `tau` or more show none of the object" if masked and not within else ""
+    return SpecError(
+        f"No {'allowed ' * (masked or within)}texel changes a pixel visibly at epsilon={budget.epsilon:g}{why}. "
+        f"{', or '.join([*hints, 'raise `epsilon`'])}."
+    )
 
-    Textures without a mask image are left alone entirely. Raises ``SpecError`` for an image of another size or of a
-    texture that there is not, and where nothing is painted.
+
+def painted_texels(obj: Object3D, images: Mapping[str, NDArray[np.uint8]]) -> TexelMasks:
+    """The texels that are white (128 or more on average) in mask images (H, W, 3) of the textures' sizes.
+
+    Textures without a mask image have none. Raises ``SpecError`` for an unknown texture, another size, or an empty
+    mask.
     """
     for name, image in images.items():
         if name not in obj.textures:
-            raise SpecError(f"There is no texture {name!r} to mask; {obj.name!r} has {sorted(obj.textures)}.")
+            raise SpecError(f"{obj.name!r} has no texture {name!r} to mask; it has {sorted(obj.textures)}.")
         check_mask_size(name, size=obj.textures[name].shape[:2], mask=image.shape[:2])
     masks = {
         name: torch.from_numpy(images[name].mean(2) >= PAINTED)
@@ -69,18 +78,18 @@ def painted_texels(obj: Object3D, images: Mapping[str, NDArray[np.uint8]]) -> Te
         for name, texture in obj.textures.items()
     }
     if not any(mask.any() for mask in masks.values()):
-        raise SpecError("The mask images leave no texel to move: paint white where the texture may change.")
+        raise SpecError("The mask images select no texel: paint white where the texture may change.")
     return masks
 
 
 def material_texels(obj: Object3D, materials: Sequence[str]) -> TexelMasks:
     """All texels of the textures of ``materials``.
 
-    Raises ``SpecError`` for a material that there is not, and for a texture that a material beside these uses too.
+    Raises ``SpecError`` for an unknown material, and for a texture shared with a material not named.
     """
     unknown = sorted(set(materials) - set(obj.materials))
     if unknown or not materials:
-        raise SpecError(f"There is no material {unknown or '(none named)'}; {obj.name!r} has {sorted(obj.materials)}.")
+        raise SpecError(f"{obj.name!r} has no material {unknown or '(none named)'}; it has {sorted(obj.materials)}.")
     chosen = {obj.materials[name].albedo for name in materials}
     others = sorted(name for name, other in obj.materials.items() if name not in materials and other.albedo in chosen)
     if others:
@@ -90,36 +99,31 @@ def material_texels(obj: Object3D, materials: Sequence[str]) -> TexelMasks:
     return {name: torch.full(texture.shape[:2], name in chosen) for name, texture in obj.textures.items()}
 
 
-def rank_texels(
-    surrogate: Surrogate, textures: Textures, maps: Float[Tensor, "views H W"] | Float[Tensor, "views H W 3"]
-) -> Mapping[str, Float[Tensor, "H W"]]:
-    """How much each texel matters: what the ``maps`` of all views say of the pixels, accumulated where a texel shows.
+def rank_texels(surrogate: AnySurrogate, textures: Textures, maps: ImageMaps) -> Mapping[str, Float[Tensor, "H W"]]:
+    """Score of each texel: the ``maps`` of all views, accumulated over the pixels that show the texel.
 
-    ``maps`` are saliencies, or ``image_gradients``: with their signs, so that a texel that views would pull to and fro
-    counts little. That is the better ranking.
+    ``maps`` are saliencies or signed ``image_gradients``. The gradients rank better: a texel that views pull in
+    opposite directions scores low.
     """
-    return {name: pull.abs().sum(2) for name, pull in collect(surrogate, textures, maps).items()}
+    return {name: table.abs().sum(2) for name, table in backproject(surrogate, textures, maps).items()}
 
 
-def collect(
-    surrogate: Surrogate, textures: Textures, maps: Float[Tensor, "views H W"] | Float[Tensor, "views H W 3"]
-) -> Mapping[str, Float[Tensor, "H W 3"]]:
-    """What ``maps`` say of the pixels of all views, carried back: a pixel's value goes to the texels that it reads, by
-    weight and by how strongly the pixel answers to them."""
+def backproject(surrogate: AnySurrogate, textures: Textures, maps: ImageMaps) -> Mapping[str, Float[Tensor, "H W 3"]]:
+    """``maps`` of all views carried back to the texels: each pixel's value times its derivative by each texel."""
     leaves = {name: texture.clone().requires_grad_() for name, texture in textures.items()}
     texels = surrogate.texels(leaves)
-    collected = texels.detach().requires_grad_()
+    read = texels.detach().requires_grad_()
     for batch, views in enumerate(surrogate.batches):
-        images = surrogate.render(collected, batch)
+        images = surrogate.render(read, batch)
         weights = maps[views.start : views.stop].to(images)
         weights = weights[:, None] if maps.ndim == 3 else weights.permute(0, 3, 1, 2)
         images.backward(weights.expand_as(images))  # type: ignore[no-untyped-call]
-    return dict(zip(leaves, torch.autograd.grad(texels, list(leaves.values()), collected.grad), strict=True))
+    return dict(zip(leaves, torch.autograd.grad(texels, list(leaves.values()), read.grad), strict=True))
 
 
 def best_texels(scores: Mapping[str, Float[Tensor, "H W"]], keep: float) -> TexelMasks:
-    """The share ``keep``, in (0, 1], of all texels with the highest scores; of equal ones the first. None that has no
-    score. Raises ``SpecError`` where ``keep`` is out of range or leaves none.
+    """The share ``keep``, in (0, 1], of all texels with the highest scores; the first ones of equal scores, none with
+    score zero. Raises ``SpecError`` if ``keep`` is out of range or leaves no texel.
     """
     if not 0 < keep <= 1:
         raise SpecError(f"The share of texels to keep must be in (0, 1], got {keep}.")

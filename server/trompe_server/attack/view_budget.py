@@ -1,4 +1,4 @@
-"""The paper's constraint on the images, |I - I'|_inf <= epsilon_view, enforced on the surrogate's views."""
+"""The paper's constraint on images, |I - I'|_inf <= epsilon_view, for the surrogate's views."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,33 +8,31 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from trompe_server.attack.objective import Objective
+from trompe_server.attack.objective import Flat, Objective
 
 __all__ = ["ViewBudget"]
 
-Flat = Float[Tensor, "texels 3"]
-
 TOLERANCE: Final = 1e-6
-"""How far a pixel may stay beyond the bound, for the rounding of floats."""
+"""Excess allowed for rounding of floats."""
 
 AIM: Final = 0.98
-"""Share of the bound that a pixel beyond it is brought to: a few rounds do (with 0.999 six times as many)."""
+"""Share of the bound to which a pixel beyond it is brought. Takes a few rounds; 0.999 takes six times as many."""
 
 LOCAL_ROUNDS: Final = 20
-"""Rounds in which only the texels behind the excess shrink; after them the whole change does."""
+"""Rounds in which only the texels behind the excess shrink; later rounds shrink the whole change."""
 
 SAVED_ROUNDS: Final = 100
-"""The same where the change is rounded to whole levels, which takes a few rounds to follow."""
+"""The same for a change rounded to whole levels, which follows only after some rounds."""
 
 SHARPNESS: Final = 8
-"""Exponent of the weighted mean that stands for the maximum over the pixels that read a texel."""
+"""Exponent of the weighted mean that approximates the maximum over the pixels of a texel."""
 
 
 @dataclass(frozen=True)
 class ViewBudget:
-    """No channel of a pixel of the surrogate's images changes by more than ``epsilon``, in (0, 1].
+    """Bounds the change of each channel of the surrogate's images by ``epsilon``, in (0, 1].
 
-    clean: the unpainted object's colours, of each batch of views.
+    clean: colours of the unpainted object by batch.
     """
 
     objective: Objective
@@ -44,7 +42,7 @@ class ViewBudget:
     @classmethod
     @torch.no_grad()
     def of(cls, objective: Objective, epsilon: float) -> "ViewBudget":
-        """The bound around the images of the objective's textures."""
+        """The bound around the images of the unpainted textures."""
         surrogate = objective.surrogate
         texels = surrogate.texels(objective.textures)
         return cls(objective, epsilon, tuple(surrogate.colours(texels, k)[0] for k in range(len(surrogate.batches))))
@@ -52,13 +50,13 @@ class ViewBudget:
     def project(self, delta: Flat) -> Flat:
         """``delta`` with each texel's channel scaled down until all images are within the bound.
 
-        A texel shrinks by about the most that a pixel which reads it must; texels that no such pixel reads stay.
+        A texel shrinks by about the largest excess among its pixels; other texels stay.
         """
         return self._within(delta, lambda change: change, local_rounds=LOCAL_ROUNDS)
 
     def saved(self, delta: Flat, *, levels: int) -> Flat:
-        """``delta`` where the images are within the bound once it is rounded to 8-bit levels, at most so many, as it is
-        saved; else what of it is, in whole levels."""
+        """``delta`` if its images are within the bound once it is rounded to at most ``levels`` 8-bit levels; else the
+        scaled-down change in whole levels."""
 
         def rounded(change: Flat) -> Flat:
             return (change * 255).round().clamp(-levels, levels) / 255
@@ -66,15 +64,14 @@ class ViewBudget:
         return self._within(delta, rounded, local_rounds=SAVED_ROUNDS)
 
     def _within(self, delta: Flat, shown: Callable[[Flat], Flat], *, local_rounds: int) -> Flat:
-        """``delta`` where the images of what is ``shown`` of it are within the bound; else what is shown of as much of
-        it as is."""
+        """``delta`` if the images of ``shown(delta)`` are within the bound; else ``shown`` of a smaller ``delta``."""
         rounds = 0
         while (shrink := self._shrink(shown(delta), local=rounds < local_rounds)) is not None:
             delta, rounds = delta * (1 - shrink), rounds + 1
         return shown(delta) if rounds else delta
 
     def _shrink(self, delta: Flat, *, local: bool) -> Tensor | None:
-        """By how much each texel's channel must shrink, as a share of it; ``None`` where all images are within."""
+        """Share by which each texel's channel must shrink; ``None`` if all images are within the bound."""
         leaf = delta.clone().requires_grad_()
         texels = self.objective.texels(leaf)
         change = [self._change(texels.detach(), number) for number in range(len(self.clean))]
@@ -89,14 +86,13 @@ class ViewBudget:
         return self._spread(leaf, texels, excess)
 
     def _spread(self, leaf: Flat, texels: Tensor, excess: list[Tensor]) -> Flat:
-        """About the maximum of ``excess`` over the pixels that read each texel, through the mip levels."""
-        gathers = [batch.gather for batch in self.objective.surrogate.geometry.batches]
+        """Approximate maximum of ``excess`` over the pixels of each texel, through the mip levels."""
         sums = []
         for power in (SHARPNESS + 1, SHARPNESS):
             total = torch.zeros_like(texels)
-            for gather, each in zip(gathers, excess, strict=True):
+            for number, each in enumerate(excess):
                 if each.any():
-                    total += gather.transpose(each**power)
+                    total += self.objective.surrogate.spread(each**power, number)
             (at_texels,) = torch.autograd.grad(texels, leaf, total, retain_graph=True)
             sums.append(at_texels)
         return torch.where(sums[1] > 0, sums[0] / sums[1], 0).clamp(0, 1)

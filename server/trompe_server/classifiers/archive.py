@@ -1,19 +1,19 @@
-"""Look over a ``.pt2`` archive before torch reads it: reading one is not safe by itself.
+"""Check a ``.pt2`` archive before torch reads it: torch alone runs code from the file.
 
-What torch's source does with an archive (2.13, ``torch/export/pt2_archive/_package.py``, ``torch/_export/serde``), each
-a way for a file to run code of its own, and what is asked here of an archive before it is handed on:
+The ways in torch 2.13 (``torch/export/pt2_archive/_package.py``, ``torch/_export/serde``), and the rule against each:
 
-- weights, constants and sample inputs may be pickles (``torch.load(weights_only=False)``, ``pickle.loads``; a load
-  with ``weights_only=True`` that fails is tried again without): only raw tensors, and inputs ``weights_only`` reads;
-- an archive torch cannot read is tried as the format of torch 2.7, pickles again: ``torch.export.load`` is not called,
-  the reader under it is;
-- an operator is any name under ``torch``, ``math`` or ``operator``, so ``torch.os.system`` too: only ATen operators
-  that touch no file, and plain arithmetic;
-- symbolic sizes go through ``sympy.sympify``, that is ``eval``: only integer arithmetic on symbols;
-- names end up in generated Python source: no quotes, brackets or line ends in any; guards are code: not compiled;
-- compiled libraries (AOTInductor) would be loaded: no such member.
+- Weights, constants and sample inputs may be pickles (``torch.load(weights_only=False)``, ``pickle.loads``; torch
+  repeats a failed ``weights_only=True`` load without it). Allowed: raw tensors, and inputs ``weights_only`` can read.
+- torch tries an unreadable archive as the format of torch 2.7, with pickles again. We call the reader below
+  ``torch.export.load`` instead.
+- An operator is any name under ``torch``, ``math`` or ``operator``, thus also ``torch.os.system``. Allowed: ATen
+  operators without file access, and plain arithmetic.
+- Symbolic sizes go through ``sympy.sympify``, which calls ``eval``. Allowed: integer arithmetic on symbols.
+- Names end up in generated Python source. No quotes, brackets or line ends are allowed. Guards are code and are not
+  compiled.
+- Compiled libraries (AOTInductor) would be loaded. No such member is allowed.
 
-This closes the ways found; it is no sandbox. Read strangers' files in a process of their own, as ``inspect`` does.
+This closes the known ways and is not a sandbox. ``inspect`` reads strangers' files in a process of its own.
 """
 
 import io
@@ -66,11 +66,11 @@ SIZE: Final = re.compile(
 )
 TREE: Final = re.compile(r'builtins\.(tuple|list|dict)|null|\[("\w+"(, "\w+")*)?\]', re.ASCII)
 PROSE: Final = frozenset({"metadata", "torch_version"})
-"""Keys whose text is kept for people and never evaluated."""
+"""Keys with text for people; torch never evaluates it."""
 
 
 def read_program(path: Path) -> ExportedProgram:
-    """The program saved in a ``.pt2`` file, after a look at it. Raises ``ClassifierError``."""
+    """Check and read the program in a ``.pt2`` file. Raises ``ClassifierError``."""
     try:
         data = path.read_bytes()
         _check(PT2ArchiveReader(io.BytesIO(data)), path.name)
@@ -80,12 +80,12 @@ def read_program(path: Path) -> ExportedProgram:
     except Exception as error:
         raise ClassifierError(
             f"{path.name!r} cannot be read as an exported program ({type(error).__name__}: {str(error)[:300]}); "
-            f"expected a file that torch.export.save wrote, by a version near this one ({torch.__version__})."
+            f"expected a file of torch.export.save from a version close to {torch.__version__}."
         ) from error
 
 
 def _check(archive: Any, file: str) -> None:
-    """Raise ``ClassifierError`` when the archive holds anything that could run code while it is read."""
+    """Raise ``ClassifierError`` if reading the archive could run code."""
     for member in archive.get_file_names():
         if not MEMBER.fullmatch(member):
             raise _unsafe(file, f"the member {member!r}")
@@ -110,13 +110,13 @@ def _check_sample_inputs(data: bytes, file: str) -> None:
 
 def _unsafe(file: str, what: str) -> ClassifierError:
     return ClassifierError(
-        f"{file!r} is refused: it holds {what}, which could run code of its own. Expected raw float weights and ATen "
+        f"{file!r} is refused: it contains {what}, which could run code. Expected raw float weights and ATen "
         "operators only; export the plain network again with torch.export."
     )
 
 
 def _texts(node: Any, key: str = "name") -> Iterator[tuple[str, str]]:
-    """(kind, text) of every string in a program's JSON that may be evaluated, keys of mappings included."""
+    """(kind, text) of every string in a program's JSON that torch may evaluate, including keys of mappings."""
     if isinstance(node, str):
         yield key, node
     elif isinstance(node, list):

@@ -1,4 +1,4 @@
-"""The contract of a network that can be attacked, wherever it comes from, and the check that it holds."""
+"""The contract of a white-box network, and its check."""
 
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ CONTRACT: Final = "input image float32 NCHW in [0, 1] with a dynamic batch, outp
 
 
 class Normalised(nn.Module):
-    """A network with the normalisation that it expects of its images put in front of it."""
+    """A network preceded by its image normalisation."""
 
     mean: Tensor
     std: Tensor
@@ -34,7 +34,7 @@ class Normalised(nn.Module):
 
 
 def broken(file: str, what: str) -> ClassifierError:
-    """The error for a network that does not keep the contract."""
+    """The error for a network that breaks the contract."""
     return ClassifierError(f"{file!r}: {what}. Expected: {CONTRACT}; export it so, with the normalisation inside.")
 
 
@@ -50,7 +50,7 @@ def sample_images(size: tuple[int, int]) -> Float[Tensor, "2 3 H W"]:
 
 
 def check_contract(network: nn.Module, sample: Float[Tensor, "2 3 H W"], file: str) -> int:
-    """Number of classes. Raises ``ClassifierError`` when the output is not finite, differentiable logits."""
+    """Return the number of classes. Raises ``ClassifierError`` unless the output is finite, differentiable logits."""
     images = sample.clone().requires_grad_()
     try:
         logits = network(images)
@@ -68,15 +68,15 @@ def check_contract(network: nn.Module, sample: Float[Tensor, "2 3 H W"], file: s
 
 
 def prepared(network: nn.Module, size: tuple[int, int], file: str, *, device: str) -> tuple[nn.Module, int]:
-    """(the same function on ``device``, made faster where torch can export it; number of classes).
+    """Return the same function on ``device``, faster if torch can export it, and its number of classes.
 
-    Raises ``ClassifierError`` when the network does not keep the contract on images of ``size``.
+    Raises ``ClassifierError`` if the network breaks the contract on images of ``size`` (H, W).
     """
     network = network.to(device).eval().requires_grad_(False)
     sample = sample_images(size).to(device)
     n_classes = check_contract(network, sample, file)
     try:
         program = torch.export.export(network, (sample,), dynamic_shapes=({0: torch.export.Dim.DYNAMIC},))
-    except Exception:  # torch.export raises of every kind; what it cannot export runs as it is
+    except Exception:  # torch.export raises errors of any kind; then the network runs unchanged
         return network, n_classes
     return accelerate(program.module(check_guards=False), sample), n_classes

@@ -1,4 +1,4 @@
-"""Random numbers that depend on a seed and on the images they are drawn for, and on nothing that was drawn before."""
+"""Random numbers determined by a seed and by the images they are for, not by earlier draws."""
 
 from hashlib import blake2b
 
@@ -9,9 +9,9 @@ __all__ = ["generator_for"]
 
 
 def generator_for(images: Tensor, seed: int) -> torch.Generator:
-    """A generator on the CPU; every bit of the images and of the seed (64 bits, signed) counts.
+    """A CPU generator seeded by every bit of the images and of ``seed`` (64 bits, signed).
 
-    So an attack that is resumed draws as if it had not stopped.
+    A resumed attack therefore draws the same numbers as an uninterrupted one.
     """
     key = seed.to_bytes(8, "little", signed=True)
     digest = blake2b(images.detach().cpu().numpy().tobytes(), digest_size=8, key=key).digest()

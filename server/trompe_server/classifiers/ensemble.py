@@ -1,4 +1,4 @@
-"""Several classifiers attacked at once, so that what fools them all may fool one that was never asked."""
+"""Ensembles: classifiers attacked together, for transfer to unknown ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from trompe_server.checks import check_same_classes
 from trompe_server.classifiers.protocol import WhiteBoxClassifier, Wrapper, resize
+from trompe_server.spec.checks import check_same_classes
 from trompe_shared.errors import ClassifierError
 
 __all__ = ["ResizedClassifier", "as_ensemble", "resized"]
@@ -15,7 +15,7 @@ __all__ = ["ResizedClassifier", "as_ensemble", "resized"]
 
 @dataclass(frozen=True)
 class ResizedClassifier(Wrapper):
-    """``inner`` for images of ``image_size``, which it resizes to its own; so does their gradient come back."""
+    """``inner`` for images of ``image_size``; resizes images and gradients."""
 
     inner: WhiteBoxClassifier
     image_size: tuple[int, int]
@@ -26,14 +26,14 @@ class ResizedClassifier(Wrapper):
 
 
 def resized(classifier: WhiteBoxClassifier, size: tuple[int, int]) -> WhiteBoxClassifier:
-    """The classifier for images of ``size`` (H, W): itself where that is its own."""
+    """The classifier for images of ``size`` (H, W): itself if that is its own size."""
     return classifier if classifier.image_size == size else ResizedClassifier(classifier, size)
 
 
 def as_ensemble(classifiers: Sequence[WhiteBoxClassifier]) -> tuple[WhiteBoxClassifier, ...]:
-    """The classifiers as members that all take images of the first one's size.
+    """The classifiers as members for images of the first one's size.
 
-    Raises ``ClassifierError`` where there is none, or where two of them do not mean the same by their logits.
+    Raises ``ClassifierError`` for no classifier, and if two of them differ in their classes.
     """
     if not classifiers:
         raise ClassifierError("An ensemble needs at least one classifier, got none.")

@@ -1,4 +1,4 @@
-"""Classifiers from ``.pt2`` files, which ``torch.export.save`` writes. They give gradients: they can be attacked."""
+"""White-box classifiers from ``.pt2`` files of ``torch.export.save``."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,10 +21,10 @@ __all__ = ["load_exported"]
 def load_exported(
     path: Path, *, name: str | None = None, classes: Sequence[str] | None = None, device: str = "cpu"
 ) -> NetworkClassifier:
-    """A ``.pt2`` file as a white-box classifier with frozen parameters, made faster where that changes nothing.
+    """Load a ``.pt2`` file as a white-box classifier with frozen parameters, accelerated if that changes nothing.
 
-    The file is looked over before torch reads it (see ``archive``): ``torch.export.load`` unpickles, and worse.
-    Raises ``ClassifierError`` when it does not keep the contract.
+    The file is checked before torch reads it, because ``torch.export.load`` runs code from the file (see ``archive``).
+    Raises ``ClassifierError`` if it breaks the contract.
     """
     program = read_program(path)
     size = _image_size(program, path.name)

@@ -1,7 +1,7 @@
-"""Make an exported network cheaper to differentiate without changing its function.
+"""Accelerate an exported network without changing its function.
 
-Batch norm is folded into the convolution before it, and convolutions run in the ``channels_last`` memory format.
-Whether the function is the same is measured, not assumed: a network that comes out different is left as it was.
+Batch norm is folded into the preceding convolution, and convolutions run in the ``channels_last`` memory format. The
+result is measured: a network with different logits stays unchanged.
 """
 
 import copy
@@ -17,13 +17,13 @@ from torch.nn.utils.fusion import fuse_conv_bn_weights
 __all__ = ["Formatted", "accelerate", "fold_batch_norm"]
 
 TOLERANCE: Final = 1e-4
-"""Largest difference of a logit that is allowed, relative to the largest logit."""
+"""Largest allowed difference of a logit, relative to the largest logit."""
 CONVOLUTION: Final = torch.ops.aten.conv2d.default
 BATCH_NORM: Final = torch.ops.aten.batch_norm.default
 
 
 class Formatted(nn.Module):
-    """The same network on weights and images in one memory format, whatever the format of the images that come in."""
+    """A network with weights and images in one memory format, for images in any format."""
 
     def __init__(self, network: fx.GraphModule, memory_format: torch.memory_format) -> None:
         super().__init__()
@@ -37,26 +37,26 @@ class Formatted(nn.Module):
 
 
 def accelerate(network: fx.GraphModule, sample: Float[Tensor, "n 3 H W"]) -> Formatted:
-    """The network folded and ``channels_last``, or as it is where that moves a logit of ``sample`` too far."""
+    """The network folded and ``channels_last``, or unchanged if that moves a logit of ``sample`` too far."""
     original = Formatted(network, torch.contiguous_format)
     with torch.no_grad():
         before = original(sample)
         try:
             fast = Formatted(fold_batch_norm(_copy(network)), torch.channels_last)
             difference = (fast(sample) - before).abs().max()
-        except RuntimeError:  # e.g. a view that needs the memory format it was exported with
+        except RuntimeError:  # e.g. a view that requires the exported memory format
             return original
     return fast if difference <= TOLERANCE * before.abs().max() else original
 
 
 def _copy(network: fx.GraphModule) -> fx.GraphModule:
-    with warnings.catch_warnings():  # torch warns of its own deprecated class when a graph is copied
+    with warnings.catch_warnings():  # copying a graph warns about torch's own deprecated class
         warnings.simplefilter("ignore", FutureWarning)
         return copy.deepcopy(network)
 
 
 def fold_batch_norm(network: fx.GraphModule) -> fx.GraphModule:
-    """Fold every batch norm that directly follows a convolution into it, in place; returns ``network``."""
+    """Fold every batch norm directly after a convolution into it, in place; return ``network``."""
     for node in list(network.graph.nodes):
         if node.target is BATCH_NORM and _foldable(node):
             _fold(network, node)
@@ -66,7 +66,7 @@ def fold_batch_norm(network: fx.GraphModule) -> fx.GraphModule:
 
 
 def _foldable(norm: fx.Node) -> bool:
-    """Whether the batch norm uses its running statistics and alone reads a convolution with constant weights."""
+    """Whether the batch norm uses running statistics and is the only reader of a convolution with constant weights."""
     source = norm.args[0]
     if not isinstance(source, fx.Node) or source.target is not CONVOLUTION or len(source.users) != 1:
         return False
@@ -91,6 +91,6 @@ def _fold(network: fx.GraphModule, norm: fx.Node) -> None:
 
 
 def _value(network: fx.GraphModule, arg: Any) -> Tensor | None:
-    """The tensor that a ``get_attr`` node reads."""
+    """The tensor of a ``get_attr`` node."""
     value: Tensor | None = None if arg is None else operator.attrgetter(arg.target)(network)
     return value

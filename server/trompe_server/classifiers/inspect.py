@@ -1,4 +1,4 @@
-"""Read a classifier in a process of its own: ``python -m trompe_server.classifiers.inspect FILE_OR_NAME``.
+"""Describe a classifier in a process of its own: ``python -m trompe_server.classifiers.inspect FILE_OR_NAME``.
 
 Prints one JSON line: ``{"white_box": bool, "image_size": [H, W], "n_classes": N, "classes": names or null}``, or
 ``{"error": "..."}`` with exit code 1.
@@ -6,6 +6,7 @@ Prints one JSON line: ``{"white_box": bool, "image_size": [H, W], "n_classes": N
 
 import json
 import sys
+from collections.abc import Sequence
 
 import torch
 
@@ -13,30 +14,26 @@ from trompe_server.classifiers.protocol import WhiteBoxClassifier
 from trompe_server.classifiers.registry import load_classifier
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["describe", "main"]
+__all__ = ["main"]
 
 
-def describe(path_or_name: str) -> dict[str, object]:
-    """What the API stores about a classifier. Raises ``ClassifierError``."""
-    classifier = load_classifier(path_or_name)
-    return {
-        "white_box": isinstance(classifier, WhiteBoxClassifier),
-        "image_size": list(classifier.image_size),
-        "n_classes": classifier.n_classes,
-        "classes": None if classifier.classes is None else list(classifier.classes),
-    }
-
-
-def main() -> int:
-    """Print the JSON line for the file or name on the command line; the exit code."""
-    torch.set_num_threads(1)
+def main(arguments: Sequence[str]) -> int:
+    """Print the JSON line for the file or name in ``arguments``; return the exit code."""
     try:
-        found = describe(sys.argv[1])
+        classifier = load_classifier(arguments[0])
     except ClassifierError as error:
-        found = {"error": str(error)}
+        found: dict[str, object] = {"error": str(error)}
+    else:
+        found = {
+            "white_box": isinstance(classifier, WhiteBoxClassifier),
+            "image_size": list(classifier.image_size),
+            "n_classes": classifier.n_classes,
+            "classes": None if classifier.classes is None else list(classifier.classes),
+        }
     sys.stdout.write(json.dumps(found) + "\n")
     return int("error" in found)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    torch.set_num_threads(1)
+    sys.exit(main(sys.argv[1:]))

@@ -16,7 +16,7 @@ BATCH = 10
 
 @dataclass(frozen=True)
 class NetworkClassifier:
-    """A network (N, 3, H, W) in [0, 1] -> logits (N, n_classes) on ``device``; its parameters are frozen here."""
+    """A network (N, 3, H, W) in [0, 1] -> logits (N, n_classes) on ``device``; freezes its parameters."""
 
     name: str
     network: nn.Module
@@ -26,8 +26,7 @@ class NetworkClassifier:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        for parameter in self.network.parameters():  # TorchScript has no requires_grad_ of its own
-            parameter.requires_grad_(False)
+        self.network.requires_grad_(False)
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
         """Logits of sRGB images in [0, 1] of size ``image_size``, differentiable in the images and on their device."""

@@ -1,4 +1,4 @@
-"""Classifiers from ``.onnx`` files, run by onnxruntime. They give no gradients: they judge, they cannot be attacked."""
+"""Classifiers from ``.onnx`` files, run by onnxruntime: scores only, no gradients."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ CONTRACT: Final = "input image float32 NCHW in [0, 1], output logits (N, classes
 
 @dataclass(frozen=True)
 class OnnxClassifier:
-    """An onnxruntime session; ``fixed_batch``: how many images it takes at once, if its graph says so."""
+    """An onnxruntime session; ``fixed_batch``: the batch size of its graph, if fixed."""
 
     name: str
     session: Any
@@ -57,9 +57,9 @@ class OnnxClassifier:
 def load_onnx(
     path: Path, *, name: str | None = None, classes: Sequence[str] | None = None, device: str = "cpu"
 ) -> OnnxClassifier:
-    """An ``.onnx`` file as a classifier that only judges, on ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+    """Load an ``.onnx`` file on ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
 
-    Raises ``ClassifierError`` when it breaks the contract, or when onnxruntime was not built for the device.
+    Raises ``ClassifierError`` if it breaks the contract, or if this onnxruntime does not support the device.
     """
     session = _session(path, device)
     fixed_batch, size = _input(session, path.name)
@@ -83,7 +83,7 @@ def _broken(file: str, what: str) -> ClassifierError:
 
 
 def _providers(device: str) -> list[str | tuple[str, dict[str, str]]]:
-    """onnxruntime's names for the device, the CPU for what that cannot do. Raises ``ClassifierError``."""
+    """onnxruntime's providers for the device, with the CPU as a fallback for single operators."""
     kind, _, number = device.partition(":")
     if kind == "cpu":
         return ["CPUExecutionProvider"]
@@ -108,7 +108,7 @@ def _session(path: Path, device: str) -> Any:
 
 
 def _input(session: Any, file: str) -> tuple[int | None, tuple[int, int]]:
-    """The batch, where it is fixed, and (H, W) of the one image input. Raises ``ClassifierError``."""
+    """The batch size, if fixed, and (H, W) of the only input. Raises ``ClassifierError``."""
     inputs = session.get_inputs()
     if len(inputs) != 1 or len(session.get_outputs()) != 1:
         raise _broken(file, f"it has {len(inputs)} inputs and {len(session.get_outputs())} outputs")
@@ -125,7 +125,7 @@ def _input(session: Any, file: str) -> tuple[int | None, tuple[int, int]]:
 
 
 def _run(session: Any, images: Logits, fixed_batch: int | None) -> Logits:
-    """Logits of images (n, 3, H, W); where the batch is fixed, the last one is filled up with black and cut again."""
+    """Logits of images (n, 3, H, W); an incomplete fixed batch is padded with black images."""
     missing = (fixed_batch or len(images)) - len(images)
     padded = np.pad(images, ((0, missing), (0, 0), (0, 0), (0, 0)))
     logits: Logits = session.run(None, {session.get_inputs()[0].name: padded})[0]

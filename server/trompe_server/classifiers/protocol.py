@@ -1,4 +1,4 @@
-"""What the rest of the server asks of a classifier, and the one way images become its input."""
+"""Interfaces of classifiers, and the conversion of images to their input."""
 
 from collections.abc import Iterator, Sequence
 from typing import Final, Protocol, runtime_checkable
@@ -21,13 +21,12 @@ __all__ = [
     "finite",
     "fit_images",
     "in_batches",
-    "innermost",
     "refuse_probabilities",
     "resize",
 ]
 
 HUGE: Final = 1e30
-"""What stands for an infinite logit."""
+"""Replacement for an infinite logit."""
 
 Images = NDArray[np.uint8]
 Logits = NDArray[np.float32]
@@ -35,11 +34,11 @@ Logits = NDArray[np.float32]
 
 @runtime_checkable
 class Classifier(Protocol):
-    """An image classifier that gives logits. ``classes`` names them in order, where known."""
+    """An image classifier with logits."""
 
     @property
     def name(self) -> str:
-        """What reports call it."""
+        """Its name in reports."""
         ...
 
     @property
@@ -54,47 +53,47 @@ class Classifier(Protocol):
 
     @property
     def classes(self) -> tuple[str, ...] | None:
-        """Class names in the order of the logits, or ``None`` where unknown."""
+        """Class names in the order of the logits, or ``None`` if unknown."""
         ...
 
     def predict(self, images: Images) -> Logits:
-        """Logits (N, n_classes), all finite, of sRGB images (N, H, W, 3), row 0 on top; other sizes are resized."""
+        """Logits (N, n_classes) float32, all finite, of sRGB images (N, H, W, 3) uint8 of any size, row 0 on top."""
         ...
 
 
 @runtime_checkable
 class WhiteBoxClassifier(Classifier, Protocol):
-    """A classifier that can be attacked: its logits are differentiable in the images."""
+    """A classifier with logits differentiable in the images."""
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
-        """Logits of sRGB images in [0, 1] of the classifier's own size; its parameters take no gradient."""
+        """Logits of sRGB images in [0, 1] of size ``image_size``; the parameters are frozen."""
         ...
 
 
 @runtime_checkable
 class ScoringClassifier(Classifier, Protocol):
-    """A classifier that takes images that are not rounded to 8 bits, whether it gives gradients or not."""
+    """A classifier for images not rounded to 8 bits, with or without gradients."""
 
     def scores(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
-        """Logits of sRGB images in [0, 1] of the classifier's own size, without a gradient, on the images' device."""
+        """Logits of sRGB images in [0, 1] of size ``image_size``, without a gradient, on the images' device."""
         ...
 
 
 def resize(images: Float[Tensor, "n 3 h w"], size: tuple[int, int]) -> Float[Tensor, "n 3 H W"]:
-    """The images in another size (antialiased bilinear, differentiable); the very same tensor where it is theirs."""
+    """The images resized (antialiased bilinear, differentiable); the same tensor if they have that size."""
     if images.shape[2:] == size:
         return images
     return F.interpolate(images, size, mode="bilinear", antialias=True)
 
 
 def fit_images(images: Images, size: tuple[int, int]) -> Float[Tensor, "n 3 H W"]:
-    """Images (N, h, w, 3) as a classifier's input in [0, 1], resized (antialiased bilinear) where not of ``size``."""
+    """Images (N, h, w, 3) as a classifier's input in [0, 1] of ``size`` (H, W), resized if necessary."""
     batch = torch.from_numpy(np.ascontiguousarray(images)).permute(0, 3, 1, 2).float() / 255
     return resize(batch, size)
 
 
 def in_batches(images: Images, count: int) -> Iterator[Images]:
-    """Consecutive runs of at most ``count`` images. Raises ``ClassifierError`` when they are not (N, H, W, 3) uint8."""
+    """Batches of at most ``count`` images. Raises ``ClassifierError`` unless they are (N, H, W, 3) uint8."""
     if images.ndim != 4 or images.shape[3] != 3 or images.dtype != np.uint8:
         raise ClassifierError(
             f"Images of shape {images.shape} and type {images.dtype} cannot be classified; "
@@ -104,13 +103,12 @@ def in_batches(images: Images, count: int) -> Iterator[Images]:
 
 
 def finite(logits: Float[Tensor, "n classes"]) -> Float[Tensor, "n classes"]:
-    """Infinite logits as huge ones, undefined ones as 0: what can be compared and written. No gradient flows through
-    either."""
+    """Replace infinite logits by huge ones and NaN by 0; neither passes a gradient."""
     return logits.nan_to_num(nan=0.0, posinf=HUGE, neginf=-HUGE)
 
 
 def check_classes(classes: Sequence[str] | None, n_classes: int, file: str) -> tuple[str, ...] | None:
-    """The class names as a tuple. Raises ``ClassifierError`` when there is not one for each logit."""
+    """The class names as a tuple. Raises ``ClassifierError`` unless there is one for each logit."""
     if classes is None:
         return None
     if len(classes) != n_classes:
@@ -122,7 +120,7 @@ def check_classes(classes: Sequence[str] | None, n_classes: int, file: str) -> t
 
 
 def refuse_probabilities(outputs: NDArray[np.float32], file: str) -> None:
-    """Raise ``ClassifierError`` when every row of ``outputs`` (N, classes) is a probability distribution."""
+    """Raise ``ClassifierError`` if every row of ``outputs`` (N, classes) is a probability distribution."""
     if outputs.shape[1] > 1 and (outputs >= 0).all() and np.allclose(outputs.sum(axis=1), 1, atol=1e-4):
         raise ClassifierError(
             f"{file!r} ends in a softmax: each output row is positive and sums to 1. "
@@ -131,32 +129,25 @@ def refuse_probabilities(outputs: NDArray[np.float32], file: str) -> None:
 
 
 class Wrapper:
-    """What a wrapper around another classifier says of itself: what ``inner`` says."""
+    """Base of wrappers around a classifier: name, classes and predictions are those of ``inner``."""
 
     inner: Classifier
 
     @property
     def name(self) -> str:
-        """See ``Classifier``."""
+        """Its name in reports."""
         return self.inner.name
 
     @property
     def n_classes(self) -> int:
-        """See ``Classifier``."""
+        """Number of its logits."""
         return self.inner.n_classes
 
     @property
     def classes(self) -> tuple[str, ...] | None:
-        """See ``Classifier``."""
+        """Class names in the order of the logits, or ``None`` if unknown."""
         return self.inner.classes
 
     def predict(self, images: Images) -> Logits:
-        """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size, resized once, to the inner size."""
+        """Logits (N, n_classes) of uint8 images (N, H, W, 3) of any size, resized once, to the size of ``inner``."""
         return self.inner.predict(images)
-
-
-def innermost(classifier: Classifier) -> Classifier:
-    """The classifier without its wrappers."""
-    while isinstance(classifier, Wrapper):
-        classifier = classifier.inner
-    return classifier

@@ -1,12 +1,12 @@
-"""Attack a classifier that only answers: its gradient is estimated from scores, and every question is counted.
+"""Gradients of a score-only classifier, estimated from counted queries.
 
-Natural evolution strategies in image space (Ilyas et al., 2018): the slope of the loss along random patterns, each
-asked for on both sides of the image, times the patterns. A pattern is noise on a coarse grid, spread smoothly over the
-image: the fewer unknowns, the fewer questions, and what is finer the surrogate averages away. The estimate stands in
-for the true gradient at the classifier's input, so that nothing behind it, surrogate and attack, needs to know.
+Natural evolution strategies in image space (Ilyas et al., 2018): the slope of the loss along random patterns, from
+queries on both sides of the image, times the patterns. A pattern is noise on a coarse grid, interpolated over the
+image: fewer unknowns need fewer queries, and the surrogate averages finer detail away. The estimate replaces the true
+gradient at the classifier's input; surrogate and attack stay the same.
 
-The steps are large, as large as the change that the attack may make: a slope over the whole budget tells more about
-where to go than one at the image itself, and is not drowned by the kinks of a network.
+The steps are as large as the attack's budget. A slope over the whole budget is a better guide than one at the image
+itself, and the kinks of a network disturb it less.
 """
 
 from dataclasses import dataclass, field
@@ -28,9 +28,9 @@ __all__ = ["ScoreBasedClassifier", "score_based"]
 
 @dataclass
 class ScoreBasedClassifier(Wrapper):
-    """``inner``, its gradient estimated; ``queries`` counts the images it was asked about, ``predict`` left out.
+    """``inner`` with estimated gradients; ``queries`` counts its images, except those of ``predict``.
 
-    An image for which no gradient is wanted (its loss is clamped, say) costs only the one query for its scores.
+    An image without a gradient (for example with a clamped loss) costs only the query for its scores.
     """
 
     inner: ScoringClassifier
@@ -43,23 +43,23 @@ class ScoreBasedClassifier(Wrapper):
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """See ``Classifier``."""
+        """(H, W) of the inner classifier's input."""
         return self.inner.image_size
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
-        """The true logits of sRGB images in [0, 1]; their gradient is an estimate, asked for when it is needed."""
+        """The true logits of sRGB images in [0, 1]; the backward pass estimates their gradient."""
         logits: Tensor = _Asked.apply(images, self)  # type: ignore[no-untyped-call]
         return logits
 
     def ask(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
-        """Scores of the images, each counted as one query."""
+        """Scores of the images; each counts as one query."""
         self.queries += len(images)
         return self.inner.scores(images)
 
     def estimate(self, image: Float[Tensor, "3 H W"], weights: Float[Tensor, " classes"]) -> Float[Tensor, "3 H W"]:
         """Estimated gradient of ``weights @ logits`` in the image.
 
-        The same image and weights give the same estimate, whenever and in whatever company they are asked about.
+        Deterministic in image and weights, independent of time and batch.
         """
         patterns = self._patterns(image)
         steps = self.sigma * patterns
@@ -69,7 +69,7 @@ class ScoreBasedClassifier(Wrapper):
         return torch.einsum("p,pchw->chw", slopes, patterns)
 
     def _patterns(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "pairs 3 H W"]:
-        """Smooth noise on the object's pixels, drawn by the seed and the image's own bits."""
+        """Smooth noise on the object's pixels, seeded by the seed and the image."""
         generator = generator_for(image, self.seed)
         height, width = (min(self.cells, side) for side in image.shape[1:])
         coarse = torch.randn((self.queries_per_gradient // 2, 3, height, width), generator=generator)
@@ -78,7 +78,7 @@ class ScoreBasedClassifier(Wrapper):
 
 
 class _Asked(Function):
-    """Logits whose gradient is asked for, not computed."""
+    """Logits with an estimated gradient."""
 
     @staticmethod
     def forward(ctx: Any, images: Tensor, classifier: ScoreBasedClassifier) -> Tensor:
@@ -90,7 +90,7 @@ class _Asked(Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        """The estimate for each image that a gradient comes to, nothing for the others."""
+        """The estimate for each image with a gradient, zero for the others."""
         (images,) = ctx.saved_tensors
         estimates = torch.zeros_like(images)
         for index in torch.nonzero(gradient.any(dim=1)).flatten().tolist():
@@ -99,7 +99,7 @@ class _Asked(Function):
 
 
 def _differs(image: Float[Tensor, "3 H W"], background: Float[Tensor, "3 #H #W"]) -> Bool[Tensor, "H W"]:
-    """Where the image shows something else than the background, by more than what resizing leaves of rounding."""
+    """Mask of pixels that differ from the background by more than rounding."""
     return (image - background).abs().amax(0) > 0.25 / 255
 
 
@@ -112,16 +112,17 @@ def score_based(
     sigma: float = 0.05,
     cells: int = 28,
 ) -> ScoreBasedClassifier:
-    """A classifier of which only scores are known as one that can be attacked.
+    """Make a score-only classifier attackable.
 
-    ``background``: what the images show behind the object, sRGB in [0, 1], of the classifier's size or one colour
-    (3, 1, 1). Only what differs from it is asked about: a small object needs that, for every other pixel is noise.
-    ``queries``: how many images it is asked about for the gradient of one, an even number. ``sigma``: standard
-    deviation of a pattern at the middle of a cell, sRGB in [0, 1] units; the budget's epsilon is a good choice.
-    ``cells``: the grid of a pattern is ``cells`` x ``cells``; as many as the image has pixels makes it white noise, and
-    the estimate of a linear function exact on average, instead of a smoothed gradient.
-    The draws depend on the seed and on the image alone: a resumed attack goes on as if it had not stopped.
-    Raises ``SpecError`` for options out of range, ``ClassifierError`` where the classifier takes 8-bit images only.
+    background: the images' background, sRGB in [0, 1], of the classifier's size or one colour (3, 1, 1). Patterns cover
+        only the pixels that differ from it; for a small object all others are noise.
+    queries: images per gradient of one image, an even number.
+    sigma: standard deviation of a pattern at the middle of a cell, sRGB in [0, 1] units, best the budget's epsilon.
+    cells: side of a pattern's grid. With as many cells as pixels the patterns are white noise, and the mean estimate of
+        a linear function is exact; with fewer it is a smoothed gradient.
+
+    The draws depend on the seed and on the image only, so that a resumed attack continues identically.
+    Raises ``SpecError`` for options out of range and ``ClassifierError`` for a classifier of 8-bit images only.
     """
     if queries < 2 or queries % 2 or not 0 < sigma <= 1 or cells < 1:
         raise SpecError(
@@ -130,7 +131,7 @@ def score_based(
         )
     if not isinstance(classifier, ScoringClassifier):
         raise ClassifierError(
-            f"{classifier.name!r} takes 8-bit images only, which are too coarse to estimate a gradient from; "
-            "expected a classifier with a method 'scores', as .onnx files give."
+            f"{classifier.name!r} takes 8-bit images only, too coarse to estimate a gradient; "
+            "expected a classifier with a method 'scores', such as an .onnx file."
         )
     return ScoreBasedClassifier(classifier, queries, cells, sigma, seed, background)

@@ -1,7 +1,6 @@
-"""The classifier that ships with Trompe: a small, ordinary convolutional network that knows the shipped objects.
+"""The shipped classifier: a small convolutional network for the shipped objects.
 
-It is meant for first attacks and for tests: it is not robust, and nothing was done to make it so.
-``scripts/train_classifier.py`` trains it.
+It serves first attacks and tests and was not trained to be robust. ``scripts/train_classifier.py`` trains it.
 """
 
 from itertools import pairwise
@@ -29,7 +28,7 @@ WIDTHS: Final = (24, 48, 96, 160)
 
 
 class TinyNet(nn.Module):
-    """Seven 3x3 convolutions with batch normalisation, 16-fold smaller at the end, averaged, one linear layer."""
+    """Seven 3x3 convolutions with batch normalisation (16-fold downsampling), averaging, one linear layer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -40,7 +39,7 @@ class TinyNet(nn.Module):
         self.head = nn.Linear(WIDTHS[-1], len(CLASSES))
 
     def forward(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
-        """Logits of sRGB images in [0, 1]; the normalisation is in here."""
+        """Logits of sRGB images in [0, 1]; includes the normalisation."""
         features = self.features((images - MEAN) / SPREAD)  # (n, 160, H / 16, W / 16)
         logits: Tensor = self.head(features.mean(dim=(2, 3)))
         return logits
@@ -52,9 +51,9 @@ def _convolution(before: int, after: int, *, stride: int) -> nn.Sequential:
 
 
 def load_tiny(path: Path = WEIGHTS) -> TinyNet:
-    """The trained network in evaluation mode, its parameters frozen.
+    """The trained network in evaluation mode with frozen parameters.
 
-    Raises ``ClassifierError`` when the weights that came with the package are missing or do not fit.
+    Raises ``ClassifierError`` if the shipped weights are missing or do not fit.
     """
     network = TinyNet()
     try:
@@ -70,7 +69,7 @@ def load_tiny(path: Path = WEIGHTS) -> TinyNet:
 
 
 def save_tiny(network: TinyNet, path: Path = WEIGHTS) -> None:
-    """Write the weights; convolutions in half precision, which changes no prediction and halves the file."""
+    """Write the weights, convolutions in half precision: half the size, the same predictions."""
     state = {name: tensor.cpu().numpy() for name, tensor in network.state_dict().items()}
     narrow = {name: array.astype(np.float16) if array.ndim > 1 else array for name, array in state.items()}
     np.savez(path, allow_pickle=False, **narrow)

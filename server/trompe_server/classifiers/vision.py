@@ -1,7 +1,7 @@
-"""Networks of torchvision by name, with the size and normalisation that belong to their weights.
+"""torchvision's networks by name, with the image size and normalisation of their weights.
 
-Nothing is downloaded: weights come from torch's cache, or from a file, and every tensor of the network must be among
-them, so that it never stands there with random weights.
+Nothing is downloaded: weights come from torch's cache or from a file and must include every tensor of the network, so
+that no layer keeps random weights.
 """
 
 import difflib
@@ -23,7 +23,7 @@ __all__ = ["load_torchvision", "read_weights"]
 
 
 class _LocalWeights:
-    """An entry of torchvision's table of weights, its tensors read from a file here and its classes named anew."""
+    """An entry of torchvision's table of weights with tensors from a local file and other class names."""
 
     def __init__(self, entry: Any, tensors: dict[str, torch.Tensor], classes: Sequence[str]) -> None:
         self.entry, self.tensors = entry, tensors
@@ -31,11 +31,11 @@ class _LocalWeights:
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
-        """torchvision builds a network only for a member of the network's own table."""
+        """The entry's class: torchvision accepts members of the network's own table only."""
         return type(self.entry)
 
     def get_state_dict(self, **_: Any) -> dict[str, torch.Tensor]:
-        """What torchvision loads into the network."""
+        """The tensors for the network."""
         return self.tensors
 
 
@@ -47,11 +47,13 @@ def load_torchvision(
     weights: str | Path | None = None,
     device: str = "cpu",
 ) -> NetworkClassifier:
-    """The torchvision classification network ``model`` as a white-box classifier.
+    """Load torchvision's classification network ``model`` as a white-box classifier.
 
-    ``weights``: which of torchvision's (``"IMAGENET1K_V1"``; its default where ``None``), from torch's cache, or a file
-    with a state dict, for as many classes as ``classes`` names (by default those of torchvision's weights).
-    Raises ``ClassifierError`` when torchvision, the network or the weights are not there, or do not fit together.
+    weights: name of torchvision's weights in torch's cache (``"IMAGENET1K_V1"``; by default torchvision's default), or
+        a file with a state dict.
+    classes: class names of the state dict, by default those of torchvision's weights.
+
+    Raises ``ClassifierError`` if torchvision, the network or the weights are missing or do not fit together.
     """
     models = _torchvision()
     entry, path = _find_weights(models, model, weights)
@@ -71,7 +73,7 @@ def _torchvision() -> Any:
         return importlib.import_module("torchvision.models")
     except ImportError as error:
         raise ClassifierError(
-            "torchvision is not installed, and networks by name come from it. Install the version made for torch "
+            "torchvision is not installed; networks by name come from it. Install the version for torch "
             f"{torch.__version__} (the 'vision' extra of trompe), or give a .pt2 file."
         ) from error
     except RuntimeError as error:
@@ -86,7 +88,7 @@ def _find_weights(models: Any, model: str, weights: str | Path | None) -> tuple[
     known = models.list_models(module=models)
     if model not in known:
         near = ", ".join(difflib.get_close_matches(model, known)) or ", ".join(known[:5])
-        raise ClassifierError(f"torchvision has no classification network {model!r}; some that it has: {near}.")
+        raise ClassifierError(f"torchvision has no classification network {model!r}; try one of {near}.")
     table = models.get_model_weights(model)
     cache = Path(torch.hub.get_dir()) / "checkpoints"
     if weights is None or weights in table.__members__:
@@ -98,14 +100,14 @@ def _find_weights(models: Any, model: str, weights: str | Path | None) -> tuple[
 
 
 def _built(models: Any, model: str, entry: Any, path: Path, classes: Sequence[str]) -> nn.Module:
-    """The network with the weights of a file. Raises ``ClassifierError`` when they do not fit."""
+    """The network with the weights of a file. Raises ``ClassifierError`` if they do not fit."""
     tensors = read_weights(path)
     try:
         network: nn.Module = models.get_model(model, weights=_LocalWeights(entry, tensors, classes))
     except RuntimeError as error:
         raise ClassifierError(
             f"The weights in {path.name!r} do not fit torchvision's {model!r} with {len(classes)} classes "
-            f"({str(error)[:300]}). Give the file of this very network, and one class name for each of its logits."
+            f"({str(error)[:300]}). Give the file of this network, and one class name for each of its logits."
         ) from error
     return network
 
@@ -117,14 +119,14 @@ def _file_of(entry: Any) -> str:
 def _existing(path: Path, what: str) -> Path:
     if not path.is_file():
         raise ClassifierError(
-            f"There is no file {str(path)!r}, and nothing is downloaded. Put there the weights of {what}, "
-            "or give a state dict's file as weights."
+            f"There is no file {str(path)!r}, and nothing is downloaded. Put the weights of {what} there, "
+            "or give a file with a state dict as weights."
         )
     return path
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
-    """The state dict in a file that ``torch.save`` wrote; tensors only. Raises ``ClassifierError``."""
+    """The state dict in a file of ``torch.save``, tensors only. Raises ``ClassifierError``."""
     try:
         tensors = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
@@ -133,5 +135,7 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
             "state dict of tensors alone: torch.save(network.state_dict(), path)."
         ) from error
     if not isinstance(tensors, dict) or not all(isinstance(value, torch.Tensor) for value in tensors.values()):
-        raise ClassifierError(f"{path.name!r} holds no state dict; save one: torch.save(network.state_dict(), path).")
+        raise ClassifierError(
+            f"{path.name!r} contains no state dict; save one with torch.save(network.state_dict(), path)."
+        )
     return tensors

@@ -1,6 +1,6 @@
-"""Models in the formats people have, into SAILenv's and back: only the albedo changes. See docs/formats.md.
+"""Model files in and out: conversion to SAILenv's format, and repainting of the original, where only albedo changes.
 
-``python -m trompe_server.formats.convert`` does it in a process of its own, which is how uploads are read.
+The server reads uploads in a separate process, ``python -m trompe_server.formats.convert``.
 """
 
 from trompe_server.formats.gltf_write import write_glb

@@ -1,4 +1,4 @@
-"""What of an object was repainted, and whether anything else was done to it."""
+"""Comparison of an object before and after a repaint."""
 
 import numpy as np
 
@@ -10,14 +10,14 @@ __all__ = ["repainted"]
 
 
 def repainted(original: Object3D, painted: Object3D) -> dict[str, Pixels]:
-    """The textures (H, W, 3) of ``painted``, by name, whose colours are not those of ``original``.
+    """The textures (H, W, 3) of ``painted``, by name, with colours different from ``original``.
 
-    Raises ``ObjectError`` where the two are not the same mesh.
+    Raises ``ObjectError`` if the meshes differ.
     """
     if _mesh(original) != _mesh(painted) or original.textures.keys() != painted.textures.keys():
         raise ObjectError(
-            f"The mesh of {painted.name!r} is not the one that was uploaded (it was moved, or read by another version "
-            "of Trompe), so its paint does not fit the uploaded file. Take the zip or the GLB, or upload it again."
+            f"The mesh of {painted.name!r} is not the uploaded one (it was moved, or read by another version of "
+            "Trompe), so its paint does not fit the uploaded file. Take the zip or the GLB, or upload it again."
         )
     return {name: image for name, image in painted.textures.items() if not _same(original.textures[name], image)}
 

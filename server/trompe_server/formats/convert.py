@@ -1,7 +1,7 @@
-"""Reads or repaints one model file in a process of its own; ``isolated`` starts it.
+"""Read or repaint one model file in a separate process, started by ``isolated``.
 
-``convert read FILE NAME MAX_TEXTURE ARCHIVE`` writes the object as SAILenv's zip, ``convert repaint FILE NAME ARCHIVE
-OUT`` a model file with its paint; MAX_TEXTURE may be 0 for none. Both answer with one line of JSON.
+``convert read FILE NAME MAX_TEXTURE ARCHIVE`` writes the object as SAILenv's zip (MAX_TEXTURE 0: no limit).
+``convert repaint FILE NAME ARCHIVE OUT`` writes the model file with the paint of ARCHIVE. Both print one line of JSON.
 """
 
 import json
@@ -36,7 +36,7 @@ def _repaint(file: str, name: str, archive: str, out: str) -> dict[str, object]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the command line says, and print the answer; the exit code."""
+    """Run the command and print its answer; return the exit code."""
     what, *rest = arguments
     try:
         answer = _read(*rest) if what == "read" else _repaint(*rest)

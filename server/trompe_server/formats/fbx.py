@@ -1,6 +1,6 @@
-"""FBX, read by assimp's command line: its mesh and materials as OBJ, in metres.
+"""FBX: mesh and materials through assimp's command line as OBJ, in metres.
 
-Only its textures are ever replaced, those that are files beside it as well as those inside a binary FBX.
+A repaint replaces textures only, beside the FBX or inside a binary one.
 """
 
 import re
@@ -19,42 +19,42 @@ from trompe_server.formats.comparison import repainted
 from trompe_server.formats.fbx_tree import MAGIC, Tree, parse_tree
 from trompe_server.formats.pictures import decode, with_alpha_of
 from trompe_server.formats.upload import Upload, base_name
-from trompe_server.formats.wavefront import complete, shrunk
+from trompe_server.formats.wavefront import complete, dissolved, shrunk
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D, object_from_files
 
 __all__ = ["read", "repaint", "unit"]
 
 CENTIMETRE: Final = 0.01
-"""Metres of FBX's unit, where a file does not scale it."""
+"""Metres of FBX's default unit."""
 TIMEOUT: Final = 60.0
 _BINARY: Final = re.compile(rb"S\x0f\0\0\0UnitScaleFactorS\x06\0\0\0doubleS\x06\0\0\0NumberS\0\0\0\0D(.{8})", re.DOTALL)
 _TEXT: Final = re.compile(rb'"UnitScaleFactor"(?:[^\n,]*,){4}\s*([0-9]+(?:\.[0-9]*)?(?:[eE][+-]?[0-9]{1,3})?)')
 
 
 def unit(data: bytes) -> float:
-    """Metres of the file's unit of length. Raises ``ObjectError`` for an absurd one."""
+    """The file's unit of length in metres. Raises ``ObjectError`` outside 1e-6 to 1e6 cm."""
     found = _BINARY.search(data)
     text = _TEXT.search(data)
     factor = struct.unpack("<d", found[1])[0] if found else float(text[1]) if text else 1.0
     if not 1e-6 <= factor <= 1e6:
-        raise ObjectError(f"The FBX says that its unit is {factor:g} cm; set the unit of length and export it again.")
+        raise ObjectError(f"The unit of length of the FBX is {factor:g} cm; set a sensible unit and export it again.")
     return float(factor) * CENTIMETRE
 
 
 def read(upload: Upload, max_texture: int | None = None) -> Object3D:
-    """The object of an FBX and the textures beside it. Raises ``ObjectError``."""
+    """Read an FBX and the textures beside it. Raises ``ObjectError``."""
     return shrunk(_read(upload), max_texture)
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
-    """``upload`` with the textures of ``painted``. Raises ``ObjectError`` for paint that has no place there."""
+    """``upload`` with the textures of ``painted``. Raises ``ObjectError`` for paint on a plain colour."""
     original, tree = _read(upload), _tree(upload.data)
     changed = repainted(original, painted)
     beside, inside = upload.flat(), tree.pictures() if tree is not None else {}
     homeless = sorted(name for name in changed if name not in beside and name not in inside)
     if homeless:
-        raise ObjectError(f"{homeless} are not textures of the FBX, which has colours in their place; take the GLB.")
+        raise ObjectError(f"The FBX has plain colours in place of the textures {homeless}; take the GLB.")
     pngs = {
         name: with_alpha_of(rgb, decode(beside.get(name, inside.get(name, b"")), name)[1])
         for name, rgb in changed.items()
@@ -74,18 +74,18 @@ def _read(upload: Upload) -> Object3D:
     beside = {name: data for name, data in upload.flat().items() if not name.lower().endswith((".obj", ".mtl"))}
     inside = tree.pictures() if tree is not None else {}
     bare = upload.data if tree is None or not inside else tree.with_pictures(dict.fromkeys(inside)).to_bytes()
-    obj = object_from_files(complete({**inside, **beside, **_converted(bare)}))
+    obj = object_from_files(dissolved(complete({**inside, **beside, **_converted(bare)})))
     parts = [replace(part, vertices=part.vertices * np.float32(scale)) for part in obj.parts]
     images = {name: obj.files[name] for m in obj.materials.values() for name in (m.albedo, m.normal) if name}
     return assemble(safe_name(upload.stem), parts, obj.materials, images)
 
 
 def _converted(data: bytes) -> dict[str, bytes]:
-    """The OBJ and MTL that assimp makes of an FBX."""
+    """OBJ and MTL of an FBX, by assimp."""
     program = shutil.which("assimp")
     if program is None:
         raise ObjectError(
-            "FBX files are read by assimp, which is missing: install the package assimp-utils (Debian, Ubuntu), or "
+            "Reading FBX needs assimp, which is missing: install the package assimp-utils (Debian, Ubuntu), or "
             "export the model as glTF."
         )
     with tempfile.TemporaryDirectory() as folder:

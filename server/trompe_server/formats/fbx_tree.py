@@ -1,4 +1,4 @@
-"""Binary FBX as a tree of nodes, as far as it takes to find the pictures inside and to put others in their place."""
+"""Binary FBX as a tree of nodes, to find and replace the pictures inside."""
 
 import struct
 from collections.abc import Iterator
@@ -13,16 +13,16 @@ __all__ = ["MAGIC", "Node", "Tree", "parse_tree"]
 MAGIC: Final = b"Kaydara FBX Binary  \0\x1a\0"
 MAX_DEPTH: Final = 32
 WIDE: Final = 7500
-"""From this version on, offsets have 64 bits."""
+"""First version with offsets of 64 bits."""
 _ID: Final = 16
-"""Bytes of the footer before its padding, an identification ..."""
+"""Bytes of the footer before its padding: an identification."""
 _END: Final = 140
-"""... and after it: the version, zeros, a mark."""
+"""Bytes of the footer after its padding: version, zeros, a mark."""
 
 
 @dataclass(frozen=True)
 class Node:
-    """``properties`` are ``count`` values, encoded; ``children`` is ``None`` where there is no list of them at all."""
+    """properties: ``count`` encoded values. children: ``None`` without a list of children."""
 
     name: bytes
     count: int
@@ -35,18 +35,18 @@ class Node:
 
 @dataclass(frozen=True)
 class Tree:
-    """A file; ``footer`` is what follows its nodes."""
+    """A file; ``footer``: the bytes after its nodes."""
 
     version: int
     nodes: tuple[Node, ...]
     footer: bytes
 
     def pictures(self) -> dict[str, bytes]:
-        """The image files inside, by the name that materials know them by."""
+        """The image files inside, by their names in materials."""
         return {name: _bytes(content) for video in self._videos() for name, content in [_picture(video)] if content}
 
     def with_pictures(self, pictures: dict[str, bytes | None]) -> "Tree":
-        """The same tree with other image files; those that are ``None`` are taken out."""
+        """The tree with other image files; ``None`` removes a file."""
         return replace(self, nodes=tuple(_replaced(node, pictures) for node in self.nodes))
 
     def _videos(self) -> Iterator[Node]:
@@ -55,7 +55,7 @@ class Tree:
                 yield from (node for node in top.children or () if node.name == b"Video")
 
     def to_bytes(self) -> bytes:
-        """The file."""
+        """The file's bytes."""
         out = bytearray(MAGIC + struct.pack("<I", self.version))
         for node in self.nodes:
             _write(node, out, self._header)
@@ -72,7 +72,7 @@ class Tree:
 
 
 def parse_tree(data: bytes) -> Tree:
-    """The nodes of a binary FBX. Raises ``ObjectError``."""
+    """Parse a binary FBX. Raises ``ObjectError``."""
     try:
         (version,) = struct.unpack_from("<I", data, len(MAGIC))
         nodes, end = _parse(data, len(MAGIC) + 4, len(data), _header(version), 0)
@@ -82,12 +82,12 @@ def parse_tree(data: bytes) -> Tree:
 
 
 def _header(version: int) -> struct.Struct:
-    """Of a node: where it ends, the number of its properties, their length."""
+    """Header of a node: its end, the number of its properties, their length."""
     return struct.Struct("<QQQ" if version >= WIDE else "<III")
 
 
 def _parse(data: bytes, position: int, end: int, header: struct.Struct, depth: int) -> tuple[tuple[Node, ...], int]:
-    """Nodes from ``position`` up to the empty one that ends their list, and where it ends."""
+    """(Nodes from ``position`` up to the empty one that ends their list, end of the list)."""
     nodes: list[Node] = []
     while position < end:
         node_end, count, length = header.unpack_from(data, position)
@@ -97,7 +97,7 @@ def _parse(data: bytes, position: int, end: int, header: struct.Struct, depth: i
         name = data[start : start + data[start - 1]]
         body = start + len(name) + length
         if not position < node_end <= end or body > node_end or depth > MAX_DEPTH:
-            raise ObjectError(f"The FBX's nodes do not fit into each other (at byte {position}); export it again.")
+            raise ObjectError(f"The FBX's nodes overlap (at byte {position}); export it again.")
         children = _parse(data, body, node_end, header, depth + 1)[0] if body < node_end else None
         nodes.append(Node(name, count, data[body - length : body], children))
         position = node_end
@@ -115,7 +115,7 @@ def _write(node: Node, out: bytearray, header: struct.Struct) -> None:
 
 
 def _picture(video: Node) -> tuple[str, Node | None]:
-    """The name of a picture, and the node of its bytes where they are inside."""
+    """(Name of a picture, node of its bytes if they are inside)."""
     content = video.child(b"Content")
     named = video.child(b"RelativeFilename") or video.child(b"Filename")
     inside = content is not None and content.properties[:1] == b"R" and len(content.properties) > 5

@@ -1,7 +1,7 @@
-"""glTF and GLB: what a scene shows, as an object.
+"""Read the scene of a glTF or GLB file as an object.
 
-Each distinct (image, colour factor, treatment of alpha) becomes one albedo texture: materials that look alike share
-their texels, an image that is used with two factors becomes two textures, for an attack would paint them differently.
+Each distinct (image, colour factor, treatment of alpha) becomes one albedo texture. Equal materials share their texels;
+an image with two factors becomes two textures, because an attack paints them differently.
 """
 
 from dataclasses import dataclass, field, replace
@@ -32,17 +32,19 @@ from trompe_shared.wavefront import Part
 __all__ = ["Model", "Slot", "load", "read"]
 
 Key = tuple[int, int]
-"""Numbers of a mesh and of one of its primitives."""
+"""(Number of a mesh, number of one of its primitives)."""
+KEPT: tuple[float, float] = (1.0, 0.5)
+"""Factor and cutoff that leave alpha unchanged."""
 PLAIN: tuple[float, float] = (0.0, 0.9)
-"""Metallic and roughness of a material without a map, in SAILenv's format."""
+"""Metallic and roughness of SAILenv's materials without a map."""
 
 
 @dataclass(frozen=True)
 class Slot:
-    """An albedo texture: the image it comes from (``None``: a flat colour), and what is done to it.
+    """An albedo texture: its image (``None``: a flat colour) and the changes to it.
 
-    ``factor`` is linear. ``alpha`` is (factor, cutoff) where alpha cuts out. ``unwrapped`` names the material whose
-    primitives get their texture coordinates here.
+    factor: linear. alpha: (factor, cutoff) for cut-out materials, ``KEPT`` for blended ones. unwrapped: the material
+    (-1: none) of the primitives that get their texture coordinates here.
     """
 
     image: int | None
@@ -53,7 +55,7 @@ class Slot:
 
 @dataclass
 class Model:
-    """A glTF file as an object, and what of it came from where."""
+    """A glTF file as an object, with the origin of each texture and part."""
 
     container: Container
     max_texture: int | None
@@ -61,7 +63,7 @@ class Model:
     slots: dict[Slot, str] = field(default_factory=dict)
     """File name of each slot's texture."""
     users: dict[Slot, set[int | None]] = field(default_factory=dict)
-    """The glTF materials that are painted with it."""
+    """The glTF materials of each slot."""
     shapes: dict[Key, Shape] = field(default_factory=dict)
     materials: dict[str, Maps] = field(default_factory=dict)
     parts: list[Part] = field(default_factory=list)
@@ -78,7 +80,7 @@ class Model:
         return assemble(safe_name(self.container.upload.stem), self.parts, self.materials, self.files)
 
     def add(self) -> None:
-        """Read all that the scene shows."""
+        """Read all meshes of the scene."""
         standing = list(instances(self.document))
         for mesh in dict.fromkeys(mesh for mesh, _ in standing):
             self._read_mesh(mesh)
@@ -93,13 +95,13 @@ class Model:
     def _read_mesh(self, index: int) -> None:
         mesh = at(self.document.meshes, index, "mesh")
         if any(mesh.weights):
-            raise ObjectError("The glTF blends morph targets, which are not read; apply them and export it again.")
+            raise ObjectError("The glTF blends morph targets, which are not supported; apply them and export it again.")
         for number, primitive in enumerate(mesh.primitives):
             if primitive.mode >= 4:
                 self.shapes[index, number] = read_shape(self.container, primitive)
 
     def _unwrap(self) -> None:
-        """Give texture coordinates to the shapes that need them, those of one material in one texture."""
+        """Unwrap the shapes without texture coordinates; those of one material share a texture."""
         needy: dict[int | None, list[Key]] = {}
         for key, shape in self.shapes.items():
             if _needs_unwrapping(shape, self._material(shape.material)):
@@ -129,8 +131,7 @@ class Model:
     def _slot(self, index: int | None, *, unwrapped: bool) -> Slot:
         material = self._material(index)
         red, green, blue, opacity = material.pbr.base_color_factor
-        cutoff = material.alpha_cutoff if material.alpha_mode == "MASK" else 0.5
-        alpha = None if material.alpha_mode == "OPAQUE" else (opacity, cutoff)
+        alpha = {"OPAQUE": None, "MASK": (opacity, material.alpha_cutoff), "BLEND": KEPT}[material.alpha_mode]
         info = material.pbr.base_color_texture
         image = None if info is None else self._image_of(info)
         if unwrapped:
@@ -140,11 +141,11 @@ class Model:
     def _image_of(self, info: TextureInfo) -> int:
         texture = at(self.document.textures, info.index, "texture")
         if texture.source is None:
-            raise ObjectError(f"Texture {info.index} of the glTF has no image that is read; use PNG or JPEG.")
+            raise ObjectError(f"Texture {info.index} of the glTF has no supported image; use PNG or JPEG.")
         return texture.source
 
     def _paint(self, shape: Shape) -> None:
-        """Have the material of ``shape``, with its textures."""
+        """Add the material of ``shape`` with its textures."""
         slot = self._slot(shape.material, unwrapped=shape.cut is not None)
         self.users.setdefault(slot, set()).add(shape.material)
         if slot not in self.slots:
@@ -154,8 +155,9 @@ class Model:
             wanted = self._material_name(shape.material) + ("_unwrapped" if key[1] else "")
             self._names[key] = free_name(wanted, self._names.values())
             material = self._material(shape.material)
-            maps = Maps(self._names[key], self.slots[slot], self._normal(material), self._metallic(material))
-            self.materials[self._names[key]] = maps
+            opacity = material.pbr.base_color_factor[3] if material.alpha_mode == "BLEND" else None
+            maps = self._names[key], self.slots[slot], self._normal(material), self._metallic(material)
+            self.materials[self._names[key]] = Maps(*maps, opacity)
 
     def _material_name(self, index: int | None) -> str:
         default = "default" if index is None else f"material_{index}"
@@ -222,7 +224,7 @@ class Model:
         return self._converted[key]
 
     def _place(self, shape: Shape, matrix: Matrix) -> tuple[Part, ...]:
-        """The shape where an instance stands; both sides of it where both are seen."""
+        """The shape at the place of an instance; both sides if the material is double-sided."""
         part = placed(shape, matrix, self._names[shape.material, shape.cut is not None])
         if not self._material(shape.material).double_sided:
             return (part,)
@@ -230,16 +232,16 @@ class Model:
 
 
 def read(upload: Upload, max_texture: int | None = None) -> Object3D:
-    """The object that a .gltf or .glb shows. Raises ``ObjectError``."""
+    """Read a .gltf or .glb file. Raises ``ObjectError``."""
     return load(upload, max_texture).object()
 
 
 def load(upload: Upload, max_texture: int | None = None) -> Model:
-    """As ``read``, with what came from where."""
+    """As ``read``, with the origin of textures and parts."""
     model = Model(open_container(upload), max_texture)
     model.add()
     if not model.parts:
-        raise ObjectError("The glTF's scene shows no triangles; export a scene with a mesh in it.")
+        raise ObjectError("The glTF's scene has no triangles; export a scene with a mesh.")
     return model
 
 
@@ -250,20 +252,19 @@ def _colours(shape: Shape) -> NDArray[np.float64]:
 def _needs_unwrapping(shape: Shape, material: Material) -> bool:
     if shape.colours is not None and material.maps:
         raise ObjectError(
-            f"Material {material.name!r} has textures that colours of vertices are to multiply; bake these into its "
-            "base colour texture."
+            f"Material {material.name!r} has textures and vertex colours; bake them into its base colour texture."
         )
     return shape.uvs is None or shape.colours is not None
 
 
 def _ending(data: bytes) -> str | None:
-    """How the name of an image file is to end that everyone can read as it is."""
+    """File name ending of a PNG or JPEG; ``None`` for other encodings."""
     return "png" if data[:4] == b"\x89PNG" else "jpg" if data[:3] == b"\xff\xd8\xff" else None
 
 
 def _kept_as_is(slot: Slot, data: bytes, has_alpha: bool, full_size: bool) -> bool:
-    """Whether an image file can serve as it is."""
-    alpha_fits = not has_alpha if slot.alpha is None else slot.alpha == (1.0, 0.5)
+    """Whether an image file can serve unchanged."""
+    alpha_fits = not has_alpha if slot.alpha is None else slot.alpha == KEPT
     return _ending(data) == "png" and full_size and slot.factor == (1.0, 1.0, 1.0) and alpha_fits
 
 

@@ -1,4 +1,4 @@
-"""A glTF file opened: its JSON checked against the schema, its buffers found, its accessors and images read."""
+"""Open a glTF file: check its JSON against the schema, find its buffers, read accessors and images."""
 
 import base64
 import binascii
@@ -29,15 +29,15 @@ T = TypeVar("T")
 
 
 def at(items: Sequence[T], index: int, what: str) -> T:
-    """``items[index]``. Raises ``ObjectError`` where there is none."""
+    """``items[index]``. Raises ``ObjectError`` for an index out of range."""
     if not 0 <= index < len(items):
-        raise ObjectError(f"The glTF names {what} {index}, and has {len(items)}; export it again.")
+        raise ObjectError(f"The glTF names {what} {index}, but has {len(items)}; export it again.")
     return items[index]
 
 
 @dataclass(frozen=True)
 class Container:
-    """``text`` is the JSON as it is in the file; ``buffers`` are as long as it says at least."""
+    """text: the JSON as in the file. buffers: at least as long as their declared lengths."""
 
     upload: Upload
     text: bytes
@@ -54,10 +54,10 @@ class Container:
         return data[view.byte_offset : view.byte_offset + view.byte_length]
 
     def raw(self, index: int) -> NDArray[np.generic]:
-        """Numbers of an accessor as they are stored, (count, components)."""
+        """Stored numbers of an accessor, (count, components)."""
         accessor = at(self.document.accessors, index, "accessor")
         if accessor.sparse is not None:
-            raise ObjectError("The glTF has sparse accessors, which are not read; export it without.")
+            raise ObjectError("The glTF has sparse accessors, which are not supported; export it without.")
         kind, width = np.dtype(COMPONENTS[accessor.component_type]), WIDTHS[accessor.type]
         if accessor.buffer_view is None:
             return np.zeros((accessor.count, width), kind)
@@ -69,7 +69,7 @@ class Container:
         return np.ndarray((accessor.count, width), kind, data, accessor.byte_offset, strides).copy()
 
     def numbers(self, index: int, width: int) -> NDArray[np.float32]:
-        """An accessor of ``width`` components as float32 (count, width), normalised where it says so."""
+        """An accessor of ``width`` components as float32 (count, width), normalised if declared so."""
         values, accessor = self.raw(index), self.document.accessors[index]
         if values.shape[1] != width:
             raise ObjectError(f"Accessor {index} of the glTF has {values.shape[1]} components, expected {width}.")
@@ -84,12 +84,12 @@ class Container:
         if image.buffer_view is not None:
             return self.view(image.buffer_view)
         if image.uri is None:
-            raise ObjectError(f"Image {index} of the glTF is nowhere: it has neither a buffer view nor a URI.")
+            raise ObjectError(f"Image {index} of the glTF has neither a buffer view nor a URI; export it again.")
         return resolve(image.uri, self.upload)
 
 
 def resolve(uri: str, upload: Upload) -> bytes:
-    """Bytes behind a URI: its own data, or a file of the upload. Raises ``ObjectError`` for any other."""
+    """Bytes of a data URI or of a file of the upload. Raises ``ObjectError`` for any other URI."""
     if not uri.startswith("data:"):
         return upload.files[upload.beside(uri)]
     head, _, data = uri.partition(",")
@@ -107,7 +107,7 @@ def split_glb(data: bytes) -> list[tuple[int, bytes]]:
         raise ObjectError("The GLB file ends too early; export it again.")
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
-        raise ObjectError(f"The GLB file has version {version}; only version 2 is read. Export it as glTF 2.0.")
+        raise ObjectError(f"The GLB file has version {version}; expected 2. Export it as glTF 2.0.")
     chunks, position = [], 12
     end = min(length, len(data))
     while position + 8 <= end:
@@ -117,7 +117,7 @@ def split_glb(data: bytes) -> list[tuple[int, bytes]]:
         chunks.append((kind, data[position + 8 : position + 8 + size]))
         position += 8 + size
     if not chunks or chunks[0][0] != JSON_CHUNK:
-        raise ObjectError("The GLB file does not begin with its JSON; export it again.")
+        raise ObjectError("The first chunk of the GLB file is not JSON; export it again.")
     return chunks
 
 
@@ -134,7 +134,7 @@ def open_container(upload: Upload) -> Container:
 def _document(text: bytes) -> Document:
     if len(text) > MAX_JSON:
         raise ObjectError(
-            f"The glTF's JSON has {len(text)} bytes; at most {MAX_JSON} are read. Put buffers and images beside it, or "
+            f"The glTF's JSON has {len(text)} bytes; the limit is {MAX_JSON}. Put buffers and images beside it, or "
             "export it as .glb."
         )
     try:
@@ -147,7 +147,9 @@ def _document(text: bytes) -> Document:
     unread = [name for name in document.extensions_required if not name.startswith(READ_EXTENSIONS)]
     unread += [name for name in document.extensions_required if name == "KHR_materials_pbrSpecularGlossiness"]
     if unread:
-        raise ObjectError(f"The glTF requires {', '.join(unread)[:200]}, not read here; export it without compression.")
+        raise ObjectError(
+            f"The glTF requires {', '.join(unread)[:200]}, which is not supported; export it without compression."
+        )
     return document
 
 

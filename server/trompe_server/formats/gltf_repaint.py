@@ -1,8 +1,8 @@
-"""A glTF file with new base colour textures, and as much of the rest as can stay as it was, byte for byte.
+"""Replace the base colour textures of a glTF file and keep the rest byte for byte.
 
-A texture takes the place of the image it came from, where nothing else is drawn with that image; else it becomes an
-image of its own. A colour factor that the texture has taken in becomes 1. A mesh that had no texture coordinates gets
-those that it was painted with: its vertices are split at seams, its triangles stay.
+A texture replaces its image if nothing else uses that image; otherwise it becomes a new image. A colour factor already
+in the texture becomes 1. A mesh without texture coordinates gets those of its paint: its vertices are split at seams,
+its triangles stay.
 """
 
 import base64
@@ -45,7 +45,7 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
 
 
 class _Repainting:
-    """One texture on its way into the file."""
+    """The repaint of one texture."""
 
     def __init__(self, model: Model, editor: "_Editor", slot: Slot) -> None:
         self._model, self._editor, self._slot = model, editor, slot
@@ -67,7 +67,7 @@ class _Repainting:
                 self._point_to(self._editor.add_texture(png, self._texture_entry()))
 
     def _is_first_of(self, image: int) -> bool:
-        """Whether of the slots that come from one image this is the one that may keep its place."""
+        """Whether this is the first slot of its image, which may replace it."""
         return next(slot for slot in self._model.slots if slot.image == image) == self._slot
 
     def _texture_entry(self) -> Json:
@@ -76,7 +76,7 @@ class _Repainting:
         return dict(self._editor.document["textures"][index])
 
     def _point_to(self, texture: int | None) -> None:
-        """Have the slot's materials use ``texture`` (``None``: the one they use), with a factor of 1."""
+        """Point the slot's materials to ``texture`` (``None``: the present one) with a factor of 1."""
         for index in self._materials:
             self._paint(self._editor.document["materials"][index], texture)
         if None in self._model.users[self._slot] and texture is not None:
@@ -95,13 +95,13 @@ class _Repainting:
             pbr["baseColorFactor"] = [1.0, 1.0, 1.0, pbr["baseColorFactor"][3]]
 
     def _placement(self, material: Json) -> Json:
-        """As the material's other maps are placed."""
+        """Placement of the material's other maps."""
         others = (material.get("normalTexture"), material["pbrMetallicRoughness"].get("metallicRoughnessTexture"))
         info: Json = next((info for info in others if info is not None), {})
         return copy.deepcopy({key: info[key] for key in ("texCoord", "extensions") if key in info})
 
     def _wrap(self, rgb: Pixels) -> None:
-        """A copy of the material, with the texture, for the primitives that got their texture coordinates here."""
+        """Give the unwrapped primitives a copy of the material with the texture."""
         slot, document = self._slot, self._editor.document
         own = slot.unwrapped is not None and slot.unwrapped >= 0
         material = copy.deepcopy(document["materials"][slot.unwrapped]) if own else {}
@@ -117,7 +117,7 @@ class _Repainting:
 
 
 class _Editor:
-    """The file's JSON and what belongs to it, being changed."""
+    """Changes to the file's JSON, buffers and images."""
 
     def __init__(self, container: Container) -> None:
         self._container = container
@@ -133,13 +133,13 @@ class _Editor:
         return self._container.binary and bool(buffers) and buffers[0].uri is None
 
     def add(self, kind: str, entry: Json) -> int:
-        """Append to a list of the document; the number of the new entry."""
+        """Append to a list of the document; return the number of the new entry."""
         entries = self.document.setdefault(kind, [])
         entries.append(entry)
         return len(entries) - 1
 
     def serves_only(self, image: int, materials: list[int]) -> bool:
-        """Whether an image is drawn as base colour of these materials, and nothing else uses its bytes."""
+        """Whether an image serves as base colour of these materials and nothing else."""
         entry = self._before["images"][image]
         alike = [other for other in self._before["images"] if _source(other) == _source(entry)]
         accessors = self._before.get("accessors", [])
@@ -147,7 +147,7 @@ class _Editor:
         return len(alike) == 1 and not in_use and self._serving.get(image) == set(materials)
 
     def replace_image(self, index: int, png: bytes) -> None:
-        """Put a PNG in the place of an image."""
+        """Replace an image by a PNG."""
         entry = self.document["images"][index]
         uri = entry.get("uri")
         if uri is None:
@@ -169,7 +169,7 @@ class _Editor:
         self._files[path] = png
 
     def _replace_view(self, entry: Json, png: bytes) -> None:
-        """In the GLB's own chunk: cut the old bytes out, and have what lies behind them move up or down."""
+        """Replace the bytes in the GLB's own chunk and move the views behind them."""
         views = self.document["bufferViews"]
         view = views[entry["bufferView"]]
         start = view.get("byteOffset", 0)
@@ -190,7 +190,7 @@ class _Editor:
                 other["byteOffset"] += shift
 
     def add_texture(self, png: bytes, entry: Json) -> int:
-        """A new texture with a new image; ``entry`` is that of the texture it is sampled like."""
+        """Add a texture with a new image, sampled like the texture ``entry``; return its number."""
         image: Json = {"mimeType": "image/png"}
         if self._container.binary:
             image["bufferView"] = self._add_view(png)
@@ -200,7 +200,7 @@ class _Editor:
         return self.add("textures", kept | {"source": self.add("images", image)})
 
     def cut_open(self, primitive: Json, shape: Shape, cut: Unwrapped) -> None:
-        """Split a primitive's vertices at the seams, and give it the texture coordinates it was painted with."""
+        """Split a primitive's vertices at the seams and add the texture coordinates of its paint."""
         attributes = {k: v for k, v in primitive["attributes"].items() if k not in {"TEXCOORD_0", "COLOR_0"}}
         primitive["attributes"] = {name: self._gather(index, cut.source) for name, index in attributes.items()}
         if "targets" in primitive:
@@ -232,7 +232,7 @@ class _Editor:
         return self.add("accessors", entry | {"bufferView": self._add_view(rows.tobytes(), view), "count": len(values)})
 
     def _add_view(self, data: bytes, entry: Json | None = None) -> int:
-        """A buffer view of new bytes: in the GLB's own chunk, or in a new buffer."""
+        """Add a buffer view of new bytes, in the GLB's own chunk or in a new buffer; return its number."""
         if self._container.binary and not self.document.get("buffers"):
             self.document["buffers"] = [{"byteLength": 0}]
         own = self._container.binary and "uri" not in self.document["buffers"][0]
@@ -243,7 +243,7 @@ class _Editor:
         return self.add("bufferViews", place | {"byteLength": len(data)} | (entry or {}))
 
     def finish(self) -> Upload:
-        """The changed upload; what did not change is what it was."""
+        """The changed upload; unchanged files keep their bytes."""
         upload = self._container.upload
         if self._extra:
             self.add("buffers", {"byteLength": len(self._extra), "uri": _data_uri(self._extra, _BYTES)})
@@ -267,7 +267,7 @@ _BYTES: Final = "application/octet-stream"
 
 
 def glb(text: bytes, chunks: list[tuple[int, bytes]]) -> bytes:
-    """A GLB file of its JSON and other chunks."""
+    """The GLB file of a JSON text and other chunks."""
     body = b"".join(_chunk(kind, data) for kind, data in [(JSON_CHUNK, text), *chunks])
     return GLB_MAGIC + struct.pack("<II", 2, 12 + len(body)) + body
 
@@ -278,7 +278,7 @@ def _chunk(kind: int, data: bytes) -> bytes:
 
 
 def _dumped(document: Json, before: bytes) -> bytes:
-    """JSON, on lines where it was on lines before."""
+    """JSON, indented if ``before`` was."""
     if b"\n" in before.strip():
         return json.dumps(document, indent=2, ensure_ascii=False).encode()
     return json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode()
@@ -293,7 +293,7 @@ def _source(image: Json) -> tuple[object, object]:
 
 
 def _users_of_images(document: Json) -> dict[int, set[int | str]]:
-    """Which materials are drawn with an image as base colour; other uses are named, so that no set of numbers fits."""
+    """Users of each image: numbers of materials for base colour, paths for any other use."""
     users: dict[int, set[int | str]] = {}
     for number, material in enumerate(document.get("materials", [])):
         for path, index in _texture_uses(material, ""):
@@ -305,7 +305,7 @@ def _users_of_images(document: Json) -> dict[int, set[int | str]]:
 
 
 def _texture_uses(entry: object, path: str) -> Iterator[tuple[str, int]]:
-    """Where in a material a texture is used, and which."""
+    """(Path within a material, number of the texture) of each use of a texture."""
     if not isinstance(entry, dict):
         return
     for key, value in entry.items():
@@ -315,7 +315,7 @@ def _texture_uses(entry: object, path: str) -> Iterator[tuple[str, int]]:
 
 
 def _sources(texture: Json) -> Iterator[int]:
-    """The images of a texture, those in other encodings among them."""
+    """The images of a texture in all encodings."""
     for entry in (texture, *texture.get("extensions", {}).values()):
         if isinstance(entry, dict) and isinstance(entry.get("source"), int):
             yield entry["source"]

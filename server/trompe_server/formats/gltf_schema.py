@@ -1,4 +1,4 @@
-"""As much of glTF 2.0's schema as is read: every number in range, every index a non-negative whole number."""
+"""The supported part of glTF 2.0's schema, with ranges for all numbers and indices."""
 
 from typing import Annotated, Any, Final, Literal
 
@@ -10,7 +10,7 @@ from trompe_shared.wavefront import MAX_FACES
 __all__ = ["READ_EXTENSIONS", "Accessor", "Document", "Image", "Material", "Node", "Primitive", "TextureInfo"]
 
 READ_EXTENSIONS: Final = ("KHR_texture_transform", "KHR_mesh_quantization", "KHR_materials_", "KHR_lights_punctual")
-"""Beginnings of the names of extensions that a file may require: read, or about light and finish that is not drawn."""
+"""Prefixes of extensions a file may require: supported, or about light and finish without effect here."""
 
 MAX_NODES: Final = 100_000
 
@@ -28,7 +28,7 @@ class _Part(BaseModel):
 
 
 class Asset(_Part):
-    """What the file says of itself."""
+    """Version of the file."""
 
     version: str
 
@@ -71,14 +71,14 @@ class Primitive(_Part):
 
 
 class Mesh(_Part):
-    """Primitives that go together; ``weights`` blend their morph targets."""
+    """Primitives of one mesh; ``weights`` blend their morph targets."""
 
     primitives: Annotated[tuple[Primitive, ...], Field(min_length=1)]
     weights: tuple[Number, ...] = ()
 
 
 class Node(_Part):
-    """A place: a matrix in column order, or translation, rotation (quaternion x, y, z, w) and scale."""
+    """A transform: a matrix in column order, or translation, rotation (quaternion x, y, z, w) and scale."""
 
     mesh: Index | None = None
     skin: Index | None = None
@@ -106,14 +106,14 @@ class Image(_Part):
 
 
 class Texture(_Part):
-    """An image with the way it is sampled."""
+    """An image with a sampler."""
 
     source: Index | None = None
     sampler: Index | None = None
 
 
 class Sampler(_Part):
-    """How a texture goes on beyond its edges: 10497 repeated, 33071 clamped, 33648 mirrored."""
+    """Wrapping of a texture: 10497 repeated, 33071 clamped, 33648 mirrored."""
 
     wrap_s: Literal[10497, 33071, 33648] = 10497
     wrap_t: Literal[10497, 33071, 33648] = 10497
@@ -144,7 +144,7 @@ class TextureInfo(_Part):
 
     @property
     def placement(self) -> tuple[int, UvTransform]:
-        """The set of texture coordinates, and what is done to them."""
+        """The set of texture coordinates and their transform."""
         transform = self.extensions.transform or UvTransform()
         return (self.tex_coord if transform.tex_coord is None else transform.tex_coord), transform
 
@@ -160,7 +160,7 @@ class Pbr(_Part):
 
 
 class Material(_Part):
-    """What of a material is drawn."""
+    """The supported properties of a material."""
 
     name: str | None = None
     pbr: Pbr = Field(default=Pbr(), alias="pbrMetallicRoughness")
@@ -171,7 +171,7 @@ class Material(_Part):
 
     @property
     def maps(self) -> tuple[TextureInfo, ...]:
-        """The textures that are drawn."""
+        """The supported textures."""
         all_maps = (self.pbr.base_color_texture, self.normal_texture, self.pbr.metallic_roughness_texture)
         return tuple(info for info in all_maps if info is not None)
 

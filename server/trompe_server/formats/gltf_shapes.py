@@ -1,4 +1,4 @@
-"""The meshes of a glTF scene: where their instances stand, and what their primitives consist of."""
+"""Meshes of a glTF scene: transforms of their instances, and geometry of their primitives."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Shape:
-    """One primitive, as the file has it. ``cut`` is how it was unwrapped.
+    """One primitive of the file. ``cut``: its unwrapping, if any.
 
     uvs: (V, 2), v upwards. colours: (V, 3), linear.
     """
@@ -36,23 +36,23 @@ class Shape:
 
 
 def instances(document: Document) -> Iterator[tuple[int, Matrix]]:
-    """Each mesh of the scene with its place in the world. Raises ``ObjectError`` for what is no tree of nodes."""
+    """Each mesh of the scene with its world transform. Raises ``ObjectError`` unless the nodes form a tree."""
     waiting = [(index, np.eye(4)) for index in reversed(_roots(document))]
     seen: set[int] = set()
     triangles, count_of = 0, cache(partial(_triangles, document))
     while waiting:
         index, above = waiting.pop()
         if index in seen:
-            raise ObjectError(f"Node {index} of the glTF hangs on itself or on two others; nodes must form a tree.")
+            raise ObjectError(f"Node {index} of the glTF has two parents or contains itself; nodes must form a tree.")
         seen.add(index)
         node = at(document.nodes, index, "node")
         matrix = above @ _local(node)
         if node.mesh is not None:
             if node.skin is not None or any(node.weights):
-                raise ObjectError("The glTF bends its meshes by skins or morph targets; apply them, export it again.")
+                raise ObjectError("The glTF has skins or morph targets; apply them and export it again.")
             triangles += count_of(node.mesh)
             if triangles > MAX_FACES:
-                raise ObjectError(f"The glTF shows more than {MAX_FACES} triangles; simplify it.")
+                raise ObjectError(f"The glTF has more than {MAX_FACES} triangles; simplify it.")
             yield node.mesh, matrix
         waiting += [(child, matrix) for child in reversed(node.children)]
 
@@ -65,7 +65,7 @@ def _roots(document: Document) -> Sequence[int]:
 
 
 def _triangles(document: Document, mesh: int) -> int:
-    """About how many triangles a mesh has, both sides counted where both are seen."""
+    """Approximate number of triangles of a mesh; double-sided ones count twice."""
     count = 0
     for primitive in at(document.meshes, mesh, "mesh").primitives:
         source = primitive.attributes.get("POSITION", 0) if primitive.indices is None else primitive.indices
@@ -117,10 +117,10 @@ def _faces(container: Container, primitive: Primitive, count: int) -> NDArray[np
     if primitive.indices is not None:
         raw = container.raw(primitive.indices)
         if raw.dtype.kind != "u" or raw.shape[1] != 1:
-            raise ObjectError("A mesh of the glTF has indices that are no whole numbers; export it again.")
+            raise ObjectError("A mesh of the glTF has indices that are not whole numbers; export it again.")
         corners = raw[:, 0].astype(np.int64)
     if corners.max(initial=0) >= count:
-        raise ObjectError(f"A mesh of the glTF names vertex {corners.max()} and has {count}; export it again.")
+        raise ObjectError(f"A mesh of the glTF names vertex {corners.max()}, but has {count}; export it again.")
     if primitive.mode == 4:
         faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
     elif primitive.mode == 5:
@@ -134,7 +134,7 @@ def _faces(container: Container, primitive: Primitive, count: int) -> NDArray[np
 
 
 def _uvs(container: Container, primitive: Primitive) -> NDArray[np.float32] | None:
-    """Texture coordinates (V, 2), v upwards, that the material's maps are drawn with; ``None`` where there are none."""
+    """Texture coordinates (V, 2) of the material's maps, v upwards, or ``None``."""
     document = container.document
     material = Material() if primitive.material is None else at(document.materials, primitive.material, "material")
     if not material.maps:
@@ -149,7 +149,7 @@ def _uvs(container: Container, primitive: Primitive) -> NDArray[np.float32] | No
     if f"TEXCOORD_{which}" not in primitive.attributes:
         if material.maps:
             raise ObjectError(
-                f"Material {material.name or primitive.material!r} has textures, and a mesh with it has no "
+                f"Material {material.name or primitive.material!r} has textures, but one of its meshes has no "
                 f"TEXCOORD_{which}; unwrap it in a modelling program."
             )
         return None
@@ -167,7 +167,7 @@ def _moved(uvs: NDArray[np.float32], transform: UvTransform) -> NDArray[np.float
 
 
 def _check_wrapping(document: Document, material: Material, uvs: NDArray[np.float32]) -> None:
-    """Objects' textures repeat; where all texture coordinates are on the texture, any wrapping looks the same."""
+    """Raise ``ObjectError`` for wrapping other than repetition, unless all coordinates are within [0, 1]."""
     if uvs.min() >= -1e-3 and uvs.max() <= 1 + 1e-3:
         return
     for info in material.maps:
@@ -177,13 +177,13 @@ def _check_wrapping(document: Document, material: Material, uvs: NDArray[np.floa
         sampler = at(document.samplers, texture.sampler, "sampler")
         if (sampler.wrap_s, sampler.wrap_t) != (10497, 10497):
             raise ObjectError(
-                f"Material {material.name!r} clamps or mirrors a texture beyond its edges, which is not drawn here; "
-                "use repetition, or texture coordinates within [0, 1]."
+                f"Material {material.name!r} clamps or mirrors a texture beyond its edges, which is not supported; use "
+                "repetition, or texture coordinates within [0, 1]."
             )
 
 
 def _vertex_colours(container: Container, primitive: Primitive) -> NDArray[np.float64] | None:
-    """Linear colours (V, 3) of vertices; ``None`` where there are none, or all are white."""
+    """Linear colours (V, 3) of vertices; ``None`` if there are none or all are white."""
     if "COLOR_0" not in primitive.attributes:
         return None
     index = primitive.attributes["COLOR_0"]
@@ -193,7 +193,7 @@ def _vertex_colours(container: Container, primitive: Primitive) -> NDArray[np.fl
 
 
 def placed(shape: Shape, matrix: Matrix, material: str) -> Part:
-    """A shape that has texture coordinates, its own or its cut's, where an instance of it stands."""
+    """The transformed shape of an instance, with its own texture coordinates or those of its unwrapping."""
     shape = _with_uvs(shape)
     assert shape.uvs is not None
     moved = shape.vertices @ matrix[:3, :3].T + matrix[:3, 3]
@@ -206,7 +206,7 @@ def placed(shape: Shape, matrix: Matrix, material: str) -> Part:
 
 
 def _with_uvs(shape: Shape) -> Shape:
-    """A shape that is unwrapped, cut open."""
+    """The shape, split at seams if it was unwrapped."""
     cut = shape.cut
     if cut is None:
         return shape
@@ -215,7 +215,7 @@ def _with_uvs(shape: Shape) -> Shape:
 
 
 def _transformed(normals: NDArray[np.float32], matrix: Matrix) -> NDArray[np.float32]:
-    """Unit normals after ``matrix``; cofactors instead of the inverse, for it may be flat."""
+    """Unit normals after ``matrix``, by cofactors: the matrix may be singular."""
     a, b, c = matrix[:3, :3].T
     cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
     sign = -1.0 if np.linalg.det(matrix[:3, :3]) < 0 else 1.0
@@ -225,7 +225,7 @@ def _transformed(normals: NDArray[np.float32], matrix: Matrix) -> NDArray[np.flo
 
 
 def _faceted(material: str, corners: NDArray[np.float32], uvs: NDArray[np.float32]) -> Part:
-    """Triangles (F, 3, 3) with a normal for each face, as glTF wants it where a file gives none."""
+    """Triangles (F, 3, 3) with one normal for each face, glTF's rule for missing normals."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).astype(np.float64)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     faces = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Any object as a GLB file: what a viewer shows of it is what SAILenv's renderers show."""
+"""Write any object as a GLB file with the look of SAILenv's renderers."""
 
 import json
 from typing import Any, Final
@@ -15,7 +15,7 @@ from trompe_shared.wavefront import Part
 __all__ = ["PLAIN_ROUGHNESS", "write_glb"]
 
 PLAIN_ROUGHNESS: Final = 0.9
-"""Roughness that SAILenv's renderers give to a material whose maps give none."""
+"""Roughness of materials without a map in SAILenv's renderers."""
 TRILINEAR: Final = {"magFilter": 9729, "minFilter": 9987, "wrapS": 10497, "wrapT": 10497}
 
 Json = dict[str, Any]
@@ -38,7 +38,7 @@ class _Writer:
         self._textures: dict[str, int] = {}
 
     def document(self) -> Json:
-        """The JSON; ``binary`` is filled as it is made."""
+        """The JSON; fills ``binary``."""
         materials = {name: self._material(material) for name, material in self._obj.materials.items()}
         primitives = [self._primitive(part) | {"material": materials[part.material]} for part in self._obj.parts]
         return {
@@ -94,7 +94,10 @@ class _Writer:
         entry: Json = {"name": material.name, "pbrMetallicRoughness": pbr}
         if material.normal is not None:
             entry["normalTexture"] = {"index": self._texture(material.normal, files[material.normal])}
-        if opacity_of(files[material.albedo]) is not None:
+        if material.opacity is not None:
+            entry["alphaMode"] = "BLEND"
+            pbr["baseColorFactor"] = [1.0, 1.0, 1.0, material.opacity]
+        elif opacity_of(files[material.albedo]) is not None:
             entry |= {"alphaMode": "MASK", "alphaCutoff": CUTOFF}
         return self._add("materials", entry)
 
@@ -108,7 +111,7 @@ class _Writer:
 
 
 def _portable(data: bytes, name: str) -> tuple[bytes, str]:
-    """An image file in an encoding that glTF allows, and its MIME type."""
+    """(Image file in an encoding of glTF, its MIME type)."""
     with open_image(data, name) as image:
         if image.format in {"PNG", "JPEG"}:
             return data, f"image/{image.format.lower()}"

@@ -1,4 +1,4 @@
-"""Uploads, read in a process that may fail: out of memory, out of time, or brought down by what it reads."""
+"""Read and repaint uploads in a separate process with limits on memory and time."""
 
 import tempfile
 from collections.abc import Mapping
@@ -7,24 +7,24 @@ from pathlib import Path
 from typing import Any, Final
 
 from trompe_server.formats.registry import Exported
-from trompe_server.sandbox import run_limited
+from trompe_server.system.sandbox import run_limited
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D
 
 __all__ = ["MEMORY", "SECONDS", "Converted", "import_file", "repaint_limited"]
 
 MEMORY: Final = 4 * 2**30
-"""Bytes of address space; 8192 x 8192 texels take 1.3 GiB."""
+"""Limit of the address space in bytes; 8192 x 8192 texels take 1.3 GiB."""
 SECONDS: Final = 180.0
-"""A million triangles take 20 s of computing, and 2.7 GiB."""
+"""Limit of the time; a million triangles take 20 s and 2.7 GiB."""
 _MODULE: Final = "trompe_server.formats.convert"
 
 
 @dataclass(frozen=True)
 class Converted:
-    """What came of an upload: SAILenv's zip, which Trompe wrote itself, and what is in it.
+    """An upload converted to SAILenv's zip, and its contents.
 
-    ``format`` names the one it came in. ``textures``: (height, width) by name; ``radius`` in metres.
+    format: the upload's format. textures: (height, width) by name. radius: metres.
     """
 
     archive: bytes
@@ -38,9 +38,9 @@ class Converted:
 def import_file(
     data: bytes | Path, *, name: str, max_texture: int | None = None, memory: int = MEMORY, seconds: float = SECONDS
 ) -> Converted:
-    """As ``read_object`` of bytes or of a file, in a process of its own.
+    """As ``read_object`` of bytes or of a file, in a separate process.
 
-    Raises ``ObjectError``, for one that takes too much as well.
+    Raises ``ObjectError``, also beyond the limits of ``memory`` (bytes) and ``seconds``.
     """
     with tempfile.TemporaryDirectory() as folder:
         source, archive = Path(folder, "upload"), Path(folder, "archive.zip")
@@ -57,7 +57,7 @@ def import_file(
 def repaint_limited(
     data: bytes, painted: Object3D, *, name: str, memory: int = MEMORY, seconds: float = SECONDS
 ) -> Exported:
-    """As ``repaint_file``, in a process of its own. Raises ``ObjectError``."""
+    """As ``repaint_file``, in a separate process. Raises ``ObjectError``."""
     with tempfile.TemporaryDirectory() as folder:
         source, archive, out = Path(folder, "upload"), Path(folder, "archive.zip"), Path(folder, "out")
         source.write_bytes(data)

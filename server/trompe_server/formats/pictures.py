@@ -1,4 +1,4 @@
-"""Texture images on their way in: decoded within limits, made smaller, multiplied by a colour, turned into other maps.
+"""Texture images: decoding within limits, resizing, tinting, conversion of maps.
 
 Colours are sRGB-encoded uint8 in images and linear in [0, 1] as factors.
 """
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from trompe_shared.object3d import decode_rgb, encode_png, open_image
+from trompe_shared.object3d import decode_alpha, decode_rgb, encode_png
 
 __all__ = [
     "Pixels",
@@ -32,28 +32,24 @@ _LINEAR: Final = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055
 
 
 def linear_rgb(encoded: Pixels) -> NDArray[np.float64]:
-    """Linear values in [0, 1] of sRGB-encoded ones."""
+    """Decode sRGB uint8 to linear float64 in [0, 1]; any shape."""
     return _LINEAR[encoded]
 
 
 def encode_srgb(linear: ArrayLike) -> Pixels:
-    """sRGB-encoded values of linear ones, clipped to [0, 1]; any shape."""
+    """Encode linear values, clipped to [0, 1], as sRGB uint8; any shape."""
     values = np.clip(np.asarray(linear, np.float64), 0.0, 1.0)
     encoded = np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
     return np.asarray(np.rint(255 * encoded), np.uint8)
 
 
 def decode(data: bytes, name: str) -> tuple[Pixels, Pixels | None]:
-    """Colours (H, W, 3) and, where the image has one, alpha (H, W). Raises ``ObjectError``."""
-    rgb = decode_rgb(data, name)
-    with open_image(data, name) as image:
-        if not image.has_transparency_data:
-            return rgb, None
-        return rgb, np.array(image.convert("RGBA").getchannel("A"))
+    """Colours (H, W, 3) and alpha (H, W) or ``None``. Raises ``ObjectError``."""
+    return decode_rgb(data, name), decode_alpha(data, name)
 
 
 def shrink(pixels: Pixels, side: int | None) -> Pixels:
-    """The image with its longer side at most ``side``; channels are filtered one by one, for they may be no colours."""
+    """The image with its longer side at most ``side``; filters each channel alone, as channels may be unrelated."""
     height, width = pixels.shape[:2]
     if side is None or max(height, width) <= side:
         return pixels
@@ -78,9 +74,9 @@ def tinted(rgb: Pixels, factor: Sequence[float]) -> Pixels:
 
 
 def cutout_alpha(alpha: Pixels, *, factor: float, cutoff: float) -> Pixels:
-    """Alpha that is one half where ``alpha * factor`` is ``cutoff``, which is where SAILenv's renderers cut.
+    """Scale alpha so that ``cutoff`` becomes one half, the threshold of SAILenv's renderers.
 
-    Values in between are scaled, not thresholded, so that the edge is filtered as it was.
+    Scaling, not thresholding, keeps the filtering of the edge.
     """
     scale = factor * 0.5 / max(cutoff, 1e-3)
     table = np.asarray(np.rint(np.minimum(np.arange(256) * scale, 255)), np.uint8)
@@ -105,7 +101,7 @@ def scaled_normals(pixels: Pixels, scale: float) -> Pixels:
 
 
 def with_alpha_of(rgb: Pixels, alpha: Pixels | None) -> bytes:
-    """PNG bytes of ``rgb`` with ``alpha`` (H, W), brought to its size where it is another."""
+    """PNG bytes of ``rgb`` with ``alpha`` (h, w), resized if necessary."""
     if alpha is None:
         return encode_png(np.ascontiguousarray(rgb))
     size = (rgb.shape[1], rgb.shape[0])

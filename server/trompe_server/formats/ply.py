@@ -1,26 +1,21 @@
-"""PLY: triangles with normals, colours or texture coordinates at their vertices, text or binary.
+"""PLY: polygons with normals, colours or texture coordinates, text or binary. trimesh reads them.
 
-A texture is named as MeshLab and others do it: ``comment TextureFile picture.png``, with properties ``s`` and ``t``.
+A texture is named by ``comment TextureFile picture.png``, as MeshLab writes it. Texture coordinates belong to vertices
+(``s`` and ``t``, or ``u`` and ``v``) or to the corners of faces (``texcoord``).
 """
 
+import io
 import re
-import struct
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_server.formats.assembly import (
-    DEFAULT_COLOUR,
-    assemble,
-    check_numbers,
-    free_name,
-    painted_flat,
-    safe_name,
-)
+from trompe_server.formats.assembly import DEFAULT_COLOUR, assemble, check_numbers, free_name, painted_object, safe_name
 from trompe_server.formats.comparison import repainted
 from trompe_server.formats.pictures import decode, with_alpha_of
+from trompe_server.formats.refusal import refusing
 from trompe_server.formats.upload import Upload
 from trompe_server.formats.wavefront import shrunk
 from trompe_shared.errors import ObjectError
@@ -29,45 +24,33 @@ from trompe_shared.wavefront import MAX_FACES, Part, Surface, smooth_normals
 
 __all__ = ["read", "repaint"]
 
-MAX_HEADER: Final = 2**16
 MATERIAL: Final = "surface"
-TYPES: Final = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
-}
-ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-
-
-@dataclass(frozen=True)
-class _Element:
-    """Rows of a kind: ``properties`` are (name, type), of a list (name, type of its length, type of its items)."""
-
-    name: str
-    count: int
-    properties: list[tuple[str, ...]]
+WHITE: Final = (1.0, 1.0, 1.0)
+MAX_HEADER: Final = 2**16
+REMEDY: Final = "Save it again as triangles, binary or text."
+ELEMENT: Final = re.compile(rb"^element +(\w+) +(\d{1,18})\s*\n((?:(?!element|end_header).*\n)*)", re.MULTILINE)
+PROPERTY: Final = re.compile(rb"^property +(?:list +(\w+) +)?(\w+) +(\S+)", re.MULTILINE)
+TYPES: Final = {"char": "i1", "uchar": "u1", "int": "i4", "uint": "u4", "float": "f4"}
+"""Names of types whose meaning NumPy does not share."""
 
 
 @dataclass(frozen=True)
 class _Header:
-    order: str
-    elements: list[_Element]
+    """texture: file name of the texture, if any. corner_uvs: whether faces list the coordinates of their corners."""
+
+    text: bytes
+    rows: int
     texture: str | None
-    length: int
+    corner_uvs: bool
 
 
 def read(upload: Upload, max_texture: int | None = None) -> Object3D:
-    """The object of a PLY and the texture beside it. Raises ``ObjectError``."""
+    """Read a PLY and the texture beside it. Raises ``ObjectError``."""
     return shrunk(_read(upload), max_texture)
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
-    """``upload`` with the texture of ``painted``: its file replaced, or a PLY that names one where there was none."""
+    """``upload`` with the texture of ``painted``: replaces its texture file, or adds one to a new PLY."""
     original = _read(upload)
     changed = repainted(original, painted)
     if not changed:
@@ -84,201 +67,133 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
 
 
 def _read(upload: Upload) -> Object3D:
-    name = safe_name(upload.stem)
     header = _header(upload.data)
     surface = _surface(upload.data, header)
-    if header.texture is not None and surface.uvs is not None:
-        file = safe_name(header.texture, default="texture.png")
-        part = Part(MATERIAL, surface.vertices, surface.normals, surface.uvs, surface.faces)
-        picture = upload.files[upload.beside(header.texture)]
-        return assemble(name, [part], {MATERIAL: Material(MATERIAL, file)}, {file: picture})
-    painted = painted_flat([surface], DEFAULT_COLOUR if surface.colours is None else (1.0, 1.0, 1.0))
-    file = f"{name}_albedo.png"
-    return assemble(name, painted.parts, {MATERIAL: Material(MATERIAL, file)}, {file: encode_png(painted.picture)})
+    if header.texture is None or surface.uvs is None:
+        return painted_object(upload.stem, surface, DEFAULT_COLOUR if surface.colours is None else WHITE)
+    file = safe_name(header.texture, default="texture.png")
+    part = Part(MATERIAL, surface.vertices, surface.normals, surface.uvs, surface.faces)
+    picture = upload.files[upload.beside(header.texture)]
+    return assemble(safe_name(upload.stem), [part], {MATERIAL: Material(MATERIAL, file)}, {file: picture})
 
 
 def _header(data: bytes) -> _Header:
+    """Facts of the header that trimesh does not check or tell. Raises ``ObjectError``."""
     found = re.match(rb"ply\r?\n.*?^end_header\r?\n", data[:MAX_HEADER], re.DOTALL | re.MULTILINE)
     if found is None:
-        raise ObjectError("The PLY file has no header that ends; save it again.")
-    order, elements, texture = None, [], None
-    for line in found[0].decode("ascii", "replace").splitlines():
-        words = line.split()
-        if words[:2] == ["comment", "TextureFile"]:
-            texture = line.split(maxsplit=2)[2].strip() if len(words) > 2 else None
-        try:
-            if words[:1] == ["format"]:
-                order = ORDERS[words[1]]
-            elif words[:1] == ["element"]:
-                elements.append(_Element(words[1], int(words[2]), []))
-            elif words[:1] == ["property"]:
-                elements[-1].properties.append(_property(words))
-        except (KeyError, IndexError, ValueError) as error:
-            raise ObjectError(f"The PLY's header has {line[:80]!r}, which is not read; save it again.") from error
-    if order is None or any(not 0 <= element.count <= 3 * MAX_FACES for element in elements):
-        raise ObjectError(f"The PLY's header names no format, or more than {3 * MAX_FACES} rows; simplify the mesh.")
-    return _Header(order, elements, texture, len(found[0]))
+        raise ObjectError("The PLY file has no complete header; save it again.")
+    rows = sum(int(element[2]) for element in ELEMENT.finditer(found[0]))
+    if rows > 3 * MAX_FACES:
+        raise ObjectError(f"The PLY's header announces {rows} rows; at most {3 * MAX_FACES} are read.")
+    if b"format ascii" in found[0] and len(data[len(found[0]) :].splitlines()) < rows:
+        raise ObjectError(f"The PLY file ends too early: its header announces {rows} rows; save it again.")
+    texture = re.search(rb"^comment TextureFile +(.+?)\s*$", found[0], re.MULTILINE)
+    name = texture[1].decode("utf-8", "replace") if texture is not None else None
+    return _Header(found[0], rows, name, b" texcoord" in found[0])
 
 
-def _property(words: list[str]) -> tuple[str, ...]:
-    if words[1] == "list":
-        return words[4], TYPES[words[2]], TYPES[words[3]]
-    return words[2], TYPES[words[1]]
+def _regular(data: bytes, header: _Header) -> bytes:
+    """``data`` as trimesh reads it: nothing after the last row, polygons of one size in a binary file."""
+    text, position, body = header.text, len(header.text), []
+    if b"format ascii" in text:
+        return text + b"\n".join(data[position:].splitlines()[: header.rows])
+    order = ">" if b"format binary_big_endian" in text else "<"
+    for element in ELEMENT.finditer(header.text):
+        polygons, end = _polygons(data, position, element, order)
+        if len({len(polygon) for polygon in polygons}) > 1:
+            if header.corner_uvs and header.texture is not None:
+                raise ObjectError(f"The PLY has texture coordinates of polygons of different sizes. {REMEDY}")
+            faces = np.array([(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)])
+            announced = f"element face {len(faces)}\nproperty list uchar int vertex_indices\n"
+            text = text.replace(element[0], announced.encode())
+            body.append(_face_rows(faces, order))
+        else:
+            body.append(data[position:end])
+        position = end
+    return text + b"".join(body)
+
+
+def _polygons(data: bytes, position: int, element: re.Match[bytes], order: str) -> tuple[list[NDArray[Any]], int]:
+    """Vertex indices of the polygons of a binary element, if it has any, and the position of the element's end."""
+    properties = [
+        (_dtype(length, order) if length else None, _dtype(kind, order), name)
+        for length, kind, name in PROPERTY.findall(element[3])
+    ]
+    if all(length is None for length, _, _ in properties):
+        return [], position + int(element[2]) * sum(kind.itemsize for _, kind, _ in properties)
+    polygons = []
+    for _ in range(int(element[2])):
+        for length, kind, name in properties:
+            count = 1
+            if length is not None:
+                count, position = int(np.frombuffer(data, length, 1, position)[0]), position + length.itemsize
+            if count < 0:
+                raise ValueError(f"a list of {count} items")
+            if name in (b"vertex_indices", b"vertex_index") and kind.kind in "iu":
+                polygons.append(np.frombuffer(data, kind, count, position))
+            position += count * kind.itemsize
+    return polygons, position
+
+
+def _dtype(name: bytes, order: str) -> np.dtype[Any]:
+    return np.dtype(order + np.dtype(TYPES.get(name.decode(), name.decode())).str[1:])
 
 
 def _surface(data: bytes, header: _Header) -> Surface:
-    try:
-        rows = _text_rows(data, header) if header.order == "" else _binary_rows(data, header)
-    except (ValueError, IndexError, struct.error) as error:
-        raise ObjectError(
-            f"The PLY file ends too early or holds what is no number ({error}); save it again."
-        ) from error
-    vertex, polygons = _of(header, rows, "vertex", length=2), _of(header, rows, "face", length=3)
-    corners = polygons.get("vertex_indices", polygons.get("vertex_index"))
-    if not {"x", "y", "z"} <= vertex.keys() or corners is None or not len(vertex["x"]):
-        raise ObjectError("The PLY holds no mesh: it needs vertices with x, y, z, and faces with vertex_indices.")
-    faces = _fans(corners, len(vertex["x"]))
-    vertices = _columns(vertex, "x", "y", "z")
-    assert vertices is not None
-    uvs = next(
-        (
-            u
-            for names in (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
-            if (u := _columns(vertex, *names)) is not None
-        ),
-        None,
-    )
+    split = header.corner_uvs and header.texture is not None
+    with refusing("The PLY file", remedy=REMEDY), np.errstate(over="ignore"):
+        from trimesh.exchange.ply import load_ply  # takes a second to import
+        from trimesh.geometry import triangulate_quads
+
+        loaded: dict[str, Any] = load_ply(io.BytesIO(_regular(data, header)), fix_texture=split, skip_materials=True)
+        vertices, polygons = _floats(loaded.get("vertices")), loaded.get("faces")
+        if vertices is None or polygons is None or polygons.shape[1:] < (3,) or polygons.dtype.kind not in "iu":
+            raise ObjectError("The PLY holds no mesh: it needs vertices with x, y, z, and faces with vertex_indices.")
+        faces = triangulate_quads(polygons)
+        uvs = _floats(loaded["visual"].uv) if "visual" in loaded and (split or not header.corner_uvs) else None
+        normals = None if split else _floats(loaded.get("vertex_normals"))
+        colours = None if split else _colours(loaded.get("vertex_colors"))
+    _check_faces(faces, len(vertices))
     for values in (vertices, uvs):
         if values is not None:
             check_numbers(values, "The PLY")
-    normals = _columns(vertex, "nx", "ny", "nz")
     if normals is None or not np.isfinite(normals).all():
         normals = smooth_normals(vertices, np.arange(len(vertices)), faces)
-    return Surface(MATERIAL, vertices, normals, faces, uvs, _colours(vertex))
+    return Surface(MATERIAL, vertices, normals, faces.astype(np.int32), uvs, colours)
 
 
-def _of(header: _Header, rows: dict[str, dict[str, Any]], name: str, *, length: int) -> dict[str, Any]:
-    """Columns of an element that are plain (``length`` 2), or lists of whole numbers (3)."""
-    element = next((element for element in header.elements if element.name == name), None)
-    properties = element.properties if element is not None else []
-    wanted = {prop[0] for prop in properties if len(prop) == length and (length == 2 or prop[2][0] in "iu")}
-    return {key: values for key, values in rows.get(name, {}).items() if key in wanted}
+def _floats(values: Any) -> NDArray[np.float32] | None:
+    return None if values is None else np.asarray(values, np.float64).astype(np.float32)
 
 
-def _columns(rows: dict[str, Any], *names: str) -> NDArray[np.float32] | None:
-    if not set(names) <= rows.keys():
-        return None
-    with np.errstate(over="ignore"):  # too large for single precision is refused as such
-        return np.stack([np.asarray(rows[name], np.float64) for name in names], axis=1).astype(np.float32)
-
-
-def _colours(rows: dict[str, Any]) -> NDArray[np.float32] | None:
-    colours = _columns(rows, "red", "green", "blue")
+def _colours(values: Any) -> NDArray[np.float32] | None:
+    """Colours (V, 3) in [0, 1] of integers, or of floats up to 1 or up to 255."""
+    colours = _floats(values)
     if colours is None:
         return None
-    whole = np.asarray(rows["red"]).dtype.kind in "iu" or colours.max() > 1.0
-    return np.nan_to_num(colours / 255 if whole else colours)
+    whole = values.dtype.kind in "iu" or colours.max() > 1.0
+    return np.nan_to_num(colours[:, :3] / 255 if whole else colours[:, :3])
 
 
-def _fans(polygons: Any, count: int) -> NDArray[np.int32]:
-    """Triangles (F, 3) of polygons: an array (F, corners), or a list of arrays."""
-    rings = [polygons] if isinstance(polygons, np.ndarray) else [np.asarray(ring)[None] for ring in polygons]
-    fans = [
-        np.stack([ring[:, 0], ring[:, k], ring[:, k + 1]], axis=1)
-        for ring in rings
-        for k in range(1, ring.shape[1] - 1)
-    ]
-    faces = np.concatenate(fans) if fans else np.zeros((0, 3), np.int64)
-    if not len(faces) or len(faces) > MAX_FACES:
-        raise ObjectError(f"The PLY has {len(faces)} triangles; from 1 to {MAX_FACES} are read.")
+def _check_faces(faces: NDArray[np.int64], count: int) -> None:
+    if faces.ndim != 2 or not 0 < len(faces) <= MAX_FACES:
+        raise ObjectError(f"The PLY has {len(faces)} triangles; expected 1 to {MAX_FACES}.")
     if faces.min() < 0 or faces.max() >= count:
-        raise ObjectError(f"A face of the PLY names vertex {faces.max()} and there are {count}; save it again.")
-    return faces.astype(np.int32)
-
-
-def _text_rows(data: bytes, header: _Header) -> dict[str, dict[str, Any]]:
-    lines = iter(data[header.length :].decode("ascii", "replace").splitlines())
-    return {element.name: _text_element(element, lines) for element in header.elements}
-
-
-def _text_element(element: _Element, lines: Any) -> dict[str, Any]:
-    columns: dict[str, list[Any]] = {prop[0]: [] for prop in element.properties}
-    for _ in range(element.count):
-        words = iter(next(lines, "").split())
-        for prop in element.properties:
-            numeric = int if prop[-1][0] in "iu" else float
-            if len(prop) == 2:
-                columns[prop[0]].append(numeric(next(words, "")))
-            else:
-                columns[prop[0]].append([numeric(next(words, "")) for _ in range(int(next(words, "")))])
-    return dict(columns)
-
-
-def _binary_rows(data: bytes, header: _Header) -> dict[str, dict[str, Any]]:
-    position, found = header.length, {}
-    for element in header.elements:
-        lists = any(len(prop) == 3 for prop in element.properties)
-        reader = _rows_with_lists if lists else _plain_rows
-        found[element.name], position = reader(data, position, element, header.order)
-    return found
-
-
-def _plain_rows(data: bytes, position: int, element: _Element, order: str) -> tuple[dict[str, Any], int]:
-    kind = np.dtype([(prop[0], order + prop[1]) for prop in element.properties])
-    rows = np.frombuffer(data, kind, element.count, position)
-    return {name: rows[name] for name in kind.names or ()}, position + kind.itemsize * element.count
-
-
-def _rows_with_lists(data: bytes, position: int, element: _Element, order: str) -> tuple[dict[str, Any], int]:
-    """Rows whose lists are all as long as in the first row are read at once, others one by one."""
-    if not element.count:
-        return {prop[0]: [] for prop in element.properties}, position
-    first, _ = _row(data, position, element, order)
-    lengths = {prop[0]: len(first[prop[0]]) for prop in element.properties if len(prop) == 3}
-    fields = []
-    for prop in element.properties:
-        if len(prop) == 3:
-            fields.append((f"length of {prop[0]}", order + prop[1]))
-            fields.append((prop[0], order + prop[2], (lengths[prop[0]],)))  # type: ignore[arg-type]
-        else:
-            fields.append((prop[0], order + prop[1]))
-    kind = np.dtype(fields)
-    if position + kind.itemsize * element.count <= len(data):
-        rows = np.frombuffer(data, kind, element.count, position)
-        if all((rows[f"length of {name}"] == length).all() for name, length in lengths.items()):
-            return {prop[0]: rows[prop[0]] for prop in element.properties}, position + kind.itemsize * element.count
-    columns: dict[str, list[Any]] = {prop[0]: [] for prop in element.properties}
-    for _ in range(element.count):
-        row, position = _row(data, position, element, order)
-        for name, value in row.items():
-            columns[name].append(value)
-    return dict(columns), position
-
-
-def _row(data: bytes, position: int, element: _Element, order: str) -> tuple[dict[str, Any], int]:
-    row = {}
-    for prop in element.properties:
-        count = 1
-        if len(prop) == 3:
-            length = np.frombuffer(data, order + prop[1], 1, position)
-            count, position = int(length[0]), position + length.itemsize
-        kind = np.dtype(order + prop[-1])
-        if not 0 <= count <= (len(data) - position) // kind.itemsize:
-            raise ValueError(f"a list of {count} items")
-        values = np.frombuffer(data, kind, count, position)
-        position += values.nbytes
-        row[prop[0]] = values if len(prop) == 3 else values[0]
-    return row, position
+        raise ObjectError(f"A face of the PLY names vertex {faces.max()}, but there are {count}; save it again.")
 
 
 def _written(part: Part, texture: str) -> bytes:
-    """A binary PLY with the texture coordinates that the part was painted with."""
+    """A binary PLY with the texture coordinates of ``part``."""
     header = [
         f"ply\nformat binary_little_endian 1.0\ncomment TextureFile {texture}\nelement vertex {len(part.vertices)}"
     ]
     header += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz", "s", "t")]
     header += [f"element face {len(part.faces)}", "property list uchar int vertex_indices", "end_header\n"]
     vertices = np.concatenate([part.vertices, part.normals, part.uvs], axis=1).astype("<f4")
-    faces = np.zeros(len(part.faces), np.dtype([("count", "u1"), ("corners", "<i4", (3,))]))
-    faces["count"], faces["corners"] = 3, part.faces
-    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+    return "\n".join(header).encode() + vertices.tobytes() + _face_rows(part.faces, "<")
+
+
+def _face_rows(faces: NDArray[Any], order: str) -> bytes:
+    rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("corners", f"{order}i4", (3,))]))
+    rows["count"], rows["corners"] = 3, faces
+    return rows.tobytes()

@@ -1,4 +1,4 @@
-"""The formats, how a file's is recognised, and the two things that can be done with any: read it, and repaint it."""
+"""Supported formats, their recognition, and the two operations on all of them: read and repaint."""
 
 import posixpath
 from collections.abc import Callable, Mapping
@@ -15,7 +15,7 @@ __all__ = ["FORMATS", "Exported", "Format", "Imported", "read_object", "repaint_
 
 @dataclass(frozen=True)
 class Format:
-    """``endings`` of the mesh file. ``read`` takes the longest side of a texture, too; both raise ``ObjectError``."""
+    """endings: of the mesh file. read: also takes the longest side of a texture. Both raise ``ObjectError``."""
 
     name: str
     endings: tuple[str, ...]
@@ -30,7 +30,7 @@ FORMATS: Final = (
     Format("ply", (".ply",), ply.read, ply.repaint),
     Format("stl", (".stl",), stl.read, stl.repaint),
 )
-"""Where an archive holds meshes of several formats, the first of these is meant; others are beside it."""
+"""In order of precedence for archives with meshes of several formats."""
 
 _BEGINNINGS: Final = (
     (b"glTF", "gltf"),
@@ -45,7 +45,7 @@ _ENDING: Final = {"gltf": ".glb", "fbx": ".fbx", "ply": ".ply", "stl": ".stl", "
 
 @dataclass(frozen=True)
 class Imported:
-    """An object, and the name of the format that it came in (``sailenv``: an OBJ with a mat_def)."""
+    """An object and the name of its file format (``sailenv``: an OBJ with a mat_def)."""
 
     obj: Object3D
     format: str
@@ -53,16 +53,16 @@ class Imported:
 
 @dataclass(frozen=True)
 class Exported:
-    """Bytes of a file, and the ending of its name."""
+    """Bytes of a file and the ending of its name."""
 
     data: bytes
     ending: str
 
 
 def read_object(data: bytes, *, name: str, max_texture: int | None = None) -> Imported:
-    """The object in the bytes of a model file or of a zip; ``name`` is the file's name.
+    """Read the bytes of a model file or zip called ``name``.
 
-    ``max_texture`` is the longest side of a texture; larger ones are made smaller. Raises ``ObjectError``.
+    max_texture: longest side of a texture; larger ones are reduced. Raises ``ObjectError``.
     """
     upload, found = _opened(data, name)
     sailenv = found.name == "obj" and any(path.endswith("_mat_def.json") for path in upload.files)
@@ -70,7 +70,7 @@ def read_object(data: bytes, *, name: str, max_texture: int | None = None) -> Im
 
 
 def repaint_file(data: bytes, painted: Object3D, *, name: str) -> Exported:
-    """The same model file, or zip, with the textures of ``painted``, which came of it. Raises ``ObjectError``."""
+    """The model file or zip with the textures of ``painted``, an object read from it. Raises ``ObjectError``."""
     upload, found = _opened(data, name)
     changed = found.repaint(upload, painted)
     out = data if changed == upload else changed.to_bytes()
@@ -99,8 +99,8 @@ def _recognised(data: bytes, name: str) -> Format:
     if name.lower().endswith(".obj"):
         return by_name["obj"]
     raise ObjectError(
-        f"{name!r} is no model that is read here. Send a zip of an OBJ with its materials and textures, glTF or "
-        "GLB, FBX, PLY or STL."
+        f"{name!r} is not a supported model file. Send a zip of an OBJ with its materials and textures, glTF or GLB, "
+        "FBX, PLY or STL."
     )
 
 
@@ -108,7 +108,9 @@ def _in_archive(files: Mapping[str, bytes]) -> tuple[Upload, Format]:
     for format in FORMATS:
         meshes = sorted(path for path in files if path.lower().endswith(format.endings))
         if len(meshes) > 1:
-            raise ObjectError(f"The archive holds several models, {meshes[:8]}; send them one by one.")
+            raise ObjectError(f"The archive contains several models, {meshes[:8]}; send them one by one.")
         if meshes:
             return Upload(meshes[0], files, packed=True), format
-    raise ObjectError(f"The archive holds no model, only {sorted(files)[:8]}; zip an .obj, .gltf, .glb, .fbx or .ply.")
+    raise ObjectError(
+        f"The archive contains no model, only {sorted(files)[:8]}; zip an .obj, .gltf, .glb, .fbx or .ply."
+    )

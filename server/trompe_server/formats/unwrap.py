@@ -1,4 +1,4 @@
-"""Texture coordinates for meshes that have none, by xatlas, and colours of vertices baked into the texture they get."""
+"""Texture coordinates for meshes without any, by xatlas, and vertex colours baked into the new texture."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,22 +13,22 @@ from trompe_shared.errors import ObjectError
 __all__ = ["BAKED_SIDE", "Unwrapped", "bake", "unwrap"]
 
 BAKED_SIDE: Final = 512
-"""About how many texels a side a texture has that an object came without."""
+"""Approximate side, in texels, of a generated texture."""
 MAX_UNWRAPPED: Final = 100_000
-"""Triangles; xatlas takes up to half a minute for as many."""
+"""Most triangles to unwrap; xatlas takes up to half a minute for them."""
 EXTENT: Final = 100.0
-"""Units that a mesh spans when xatlas sees it, which takes triangles of less than about 1e-8 for nothing."""
+"""Extent of a mesh for xatlas, which drops triangles smaller than about 1e-8 units."""
 PADDING: Final = 2
 GUTTER: Final = 4
-"""Texels by which colours are spread beyond the edges of charts, for filters to read."""
+"""Texels by which colours extend beyond the edges of charts, for filtering."""
 
 
 @dataclass(frozen=True)
 class Unwrapped:
-    """A mesh cut open at seams.
+    """A mesh split at seams.
 
-    source: (V,) int64, the vertex of the mesh that each of the new vertices was.
-    faces:  (F, 3) int32, the same triangles in the same order.
+    source: (V,) int64, the original vertex of each new vertex.
+    faces:  (F, 3) int32, the original triangles in their order.
     uvs:    (V, 2) float32 in [0, 1].
     """
 
@@ -40,21 +40,21 @@ class Unwrapped:
 def unwrap(
     meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int32]]],
 ) -> tuple[list[Unwrapped], tuple[int, int]]:
-    """Lay out meshes (vertices (V, 3), faces (F, 3)) in one texture of size (H, W). The same meshes give the same.
+    """Lay out meshes (vertices (V, 3), faces (F, 3)) in one texture of size (H, W); deterministic.
 
-    Raises ``ObjectError`` where xatlas is missing or the meshes are too large for it.
+    Raises ``ObjectError`` if xatlas is missing or the meshes are too large for it.
     """
     count = sum(len(faces) for _, faces in meshes)
     if count > MAX_UNWRAPPED:
         raise ObjectError(
-            f"The mesh has no texture coordinates and {count} triangles; at most {MAX_UNWRAPPED} are unwrapped here. "
+            f"The mesh has no texture coordinates and {count} triangles; the limit is {MAX_UNWRAPPED}. "
             "Unwrap it in a modelling program."
         )
     atlas = _generated(meshes)
     unwrapped = []
     for number in range(len(meshes)):
         source, faces, uvs = atlas[number]
-        uvs = np.clip(np.nan_to_num(uvs), 0.0, 1.0)  # not a number where a mesh has no area
+        uvs = np.clip(np.nan_to_num(uvs), 0.0, 1.0)  # NaN for meshes without area
         unwrapped.append(Unwrapped(source.astype(np.int64), faces.astype(np.int32), uvs))
     return unwrapped, (max(1, atlas.height), max(1, atlas.width))
 
@@ -64,8 +64,8 @@ def _generated(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int32]]]) 
         import xatlas  # type: ignore[import-not-found]
     except ImportError as error:
         raise ObjectError(
-            "The mesh has no texture coordinates, and xatlas, which makes them, is missing: "
-            "pip install 'trompe[formats]', or unwrap the mesh in a modelling program."
+            "The mesh has no texture coordinates, and xatlas, which generates them, is missing: "
+            "pip install 'trompe[server]', or unwrap the mesh in a modelling program."
         ) from error
     atlas = xatlas.Atlas()
     extent = max(float(np.ptp(vertices, axis=0).max()) for vertices, _ in meshes)
@@ -78,14 +78,14 @@ def _generated(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int32]]]) 
     atlas.generate(xatlas.ChartOptions(), options)
     if max(atlas.width, atlas.height) > 4 * BAKED_SIDE:
         raise ObjectError(
-            "The mesh has no texture coordinates, and its triangles are too long and thin to be laid out here; unwrap "
+            "The mesh has no texture coordinates, and its triangles are too long and thin to be unwrapped here; unwrap "
             "it in a modelling program."
         )
     return atlas
 
 
 def bake(meshes: Sequence[tuple[Unwrapped, NDArray[np.float64]]], *, size: tuple[int, int]) -> Pixels:
-    """Texture (H, W, 3) that shows linear colours (V, 3) of vertices, interpolated over each triangle."""
+    """Texture (H, W, 3) of linear vertex colours (V, 3), interpolated over each triangle."""
     colours = np.zeros((*size, 3))
     covered = np.zeros(size, bool)
     for unwrapped, of_vertices in meshes:
@@ -106,7 +106,7 @@ def _fill(
     colours: NDArray[np.float64],
     covered: NDArray[np.bool_],
 ) -> None:
-    """Interpolate (3, 3) ``values`` over the texels whose centres are in ``triangle`` (3, 2), or nearly so."""
+    """Interpolate ``values`` (3, 3) over the texels with centres in ``triangle`` (3, 2), within a tolerance."""
     height, width = covered.shape
     low = np.maximum(np.floor(triangle.min(axis=0)).astype(int) - 1, 0)
     high = np.minimum(np.ceil(triangle.max(axis=0)).astype(int) + 1, [width, height])
@@ -123,7 +123,7 @@ def _fill(
 
 
 def _spread(colours: NDArray[np.float64], covered: NDArray[np.bool_]) -> None:
-    """Give each uncovered texel beside covered ones their colour."""
+    """Extend the colours of covered texels to their uncovered neighbours."""
     for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
         near, values = np.roll(covered, step, axis), np.roll(colours, step, axis)
         fresh = near & ~covered

@@ -1,4 +1,4 @@
-"""An uploaded model: the files it consists of, and the one among them that holds the mesh."""
+"""An uploaded model: its files, and the mesh file among them."""
 
 import posixpath
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ __all__ = ["Upload", "base_name"]
 
 @dataclass(frozen=True)
 class Upload:
-    """``files`` by path; ``main`` is the path of the mesh. ``packed``: they came, and are to go, as a zip."""
+    """files: by path. main: path of the mesh file. packed: whether the files came as a zip and leave as one."""
 
     main: str
     files: Mapping[str, bytes]
@@ -30,35 +30,37 @@ class Upload:
         return base_name(self.main).rsplit(".", 1)[0] or "object"
 
     def beside(self, uri: str) -> str:
-        """The path of a file that the mesh file names by a relative URI. Raises ``ObjectError`` where it leads away."""
+        """The path of a relative URI in the mesh file. Raises ``ObjectError`` outside the mesh's folder."""
         path = posixpath.normpath(posixpath.join(posixpath.dirname(self.main), unquote(uri).replace("\\", "/")))
         if ":" in uri or path.startswith(("/", "..")):
             raise ObjectError(
                 f"{self.main!r} names {uri[:80]!r}; only files below its own folder are read. Put the file there."
             )
         if path not in self.files:
-            raise ObjectError(f"{self.main!r} names {uri[:80]!r}, which is not there; zip it together with its files.")
+            raise ObjectError(
+                f"{self.main!r} names {uri[:80]!r}, which is missing; zip the model together with its files."
+            )
         return path
 
     def flat(self) -> dict[str, bytes]:
-        """The files by name without folders. Raises ``ObjectError`` where two have the same."""
+        """The files by name without folders. Raises ``ObjectError`` if two names are equal."""
         names = {base_name(path): data for path, data in self.files.items()}
         if len(names) < len(self.files):
             raise ObjectError("Two files in different folders have the same name; rename one of them.")
         return names
 
     def with_flat(self, files: Mapping[str, bytes]) -> "Upload":
-        """The same upload with files replaced, by name without folders; new ones go where the mesh is."""
+        """The upload with files replaced, by name without folders; new ones go beside the mesh."""
         places = {base_name(path): path for path in self.files}
         folder = posixpath.dirname(self.main)
         new = {places.get(name, posixpath.join(folder, name)): data for name, data in files.items()}
         return replace(self, files={**self.files, **new})
 
     def to_bytes(self) -> bytes:
-        """What to send back: the mesh file where it came alone and needs no other, else a zip."""
+        """The bytes to send back: the mesh file if it came and stays alone, otherwise a zip."""
         return self.data if not self.packed and len(self.files) == 1 else pack_zip(self.files)
 
 
 def base_name(path: str) -> str:
-    """The file name at the end of a path, whichever way its slashes lean."""
+    """The file name at the end of a path with slashes or backslashes."""
     return path.replace("\\", "/").rsplit("/", 1)[-1]

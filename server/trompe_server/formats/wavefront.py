@@ -1,41 +1,52 @@
-"""OBJ with MTL or with SAILenv's mat_def: kept as it is where it is whole, completed where a map or UVs are missing."""
+"""OBJ with MTL or SAILenv's mat_def: kept if complete, otherwise completed with maps and UVs."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from trompe_server.formats.assembly import DEFAULT_COLOUR, free_name, painted_flat, safe_name
 from trompe_server.formats.comparison import repainted
 from trompe_server.formats.pictures import decode, shrink, with_alpha_of
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
-from trompe_shared.object3d import Object3D, encode_png, object_from_files
+from trompe_shared.object3d import Object3D, decode_alpha, decode_rgb, encode_png, object_from_files
 from trompe_shared.wavefront import Part, Surface, obj_text, parse_mtl, parse_surfaces
 
-__all__ = ["complete", "read", "repaint", "shrunk"]
+__all__ = ["complete", "dissolved", "read", "repaint", "shrunk"]
 
 
 def read(upload: Upload, max_texture: int | None = None) -> Object3D:
-    """The object of an OBJ and what is beside it. Raises ``ObjectError``."""
-    return shrunk(_read(upload), max_texture)
+    """Read an OBJ and the files beside it. Raises ``ObjectError``."""
+    return shrunk(_object(_completed(upload)), max_texture)
 
 
-def _read(upload: Upload) -> Object3D:
+def _completed(upload: Upload) -> Mapping[str, bytes]:
     files = upload.flat()
-    return object_from_files(files if any(name.endswith("_mat_def.json") for name in files) else complete(files))
+    return files if _has_table(files) else complete(files)
+
+
+def _object(files: Mapping[str, bytes]) -> Object3D:
+    return object_from_files(files if _has_table(files) else dissolved(files))
+
+
+def _has_table(files: Mapping[str, bytes]) -> bool:
+    return any(name.endswith("_mat_def.json") for name in files)
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
-    """``upload`` with the textures of ``painted``; what the OBJ lacked, it has now. Raises ``ObjectError``."""
-    original = _read(upload)
-    changed = repainted(original, painted)
+    """``upload`` with the textures of ``painted`` and the added maps and UVs. Raises ``ObjectError``."""
+    files = _completed(upload)
+    changed = repainted(_object(files), painted)
     if not changed:
         return upload
-    pngs = {name: with_alpha_of(rgb, decode(original.files[name], name)[1]) for name, rgb in changed.items()}
-    return upload.with_flat({**original.files, **pngs})
+    pngs = {name: with_alpha_of(rgb, decode_alpha(files[name], name)) for name, rgb in changed.items()}
+    return upload.with_flat({**files, **pngs})
 
 
 def shrunk(obj: Object3D, side: int | None) -> Object3D:
-    """``obj`` with no map larger than ``side``; its albedos are PNGs then, whatever they were."""
+    """``obj`` with maps of at most ``side`` texels a side; reduced maps become PNGs."""
     files = dict(obj.files)
     maps = {name for m in obj.materials.values() for name in (m.albedo, m.normal, m.metallic) if name is not None}
     for name in maps:
@@ -47,15 +58,41 @@ def shrunk(obj: Object3D, side: int | None) -> Object3D:
 
 
 def complete(files: Mapping[str, bytes]) -> dict[str, bytes]:
-    """``files`` of an OBJ, with a texture for each material that has a colour alone, and UVs for each mesh without.
+    """Complete the ``files`` of an OBJ: a texture for each material without one, UVs for each mesh without any.
 
-    Where nothing is missing they are as they were. An MTL gets the lines it needs; an OBJ that has to be changed is
-    written anew.
+    Complete files stay unchanged. An MTL gets the missing lines; a changed OBJ is rewritten.
     """
     mesh = next(name for name in files if name.lower().endswith(".obj"))
     libraries = {name: data.decode("utf-8", "replace") for name, data in files.items() if name.lower().endswith(".mtl")}
     surfaces = parse_surfaces(files[mesh].decode("utf-8", "replace"), mesh)
     return _Completion(mesh, dict(files), libraries, surfaces).files_of()
+
+
+def dissolved(files: Mapping[str, bytes]) -> dict[str, bytes]:
+    """``files`` with each opacity picture (``map_d``) of the MTL as the alpha channel of its albedo.
+
+    A ``map_d`` that names the albedo itself means its alpha channel. Raises ``ObjectError`` for an albedo with several.
+    """
+    masks: dict[str, str] = {}
+    for name, data in files.items():
+        tables = parse_mtl(data.decode("utf-8", "replace")).values() if name.lower().endswith(".mtl") else ()
+        for albedo, mask in ((maps.get("albedo", ""), maps.get("map_d", "")) for maps in tables):
+            if albedo in files and mask in files and masks.setdefault(albedo, mask) != mask:
+                raise ObjectError(
+                    f"The MTL gives the texture {albedo!r} two opacities (map_d), {masks[albedo]!r} and {mask!r}. "
+                    "Save the texture under a name for each."
+                )
+    return dict(files) | {
+        albedo: with_alpha_of(decode_rgb(files[albedo], albedo), _grey(files[mask], mask))
+        for albedo, mask in masks.items()
+        if mask != albedo
+    }
+
+
+def _grey(data: bytes, name: str) -> NDArray[np.uint8]:
+    """The alpha channel of a picture, or its brightness, (H, W)."""
+    alpha = decode_alpha(data, name)
+    return np.rint(decode_rgb(data, name).mean(axis=2)).astype(np.uint8) if alpha is None else alpha
 
 
 class _Completion:
@@ -68,7 +105,7 @@ class _Completion:
         self._rewritten = not libraries
 
     def files_of(self) -> dict[str, bytes]:
-        """The files, with what was missing."""
+        """The completed files."""
         if not self._libraries:
             self._surfaces = [_renamed(surface) for surface in self._surfaces]
             names = dict.fromkeys(surface.material for surface in self._surfaces)
@@ -86,7 +123,7 @@ class _Completion:
         maps = {name: found for text in self._libraries.values() for name, found in parse_mtl(text).items()}
         if surface.material not in maps:
             raise ObjectError(
-                f"{self._mesh!r} uses the material {surface.material!r}, which is not defined; the .mtl defines "
+                f"{self._mesh!r} uses the undefined material {surface.material!r}; the .mtl defines "
                 f"{sorted(maps) or 'none'}."
             )
         if "albedo" in maps[surface.material]:
@@ -102,13 +139,13 @@ class _Completion:
     def _keep(self, surface: Surface) -> None:
         if surface.uvs is None:
             raise ObjectError(
-                f"{self._mesh!r}, material {surface.material!r}: it has a texture, but faces without texture "
-                "coordinates (vt); unwrap the mesh in a modelling program."
+                f"{self._mesh!r}, material {surface.material!r} has a texture, but faces without texture coordinates "
+                "(vt); unwrap the mesh in a modelling program."
             )
         self._parts.append(Part(surface.material, surface.vertices, surface.normals, surface.uvs, surface.faces))
 
     def _colour(self, surface: Surface) -> Sequence[float]:
-        """Linear colour that the MTL gives a material; white where its vertices have colours of their own."""
+        """Linear colour of a material in the MTL; white for vertex colours."""
         if surface.colours is not None:
             return (1.0, 1.0, 1.0)
         for text in self._libraries.values():
@@ -123,7 +160,7 @@ def _renamed(surface: Surface) -> Surface:
 
 
 def _lines(text: str) -> Iterator[tuple[str | None, str]]:
-    """Each line of an MTL with the material that it is about."""
+    """Each line of an MTL with its material."""
     material = None
     for line in text.splitlines(keepends=True):
         words = line.split(maxsplit=1)
@@ -137,13 +174,13 @@ def _numbers(line: str, material: str) -> tuple[float, float, float]:
         red, green, blue = (min(max(float(word), 0.0), 1.0) for word in line.split()[1:4])
     except ValueError as error:
         raise ObjectError(
-            f"Material {material!r}: {line.strip()[:60]!r} is no colour; expected Kd and three numbers."
+            f"Material {material!r}: {line.strip()[:60]!r} is not a colour; expected Kd and three numbers."
         ) from error
     return red, green, blue
 
 
 def _with_map(text: str, material: str, name: str) -> str:
-    """An MTL in which ``material`` has the texture ``name`` instead of a colour."""
+    """The MTL with the texture ``name`` in place of the colour of ``material``."""
     lines = []
     for current, line in _lines(text if text.endswith("\n") else text + "\n"):
         word = next(iter(line.split(maxsplit=1)), "")

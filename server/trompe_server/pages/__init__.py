@@ -1,4 +1,4 @@
-"""The pages: what people see who open the server's address. They only show; whatever people do goes through the API."""
+"""The web pages. They show jobs; every action goes through the API."""
 
 from fastapi import FastAPI
 from starlette.staticfiles import StaticFiles
@@ -12,7 +12,7 @@ __all__ = ["add_pages"]
 
 
 def add_pages(app: FastAPI) -> None:
-    """Serve the pages from ``app``, which serves the API. Problems that a browser meets become pages, too."""
+    """Add the pages to ``app``, which serves the API. Problem details become pages for browsers."""
     app.state.pictures = Pictures()
     app.include_router(router)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")

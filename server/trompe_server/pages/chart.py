@@ -1,62 +1,37 @@
-"""The chart of an experiment: seconds against what was achieved, and what nothing else beats in both.
+"""Chart of an experiment: seconds against drop, with the Pareto front of its configurations.
 
-Objects differ in how hard they are, so a job on one does not beat a job on another: configurations are compared, by
-their means over the same objects. Where all jobs are on one object and differ, the jobs themselves are compared.
+Jobs on different objects are not comparable, so the front joins means (``trompe_shared.comparison``).
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from statistics import fmean
 from typing import Any, Final
 
-from trompe_server.experiments.front import front_of
-from trompe_server.experiments.groups import grouped
+from trompe_shared.comparison import Job, Mean, charged, means_of, pareto_front
 
-__all__ = ["Chart", "Mean", "Point", "chart", "means_of"]
+__all__ = ["Chart", "Point", "chart"]
 
 LEFT, RIGHT, TOP, BOTTOM = 60.0, 700.0, 20.0, 310.0
 STEPS: Final = (1, 2, 5)
 COLOURS: Final = 8
-"""Of objects; those beyond are squares, not discs."""
+"""Number of colours of objects; further objects are squares instead of discs."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """A job: ``drop`` is its A_drop, within 0..1 or below. ``configuration``: what was asked of it, in words."""
+    """A job and its id. Costs are seconds; configurations are words."""
 
-    job: str
-    object: str
-    configuration: str
-    seconds: float
-    drop: float
-
-    @property
-    def words(self) -> str:
-        """What it is, and what it cost and gave."""
-        return f"{self.object}, {_words(self)}"
-
-
-@dataclass(frozen=True)
-class Mean:
-    """A configuration: the means of its jobs."""
-
-    configuration: str
-    seconds: float
-    drop: float
-
-    @property
-    def words(self) -> str:
-        """What it is, and what it costs and gives."""
-        return _words(self)
+    id: str
+    job: Job[str]
 
 
 @dataclass(frozen=True)
 class Chart:
-    """What the template draws, in its own units. ``looks``: the CSS classes of each object's points.
+    """Input of the template, in SVG units. ``looks``: CSS classes of each object's points.
 
-    ``means`` are empty where all jobs are on one object and each is a configuration; ``best`` are those on the
-    ``front``, in words, ``common`` the objects that they are means over.
+    ``means`` are empty if all jobs are on one object and have different configurations. ``best``: words of the
+    configurations on the ``front``; ``common``: objects of the means.
     """
 
     points: Sequence[dict[str, Any]]
@@ -71,13 +46,13 @@ class Chart:
 
 
 def chart(points: Sequence[Point], *, measure: str) -> Chart:
-    """``measure`` names what ``drop`` is."""
+    """The chart of finished jobs. ``measure`` names their drop."""
     if not points:
         return Chart((), (), (), (), "", (), (), {}, measure)
-    seconds = [point.seconds for point in points]
-    marks = _marks(min(seconds), max(seconds))
+    jobs = charged(point.job for point in points)
+    marks = _marks(min(job.cost for job in jobs), max(job.cost for job in jobs))
     low, high = marks[0], marks[-1]
-    bottom = min(0.0, *(p.drop for p in points))
+    bottom = min(0.0, *(job.drop for job in jobs))
 
     def x(seconds: float) -> float:
         return round(LEFT + (RIGHT - LEFT) * math.log(seconds / low) / math.log(high / low), 1)
@@ -85,20 +60,22 @@ def chart(points: Sequence[Point], *, measure: str) -> Chart:
     def y(drop: float) -> float:
         return round(BOTTOM - (BOTTOM - TOP) * (drop - bottom) / (1 - bottom), 1)
 
-    def drawn(one: Point | Mean) -> dict[str, Any]:
-        return {"x": x(one.seconds), "y": y(one.drop), "title": one.words}
+    def drawn(one: Job[str] | Mean[str], title: str) -> dict[str, Any]:
+        return {"x": x(one.cost), "y": y(one.drop), "title": title}
 
-    looks = {name: _look(number) for number, name in enumerate(sorted({point.object for point in points}))}
-    alone = len(looks) == 1 and len({point.configuration for point in points}) == len(points)
-    means, common = ([], set()) if alone else means_of(points)
-    compared: Sequence[Point | Mean] = points if alone else means
-    front = front_of(compared, cost=lambda one: one.seconds, gain=lambda one: one.drop)
+    looks = {name: _look(number) for number, name in enumerate(sorted({job.object for job in jobs}))}
+    means, common = means_of(jobs)
+    front = pareto_front(means)
+    alone = len(looks) == 1 and len(means) == len(jobs)
     return Chart(
-        points=[drawn(point) | {"job": point.job, "look": looks[point.object]} for point in points],
-        means=[drawn(mean) for mean in means],
-        common=sorted(common),
-        best=[] if alone else [one.words for one in front],
-        front=" ".join(f"{x(one.seconds)},{y(one.drop)}" for one in front),
+        points=[
+            drawn(job, f"{job.object}, {_words(job)}") | {"job": point.id, "look": looks[job.object]}
+            for point, job in zip(points, jobs, strict=True)
+        ],
+        means=[] if alone else [drawn(mean, _words(mean)) for mean in means],
+        common=[] if alone else sorted(common),
+        best=[] if alone else [_words(mean) for mean in front],
+        front=" ".join(f"{x(mean.cost)},{y(mean.drop)}" for mean in front),
         x_ticks=[{"at": x(value), "text": f"{value:g}"} for value in marks],
         y_ticks=[{"at": y(value / 5), "text": f"{value / 5:.1f}"} for value in range(math.ceil(5 * bottom), 6)],
         looks=looks,
@@ -106,28 +83,8 @@ def chart(points: Sequence[Point], *, measure: str) -> Chart:
     )
 
 
-def means_of(points: Sequence[Point]) -> tuple[list[Mean], set[str]]:
-    """The configurations, and the objects on which all of them have a point: each is a mean over these alone.
-
-    One that has points on less than half of the objects, as one that has just begun, is left out. None where there are
-    no common objects. An object counts once, whatever the number of its jobs.
-    """
-    groups = grouped(points, lambda point: point.configuration)
-    objects = {name: {point.object for point in group} for name, group in groups.items()}
-    enough = len(set.union(*objects.values())) / 2
-    compared = [name for name, mine in objects.items() if len(mine) >= enough]
-    common = set.intersection(*(objects[name] for name in compared)) if compared else set()
-    means = []
-    for name in compared if common else ():
-        group = groups[name]
-        parts = grouped((point for point in group if point.object in common), lambda point: point.object).values()
-        seconds, drops = ([fmean(getattr(p, of) for p in part) for part in parts] for of in ("seconds", "drop"))
-        means.append(Mean(name, fmean(seconds), fmean(drops)))
-    return means, common
-
-
-def _words(one: Point | Mean) -> str:
-    return f"{one.configuration}: A_drop {one.drop:.2f} in {one.seconds:.0f} s"
+def _words(one: Job[str] | Mean[str]) -> str:
+    return f"{one.configuration}: A_drop {one.drop:.2f} in {one.cost:.0f} s"
 
 
 def _look(number: int) -> str:
@@ -135,7 +92,7 @@ def _look(number: int) -> str:
 
 
 def _marks(low: float, high: float) -> list[float]:
-    """Round numbers from the last below ``low`` to the first above ``high``."""
+    """Round numbers from the last one below ``low`` to the first one above ``high``."""
     powers = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 2)
     steps = [step * 10.0**power for power in powers for step in STEPS]
     first = max(k for k, step in enumerate(steps) if step < low)

@@ -1,4 +1,4 @@
-"""Problems that a browser meets while it opens a page: the API's words, as a page, or the way to sign in."""
+"""Problem details as pages for browsers; without a token, the sign-in page."""
 
 import json
 from http import HTTPStatus
@@ -16,7 +16,7 @@ PROBLEM = b"application/problem+json"
 
 
 class HtmlProblems:
-    """Turns problem details into pages for those who asked for a page."""
+    """Turns problem details into pages for requests that accept HTML."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -60,5 +60,5 @@ def _as_page(request: Request, status: int, body: bytes) -> Response:
         "problem.html",
         status=status,
         title=problem["title"],
-        detail=problem.get("detail") or "No more is known.",
+        detail=problem.get("detail") or "There are no details.",
     )

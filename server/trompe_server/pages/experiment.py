@@ -1,4 +1,4 @@
-"""An experiment's jobs, with what sets them apart and what came of them: lines of its table, points of its chart."""
+"""The page of an experiment: rows of its table and jobs of its chart."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,12 +6,13 @@ from typing import Any, Final
 
 from trompe_server.pages.chart import Point
 from trompe_server.pages.present import JobRow, value_text
+from trompe_shared import comparison
 from trompe_shared.api import Result
 
 __all__ = ["Entry", "Line", "columns_and_lines", "differing_options", "points_of"]
 
 Entry = tuple[JobRow, Mapping[str, Any], Result | None]
-"""A job, what was asked, and what came out."""
+"""A job, its options by keyword, and its result."""
 
 OUTCOME: Final = ("A_drop", "held-out A_drop", "seconds")
 
@@ -27,17 +28,12 @@ class Line:
 
 
 def differing_options(entries: Sequence[Entry]) -> list[str]:
-    """Epsilon, and the other options in which jobs on the same object differ."""
-    first: dict[str, Mapping[str, Any]] = {}
-    differ = {"epsilon"}
-    for row, asked, _ in entries:
-        one = first.setdefault(row.object, asked)
-        differ |= {option for option in asked if asked[option] != one[option]}
-    return [option for option in entries[0][1] if option in differ]
+    """Options in which jobs on the same object differ; epsilon in any case."""
+    return comparison.differing_options([(row.object, options) for row, options, _ in entries])
 
 
 def columns_and_lines(entries: Sequence[Entry], options: Sequence[str]) -> tuple[list[str], list[Line]]:
-    """Columns are ``options``, and what came of the jobs."""
+    """Columns (``options`` and the outcome) and lines of the table."""
     lines = [
         Line(row.id, row.object, row.state, [*(value_text(asked[name]) for name in options), *_outcome(result)])
         for row, asked, result in entries
@@ -46,14 +42,23 @@ def columns_and_lines(entries: Sequence[Entry], options: Sequence[str]) -> tuple
 
 
 def points_of(entries: Sequence[Entry], options: Sequence[str]) -> list[Point]:
-    """The jobs that were judged; a configuration is all of ``options`` but the seed."""
-    options = [option for option in options if option != "seed"]
+    """Finished jobs with an ``A_drop``; a configuration is all of ``options`` but the seed."""
+    shown = [option for option in options if option != "seed"]
     points = []
     for row, asked, result in entries:
         judged = result and (result.held_out or result.target)
-        if result and judged and judged.a_drop is not None:
-            words = ", ".join(f"{name} {value_text(asked[name])}" for name in options)
-            points.append(Point(row.id, row.object, words, max(sum(result.seconds.values()), 0.1), judged.a_drop))
+        if not result or not judged or judged.a_drop is None:
+            continue
+        job = comparison.Job(
+            row.object,
+            ", ".join(f"{name} {value_text(asked[name])}" for name in shown),
+            asked["seed"],
+            max(sum(result.seconds.values()), 0.1),
+            judged.a_drop,
+            (result.probe_renders, result.seconds.get("calibrate", 0.0)),
+            (row.object, result.surrogate_model, result.target.views, asked["seed"]),
+        )
+        points.append(Point(row.id, job))
     return points
 
 

@@ -1,24 +1,21 @@
-"""What the ids in a job stand for, in words."""
+"""Names for the ids and class indices of jobs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
 from trompe_server.errors import NotFoundError
 from trompe_server.library import Library
 from trompe_server.pages.present import ClassNames, JobRow, job_row
-from trompe_shared.api import Job, JobSpec
-from trompe_shared.errors import TrompeError
+from trompe_shared.api import OPTIONS, Job, JobSpec
 
 __all__ = ["Names"]
 
 
 class Names:
-    """Names of stored things; each is looked up once. A thing that is gone keeps the beginning of its id."""
+    """Names of stored things, as of the submission of the job, and of classes, looked up once for a classifier."""
 
     def __init__(self, library: Library) -> None:
-        self._object = cache(lambda reference: _name(lambda: library.object(reference).name, reference))
-        self._classifier = cache(lambda reference: _name(lambda: library.classifier(reference).name, reference))
         self._classes = cache(lambda reference: _classes(library, reference))
 
     def row(self, job: Job) -> JobRow:
@@ -26,40 +23,48 @@ class Names:
         spec = job.spec
         return job_row(
             job,
-            object=self._object(spec.object),
-            classifier=self._classifier(spec.classifier),
-            label=self._class(spec, spec.label),
+            object=_named(job, spec.object),
+            classifier=_named(job, spec.victim.classifier),
+            label=self._object_classes(spec),
         )
 
-    def options(self, spec: JobSpec) -> dict[str, Any]:
-        """What was asked of an object, with names for ids and for the numbers of classes."""
-        return spec.model_dump(exclude={"object"}) | {
-            "classifier": self._classifier(spec.classifier),
-            "label": self._class(spec, spec.label),
-            "target_label": None if spec.target_label is None else self._class(spec, spec.target_label),
-            "ensemble": [self._classifier(each) for each in spec.ensemble],
-            "judges": [self._classifier(each) for each in spec.judges],
+    def options(self, job: Job) -> dict[str, Any]:
+        """Options by keyword, with names in place of ids and class indices."""
+        goal, dumped = job.spec.goal, job.spec.model_dump()
+        return {
+            keyword: _named(job, dumped[option.part][option.field])
+            if option.file
+            else dumped[option.part][option.field]
+            for keyword, option in OPTIONS.items()
+        } | {
+            "label": self._object_classes(job.spec),
+            "target": None if goal.target is None else self._class(job.spec, goal.target),
         }
 
+    def _object_classes(self, spec: JobSpec) -> str:
+        return " or ".join(self._class(spec, label) for label in spec.goal.label)
+
     def _class(self, spec: JobSpec, given: str | int) -> str:
-        return self.classes(spec.classifier)(given) if isinstance(given, int) else given
+        return self.classes(spec.victim.classifier)(given) if isinstance(given, int) else given
 
     def classes(self, classifier: str) -> ClassNames:
-        """What a classifier's classes are called."""
+        """Function from a class index to its name."""
         known = self._classes(classifier)
         return lambda index: known[index] if index < len(known) else f"class {index}"
 
 
 def _classes(library: Library, reference: str) -> Sequence[str]:
-    """The names of a classifier's classes, none where it is gone or has none."""
+    """Names of a classifier's classes, if there are any."""
     try:
         return library.classifier(reference).classes or ()
     except NotFoundError:
         return ()
 
 
-def _name(look_up: Callable[[], str], reference: str) -> str:
-    try:
-        return look_up()
-    except TrompeError:
-        return reference[:12]
+def _named(job: Job, value: Any) -> Any:
+    """A reference, or several, with names in place of ids; of an unknown id the first 12 digits."""
+    if isinstance(value, str):
+        return job.names.get(value, value if len(value) < 64 else value[:12])
+    if isinstance(value, dict):
+        return {name: _named(job, each) for name, each in value.items()}
+    return [_named(job, each) for each in value]

@@ -1,38 +1,40 @@
-"""Single target images of a job, as PNG: the report has them on sheets, a turntable wants them one by one."""
+"""Single target images of a job, as PNG."""
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
+from fastapi import Path
 from numpy.typing import NDArray
 
-from trompe_server.array_files import unpack_arrays
-from trompe_server.artifacts import JobArtifacts
-from trompe_server.pipeline import VIEWS_AFTER, VIEWS_BEFORE
+from trompe_server.job.protocol import VIEWS_AFTER, VIEWS_BEFORE, numbered
+from trompe_server.storage.arrays import unpack_arrays
+from trompe_server.storage.folders import JobArtifacts
 from trompe_shared.object3d import encode_png
 
 __all__ = ["Kind", "Pictures", "ViewSet"]
 
-ViewSet = Literal["own", "held_out"]
+ViewSet = Annotated[str, Path(pattern=r"^(own|held_out)(-[1-9]\d?)?$")]
+"""``own`` or ``held_out``, with the number of the renderer if it is not the job's first."""
 Kind = Literal["before", "after", "difference"]
 
-FILES: Final[Mapping[Kind, str]] = {"before": f"{VIEWS_BEFORE}.npz", "after": f"{VIEWS_AFTER}.npz"}
+FILES: Final[Mapping[Kind, str]] = {"before": VIEWS_BEFORE, "after": VIEWS_AFTER}
 AMPLIFIED: Final = 10
 JOBS: Final = 4
-"""Files of images that are kept in memory, each of some tens of MiB."""
+"""Image files in memory, each of some tens of MiB."""
 
 Images = NDArray[np.uint8]
 
 
 class Pictures:
-    """Target images of finished jobs. Safe to use from several threads."""
+    """Target images of ended jobs. Thread-safe."""
 
     def __init__(self) -> None:
         self._load = lru_cache(maxsize=JOBS)(_load)
 
     def one(self, artifacts: JobArtifacts, view_set: ViewSet, index: int, kind: Kind) -> bytes:
-        """One image as PNG. Raises ``FileNotFoundError`` or ``IndexError`` where there is none."""
+        """One image as PNG. Raises ``FileNotFoundError`` or ``IndexError``."""
         if kind != "difference":
             return encode_png(self._images(artifacts, kind, view_set)[index])
         before = self._images(artifacts, "before", view_set)[index].astype(np.int16)
@@ -40,7 +42,8 @@ class Pictures:
         return encode_png((128 + AMPLIFIED * change).clip(0, 255).astype(np.uint8))
 
     def _images(self, artifacts: JobArtifacts, kind: Kind, view_set: ViewSet) -> Images:
-        return self._load(artifacts, FILES[kind])[view_set]
+        name, _, renderer = view_set.partition("-")
+        return self._load(artifacts, f"{numbered(FILES[kind], int(renderer or 0))}.npz")[name]
 
 
 def _load(artifacts: JobArtifacts, name: str) -> dict[str, Images]:

@@ -1,4 +1,4 @@
-"""From jobs and results to what a page shows: words, figures and addresses. No requests, no files."""
+"""Text, figures and addresses of the pages, from jobs and results. No I/O."""
 
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -6,7 +6,19 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final
 
-from trompe_shared.api import Accuracy, Job, JobSpec, LightFound, Result, VerticesMoved, ViewPrediction
+from trompe_server.job.protocol import numbered
+from trompe_shared.api import (
+    OPTIONS,
+    VIEW_LIMITS,
+    Accuracy,
+    Job,
+    JobSpec,
+    Option,
+    Progress,
+    Result,
+    ViewPrediction,
+    ViewRanges,
+)
 
 __all__ = [
     "TERMS",
@@ -24,17 +36,19 @@ __all__ = [
 ClassNames = Callable[[int], str]
 
 TERMS: Final = {
-    "A_before": "share of views that are classified as the object's class before the attack",
+    "A_before": "share of views classified as the object's class before the attack",
     "A_after": "the same after the attack",
-    "A_drop": "(A_before - A_after) / A_before; n.a. where A_before is 0",
-    "surrogate": "the differentiable model of the target renderer that the attack computes with",
-    "target": "the black-box renderer whose images the classifier sees",
-    "held-out": "cameras and lights that the attack never saw",
-    "epsilon": "the most that a texel's colour may change, as a share of full brightness",
+    "A_drop": "(A_before - A_after) / A_before; n.a. if A_before is 0",
+    "surrogate": "differentiable model of the target renderer, used by the attack",
+    "target": "black-box renderer of the classifier's images",
+    "held-out": "cameras and lights hidden from the attack",
+    "neighbour": "class whose name shares a noun with that of the object's class: perhaps a near-synonym",
+    "epsilon": "largest change of a texel, as a share of full brightness",
 }
 
 MEASURES: Final = {
     "transfer_gap": "Transfer gap",
+    "disagreement": "Views on which surrogate and target disagree",
     "texels_altered": "Texels altered (N%)",
     "mean_texel_change": "Mean change of a texel",
     "max_view_change": "Largest change of a pixel",
@@ -43,25 +57,30 @@ MEASURES: Final = {
     "evaluations": "Images shown to the classifier",
     "probe_renders": "Probe renders",
 }
-SHARES: Final = {"texels_altered"}
+SHARES: Final = {"disagreement", "texels_altered"}
 PICTURES: Final = {
-    "light_map.png": "The sky from above: lights that were tried, redder where they fool more; the best one ringed",
     "textures.png": "The texture: before, after, and the difference",
-    "saliency_object.png": "Where the classifier looks, on the object",
-    "predictions.png": "What it is taken for, over all views",
+    "saliency_object.png": "Saliency on the object",
+    "predictions.png": "Predictions over all views",
 }
-PHASES: Final = {"prepare": "looking", "calibrate": "probing", "attack": "attacking", "judge": "judging"}
+PHASES: Final = {
+    "open": "opening",
+    "prepare": "preparing",
+    "calibrate": "calibrating",
+    "attack": "attacking",
+    "judge": "judging",
+    "report": "report",
+}
 
 
 @dataclass(frozen=True)
 class JobRow:
-    """A job in a list. ``change`` says what may change. ``version`` differs where anything that is shown does."""
+    """A job in a list. ``version`` changes with the displayed values."""
 
     id: str
     object: str
     label: str
     classifier: str
-    change: str
     epsilon: str
     state: str
     live: bool
@@ -81,12 +100,12 @@ class JobRow:
 
     @property
     def version(self) -> str:
-        """Changes with what is shown."""
+        """Changes with the displayed values."""
         return f"{self.state}-{self.fraction:.3f}-{self.phase}-{self.eta}"
 
 
 def job_row(job: Job, *, object: str, classifier: str, label: str) -> JobRow:
-    """A job, with the names of what its ids stand for."""
+    """A job with names in place of ids."""
     progress, live = job.progress, not job.state.final
     kind = progress.phase.partition("-")[0]
     return JobRow(
@@ -94,24 +113,18 @@ def job_row(job: Job, *, object: str, classifier: str, label: str) -> JobRow:
         object=object,
         label=label,
         classifier=classifier,
-        change=_change(job.spec),
-        epsilon=f"{job.spec.epsilon:g}" if job.spec.attack_on == "texture" else job.spec.attack_on,
+        epsilon=f"{job.spec.paint.epsilon:g}",
         state=job.state.value,
         live=live,
         fraction=progress.fraction,
         phase=PHASES.get(kind, kind),
-        eta=span(progress.eta_seconds) if live and progress.eta_seconds is not None else None,
+        eta=_left(progress) if live else None,
         words=_how_it_ended(job),
         error=job.error,
         note=job.note,
         created=job.created,
         artifacts=job.artifacts,
     )
-
-
-def _change(spec: JobSpec) -> str:
-    kinds = {"light": "the light", "vertices": f"vertices within {spec.vertex_budget:.1%} of the radius"}
-    return kinds.get(spec.attack_on, f"epsilon {spec.epsilon:g}")
 
 
 def _how_it_ended(job: Job) -> str:
@@ -122,38 +135,49 @@ def _how_it_ended(job: Job) -> str:
     return ""
 
 
+def _left(progress: Progress) -> str | None:
+    """Estimated time left, as a range if the attack may end early."""
+    if progress.eta_seconds is None:
+        return None
+    most, least = span(progress.eta_seconds), span(progress.eta_least_seconds or progress.eta_seconds)
+    return most if least == most else f"{least} to {most}"
+
+
 def span(seconds: float) -> str:
-    """A length of time for people."""
+    """A duration for people."""
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A result as its page shows it."""
+    """A result as displayed on its page."""
 
     verdict: str
+    drawn_by: str | None
+    noticed: str | None
     viewer: Sequence[Mapping[str, Any]]
     strip: Sequence[Mapping[str, Any]]
+    became: str
     accuracies: Sequence[Mapping[str, Any]]
     measures: Sequence[Mapping[str, str]]
     warnings: Sequence[str]
     pictures: Sequence[Mapping[str, str]]
     times: Sequence[Mapping[str, Any]]
-    surrogate: str
+    surrogates: Sequence[str]
     command: str
 
 
 def present(result: Result, job: JobRow, *, names: ClassNames) -> Shown:
-    """A result; ``names`` says what a class is called."""
-    own = _views(result.views, result, names, f"/jobs/{job.id}/pictures/own")
-    sets = [{"name": "the attack's own", "views": own}]
-    if result.held_out_views:
-        unseen = _views(result.held_out_views, result, names, f"/jobs/{job.id}/pictures/held_out")
-        sets.append({"name": "held-out", "views": unseen})
+    """Prepare a result for its page. ``names`` maps class indices to names."""
+    sets = _view_sets(result, names, f"/jobs/{job.id}/pictures")
+    own = sets[0]["views"]
     return Shown(
         verdict=_verdict(result, job),
+        drawn_by=result.drawn_by,
+        noticed=result.noticed,
         viewer=sets,
-        strip=[{"picture": view["after"], "says": view["says_after"], "kept": view["kept_after"]} for view in own],
+        strip=[{"picture": view["after"], "says": view["says_after"], "verdict": _fate(view)} for view in own],
+        became=result.became,
         accuracies=list(_accuracies(result)),
         measures=list(_measures(result)),
         warnings=result.warnings,
@@ -163,38 +187,54 @@ def present(result: Result, job: JobRow, *, names: ClassNames) -> Shown:
             if name in job.artifacts
         ],
         times=_times(result.seconds),
-        surrogate=f"Surrogate: {result.surrogate_model}. {result.surrogate_reason}",
+        surrogates=[
+            f"Surrogate: {name}{each.surrogate_model}. {each.surrogate_reason}"
+            for name, each in result.by_renderer
+            if each.surrogate_model
+        ],
         command=command(result.spec, object=job.object, classifier=job.classifier),
     )
 
 
+def _view_sets(result: Result, names: ClassNames, place: str) -> list[dict[str, Any]]:
+    """Own and held-out views in each renderer, those of the headline first; addresses begin with ``place``."""
+    sets = []
+    for number, (name, each) in enumerate(result.by_renderer):
+        for title, kind, views in (
+            ("the attack's own", "own", each.views),
+            ("held-out", "held_out", each.held_out_views),
+        ):
+            if views:
+                shown = _views(views, result, names, f"{place}/{numbered(kind, number)}")
+                sets.append({"name": name + title, "views": shown, "headline": each.renderer == result.renderer})
+    return sorted(sets, key=lambda each: not each["headline"])
+
+
+def _fate(view: Mapping[str, Any]) -> str:
+    """``kept``, ``fooled``, or ``never`` recognised."""
+    return "kept" if view["kept_after"] else "fooled" if view["kept_before"] else "never"
+
+
 def _verdict(result: Result, job: JobRow) -> str:
-    judged, where = (result.held_out, "views it was not made for") if result.held_out else (result.target, "its views")
+    judged, where = (
+        (result.held_out, "views hidden from the attack") if result.held_out else (result.target, "views of the attack")
+    )
     if judged.a_after is None:
-        return f"The classifier does not take it for {job.label} even unpainted, so there was nothing to attack."
+        return f"The classifier does not recognise the unpainted object as {job.label}, so there was no attack."
     return (
-        f"Over {judged.views} {where}, the classifier took it for {job.label} in {judged.a_before:.0%} before "
+        f"On {judged.counted} {where}, the classifier recognised it as {job.label} in {judged.a_before:.0%} before "
         f"and in {judged.a_after:.0%} after."
     )
 
 
 def _views(views: Sequence[ViewPrediction], result: Result, names: ClassNames, place: str) -> list[dict[str, Any]]:
-    """All views around the object, one after the other by azimuth, as the viewer wants them."""
+    """All views for the viewer, sorted by azimuth."""
     order = sorted(range(len(views)), key=lambda k: (views[k].azimuth % 360, views[k].elevation))
-    moved = f"; after the attack {_light(result.light)}" if result.light else ""
-    records = [viewer_record(views[k], result.label, names, f"{place}/{k}") for k in order]
-    return [record | {"where": record["where"] + moved} for record in records]
+    return [viewer_record(views[k], result.labels, names, f"{place}/{k}") for k in order]
 
 
-def _light(light: LightFound) -> str:
-    strength = [
-        f"{name} {value:.2g}" for name in ("intensity", "ambient") if (value := getattr(light, name)) is not None
-    ]
-    return ", ".join([f"from {light.azimuth:.0f}° around", f"{light.elevation:.0f}° up", *strength])
-
-
-def viewer_record(view: ViewPrediction, label: int, names: ClassNames, place: str) -> dict[str, Any]:
-    """One view as the viewer wants it; its pictures are below ``place``."""
+def viewer_record(view: ViewPrediction, labels: Sequence[int], names: ClassNames, place: str) -> dict[str, Any]:
+    """One view for the viewer; the addresses of its pictures begin with ``place``."""
     attacked = view.after is not None
     after, confidence = (view.after, view.after_confidence) if attacked else (view.before, view.before_confidence)
     assert after is not None
@@ -205,26 +245,29 @@ def viewer_record(view: ViewPrediction, label: int, names: ClassNames, place: st
         "difference": f"{place}/difference.png" if attacked else None,
         "says_before": f"{names(view.before)} {view.before_confidence:.0%}",
         "says_after": f"{names(after)} {confidence:.0%}",
-        "kept_before": view.before == label,
-        "kept_after": after == label,
-        "where": f"Camera at {view.azimuth:.0f}° around, {view.elevation:.0f}° up, {view.distance:.2f} m away; "
-        f"light from {view.light_azimuth:.0f}° around, {view.light_elevation:.0f}° up",
+        "kept_before": view.before in labels,
+        "kept_after": after in labels,
+        "where": f"Camera: azimuth {view.azimuth:.0f}°, elevation {view.elevation:.0f}°, {view.distance:.2f} m. "
+        f"Light: azimuth {view.light_azimuth:.0f}°, elevation {view.light_elevation:.0f}°.",
     }
 
 
 def _accuracies(result: Result) -> Iterable[dict[str, Any]]:
-    rows: list[tuple[str, Accuracy | None]] = [
-        ("surrogate", result.surrogate),
-        ("target", result.target),
-        ("target, held-out", result.held_out),
-        *((f"target, judged by {judge.classifier}", judge.target) for judge in result.judges),
-    ]
+    rows: list[tuple[str, Accuracy | None]] = []
+    for name, each in result.by_renderer:
+        rows += [
+            (f"{name}surrogate", each.surrogate),
+            (f"{name}target", each.target),
+            (f"{name}target, held-out", each.held_out),
+        ]
+    rows += [(f"target, judged by {judge.classifier}", judge.target) for judge in result.judges]
+    rows += [(f"target, held-out, {each.pipeline}", each.held_out) for each in result.image_pipelines]
     for name, accuracy in rows:
         if accuracy is not None:
             shares = (accuracy.a_before, accuracy.a_after, accuracy.a_drop)
             interval = accuracy.a_drop_interval
             ends = f"{interval[0]:.2f} to {interval[1]:.2f}" if interval else "n.a."
-            yield {"name": name, "views": accuracy.views, "cells": [*map(_share, shares), ends]}
+            yield {"name": name, "views": accuracy.counted, "cells": [*map(_share, shares), ends]}
 
 
 def _share(value: float | None) -> str:
@@ -232,11 +275,6 @@ def _share(value: float | None) -> str:
 
 
 def _measures(result: Result) -> Iterable[dict[str, str]]:
-    if result.light:
-        yield {"name": "Light that was found", "value": _light(result.light), "help": LightFound.__doc__ or ""}
-    if result.vertices:
-        moved = f"{1000 * result.vertices.largest:.2g} mm, {result.vertices.largest_share:.1%} of the radius"
-        yield {"name": "Largest move of a vertex", "value": moved, "help": VerticesMoved.__doc__ or ""}
     for field, name in MEASURES.items():
         value = getattr(result, field)
         if value is not None:
@@ -252,35 +290,36 @@ def _times(seconds: Mapping[str, float]) -> list[dict[str, Any]]:
     ]
 
 
-OPTIONS: Final = {"judges": "judge", "materials": "material", "target_label": "target"}
-"""Fields of a spec whose option of ``trompe attack`` is not called as they are."""
-PAIRS: Final = {"elevation"}
-
-
 def command(spec: JobSpec, *, object: str, classifier: str) -> str:
-    """The command line that asks for the same job: what differs from the defaults. Masks stay on the server."""
-    words = ["trompe", "attack", object, "--label", str(spec.label), "--classifier", classifier]
-    plain = JobSpec.model_validate(spec.model_dump(include={"object", "label", "classifier", "epsilon"}))
-    for field in JobSpec.model_fields:
-        value = getattr(spec, field)
-        if field in {"object", "label", "classifier", "masks", "ranges", "sun"} or value == getattr(plain, field):
-            continue
-        option = f"--{OPTIONS.get(field, field).replace('_', '-')}"
-        if field in PAIRS:
-            words += [option, *(f"{end:g}" for end in value)]
-        else:
-            for each in value if isinstance(value, list) else [value]:
-                words += [option, f"{each:g}" if isinstance(each, float) else str(each)]
-    if spec.epsilon != JobSpec.model_fields["epsilon"].default:
-        words += ["--epsilon", f"{spec.epsilon:g}"]
-    for option, given in {"--range": spec.ranges, "--sun": spec.sun}.items():
-        for name, (low, high) in given.model_dump(exclude={"light_colours"}, exclude_defaults=True).items():
-            words += [option, name, f"{low:g}", f"{high:g}"]
-    return shlex.join([*words, "--out", "result"])
+    """Command line of the same job, with the options that differ from the defaults, without masks."""
+    named = {"label": spec.goal.label, "classifier": classifier}
+    values = named | spec.changed() | named
+    words = [word for keyword, value in values.items() for word in _flags(OPTIONS[keyword], value)]
+    return shlex.join(["trompe", "attack", object, *words, "--out", "result"])
+
+
+def _flags(option: Option, value: Any) -> list[str]:
+    """An option as words of the command line."""
+    if option.file == "mask":  # its pictures are on the server
+        return []
+    if isinstance(value, bool):
+        return [option.flag if value else f"--no{option.flag[1:]}"]
+    given: Iterable[Any] = [value]
+    if isinstance(value, ViewRanges):
+        ranges = value.model_dump(include=set(VIEW_LIMITS), exclude_defaults=True)
+        given = [(name, *ends) for name, ends in ranges.items()]
+    elif isinstance(value, list):
+        given = value
+    rows = (each if isinstance(each, tuple) else (each,) for each in given)
+    return [word for row in rows for word in (option.flag, *map(_word, row))]
+
+
+def _word(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def differences(asked: Sequence[Mapping[str, Any]], results: Sequence[Result]) -> list[dict[str, Any]]:
-    """What was asked and what came out of two jobs, line by line."""
+    """Options and results of two jobs, as rows of a table."""
     lines = [{"name": name, "cells": [value_text(options[name]) for options in asked]} for name in asked[0]]
     for field, title in {"target": "target", "held_out": "held-out"}.items():
         judged: list[Accuracy | None] = [getattr(side, field) for side in results]
@@ -294,7 +333,7 @@ def differences(asked: Sequence[Mapping[str, Any]], results: Sequence[Result]) -
 
 
 def value_text(value: Any) -> str:
-    """An option or a figure in a few characters; a dash where there is none."""
+    """An option or a figure as text; a dash for none."""
     if value is None or value in ([], {}):
         return "–"
     if isinstance(value, float):

@@ -10,23 +10,23 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Form, Query, Request
 from fastapi import Path as PathParam
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
-from pydantic import ValidationError
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
-from trompe_server.access import hash_secret
 from trompe_server.api.experiments import LABEL
 from trompe_server.api.jobs import RESULT, Cursor, labels_of
 from trompe_server.api.services import Services, ServicesDep
-from trompe_server.database import DatabaseDownError
 from trompe_server.errors import NotFoundError
 from trompe_server.pages.chart import chart
 from trompe_server.pages.experiment import columns_and_lines, differing_options, points_of
+from trompe_server.pages.form import form_fields
 from trompe_server.pages.naming import Names
 from trompe_server.pages.pictures import Kind, ViewSet
 from trompe_server.pages.present import TERMS, JobRow, Shown, differences, present
 from trompe_server.pages.serving import COOKIE, page, render
 from trompe_server.pages.turntable import TURNS, turntable
-from trompe_shared.api import Job, JobState, Result
+from trompe_server.storage.database import DatabaseDownError
+from trompe_server.storage.tokens import hash_secret
+from trompe_shared.api import Job, JobState, Result, in_parts
 from trompe_shared.presets import PRESETS
 from trompe_shared.shipped import shipped_objects
 
@@ -48,7 +48,7 @@ Label = Annotated[str, Query(max_length=264)]
 
 @router.get("/")
 def home(request: Request, services: ServicesDep) -> HTMLResponse:
-    """What Trompe does, and the latest jobs."""
+    """Example, latest jobs and explanation."""
     return page(request, "home.html", gallery=GALLERY, rows=_rows(services, limit=LATEST)[0])
 
 
@@ -60,7 +60,7 @@ def jobs(
     rows, older = _rows(services, state=state, label=label, cursor=cursor)
     filters = {"state": state, "label": label}
     given = {name: value for name, value in filters.items() if value}
-    # Older pages stand still, but for the jobs on them.
+    # Older pages show the same jobs, updated.
     stream = "/jobs/stream?" + urlencode(given if cursor is None else {"ids": ",".join(row.id for row in rows)})
     return page(
         request,
@@ -80,7 +80,7 @@ def jobs(
 def follow_list(
     services: ServicesDep, state: State = "", label: Label = "", ids: str = "", limit: int = PAGE
 ) -> EventSourceResponse:
-    """Rows of the list as they change, newest first, as HTML."""
+    """Stream of changed rows as HTML, newest first."""
 
     def look() -> list[JobRow]:
         if ids:
@@ -107,7 +107,9 @@ def new_job(request: Request, services: ServicesDep) -> HTMLResponse:
         "new.html",
         objects=objects,
         classifiers=classifiers,
-        presets={name: {"help": preset.help, "options": dict(preset.options)} for name, preset in PRESETS.items()},
+        fields=form_fields(),
+        renderers=list(dict.fromkeys(each.identity for each in services.renderers() if each.identity)),
+        presets={name: {"help": one.help, "options": in_parts(one.options)} for name, one in PRESETS.items()},
         turns=TURNS,
         endings=".zip,.glb,.gltf,.fbx,.ply,.stl,.obj",
         formats="GLB, FBX, PLY, STL, or a zip of an .obj or .gltf with its textures.",
@@ -116,10 +118,15 @@ def new_job(request: Request, services: ServicesDep) -> HTMLResponse:
 
 @router.get("/jobs/turntable/{reference}.png")
 def show_turntable(
-    services: ServicesDep, reference: str, background: str = "white", distance: float | None = None
+    services: ServicesDep,
+    reference: str,
+    background: str = "white",
+    distance: float | None = None,
+    renderer: str = "",
 ) -> Response:
-    """The object from all around in the target renderer: pictures side by side."""
-    return Response(turntable(services, reference, background=background, distance=distance), media_type="image/png")
+    """The object from all sides in a renderer: pictures side by side."""
+    shown = turntable(services, reference, background=background, distance=distance, renderer=renderer)
+    return Response(shown, media_type="image/png")
 
 
 @router.get("/jobs/compare")
@@ -130,10 +137,9 @@ def compare(request: Request, services: ServicesDep, a: str, b: str) -> HTMLResp
         job = services.store.get(each)
         result = _result(services, job)
         if result is None:
-            lacks = "a result of another version of Trompe" if RESULT in job.artifacts else "no result"
-            raise NotFoundError(f"Job {each} is {job.state} and has {lacks}: there is nothing to compare.")
+            raise NotFoundError(f"Job {each} is {job.state} and has no result to compare.")
         row = names.row(job)
-        asked.append(names.options(job.spec))
+        asked.append(names.options(job))
         results.append(result)
         sides.append({"job": row, "shown": _shown(services, row, result)})
     return page(request, "compare.html", sides=sides, lines=differences(asked, results))
@@ -145,13 +151,12 @@ def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
     found = services.store.get(job)
     row, result = _row(services, found), _result(services, found)
     shown = _shown(services, row, result) if result else None
-    foreign = shown is None and RESULT in found.artifacts
-    return page(request, "job.html", job=row, shown=shown, foreign=foreign, terms=TERMS)
+    return page(request, "job.html", job=row, shown=shown, terms=TERMS)
 
 
 @router.get("/jobs/{job}/preview.png")
 def preview(services: ServicesDep, job: str) -> Response:
-    """The object as the attack has it now, in surrogate and target; 204 where it has not come so far."""
+    """The object at present, in surrogate and target; 204 before the first one."""
     services.store.get(job)
     try:
         return Response(services.artifacts(job).read("preview.png"), media_type="image/png")
@@ -168,7 +173,7 @@ def picture(
     index: Annotated[int, PathParam(ge=0)],
     kind: Kind,
 ) -> Response:
-    """One target image of a job that has ended."""
+    """One target image of an ended job."""
     services.store.get(job)
     try:
         data = request.app.state.pictures.one(services.artifacts(job), view_set, index, kind)
@@ -189,12 +194,12 @@ def experiments(request: Request, services: ServicesDep) -> HTMLResponse:
 
 @router.get("/experiments/{name:path}")
 def show_experiment(request: Request, services: ServicesDep, name: str, cursor: Cursor = None) -> HTMLResponse:
-    """The jobs of an experiment, and their speed against their accuracy."""
+    """Jobs of an experiment, and a chart of seconds and accuracy."""
     found = services.store.page(labels={LABEL: name}, limit=500, cursor=cursor)
     if not found.jobs:
         raise NotFoundError(f"There is no experiment {name!r}.")
     names = Names(services.library)
-    entries = [(names.row(job), names.options(job.spec), _result(services, job)) for job in found.jobs]
+    entries = [(names.row(job), names.options(job), _result(services, job)) for job in found.jobs]
     states = [row.state for row, _, _ in entries]
     options = differing_options(entries)
     columns, lines = columns_and_lines(entries, options)
@@ -210,9 +215,15 @@ def show_experiment(request: Request, services: ServicesDep, name: str, cursor: 
     )
 
 
+@router.get("/docs")
+def docs(request: Request) -> HTMLResponse:
+    """The operations and schemas of the API."""
+    return page(request, "docs.html")
+
+
 @router.get("/login")
 def login(request: Request, next: str = "/") -> HTMLResponse:
-    """Where a token is asked for."""
+    """The sign-in page."""
     return page(request, "login.html", next=next, wrong=None)
 
 
@@ -223,10 +234,10 @@ def sign_in(
     token: Annotated[str, Form(max_length=200)],
     next: Annotated[str, Form(max_length=2000)] = "/",
 ) -> Response:
-    """Keep the token in a cookie that scripts cannot read and other sites cannot use."""
+    """Keep the token in a cookie, unreadable by scripts and unused by other sites."""
     known = services.tokens.by_hash().get(hash_secret(token.strip()))
     if known is None or known.revoked is not None:
-        wrong = "That is no valid token; it begins with trompe_ and was shown once, when it was made."
+        wrong = "This is not a valid token. Tokens begin with trompe_ and are printed once, by trompe token create."
         return page(request, "login.html", status=401, next=next, wrong=wrong)
     own = next.startswith("/") and not next.startswith(("//", "/\\"))
     answer = RedirectResponse(next if own else "/", status_code=303)
@@ -237,7 +248,7 @@ def sign_in(
 
 @router.post("/logout")
 def sign_out() -> Response:
-    """Forget the token."""
+    """Delete the token's cookie."""
     answer = RedirectResponse("/", status_code=303)
     answer.delete_cookie(COOKIE, httponly=True, samesite="strict")
     return answer
@@ -268,7 +279,7 @@ def _found(services: Services, job: str) -> Job | None:
 
 
 async def _changes(look: Any) -> AsyncIterator[ServerSentEvent]:
-    """Rows that are new or changed since the look before, rendered as the page renders them."""
+    """New and changed rows, rendered as HTML."""
     known: dict[str, str] = {}
     while True:
         try:
@@ -284,15 +295,13 @@ async def _changes(look: Any) -> AsyncIterator[ServerSentEvent]:
 
 
 def _result(services: Services, job: Job) -> Result | None:
-    """What came of a job; ``None`` where there is nothing, or another version of Trompe wrote what this one does not
-    understand."""
     if RESULT not in job.artifacts:
         return None
     try:
         return Result.model_validate_json(services.artifacts(job.id).read(RESULT))
-    except (FileNotFoundError, ValidationError):
+    except FileNotFoundError:
         return None
 
 
 def _shown(services: Services, row: JobRow, result: Result) -> Shown:
-    return present(result, row, names=Names(services.library).classes(result.spec.classifier))
+    return present(result, row, names=Names(services.library).classes(result.spec.victim.classifier))

@@ -1,6 +1,7 @@
-"""How pages are put together: templates, files that go with them, and the headers that keep browsers strict."""
+"""Templates, static files, and security headers of the pages."""
 
 import hashlib
+import re
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -10,6 +11,7 @@ from fastapi import Request
 from fastapi.responses import HTMLResponse
 from fastapi.templating import Jinja2Templates
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup, escape
 
 from trompe_server.api.guard import COOKIE
 
@@ -24,6 +26,12 @@ HEADERS: Final = {
     "Referrer-Policy": "same-origin",
 }
 
+
+def _code(text: str) -> Markup:
+    """``text`` with words in backquotes, such as names of options, as code."""
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
+
+
 _TEMPLATES: Final = Jinja2Templates(
     env=Environment(
         loader=FileSystemLoader(_HERE / "templates"),
@@ -33,21 +41,22 @@ _TEMPLATES: Final = Jinja2Templates(
         lstrip_blocks=True,
     )
 )
+_TEMPLATES.env.filters["code"] = _code
 
 
 @cache
 def _static(name: str) -> str:
-    """Address of a file that goes with the pages; it changes with the file, so browsers may keep what they have."""
+    """Address of a static file, with a hash of its content, so that browsers may cache it."""
     mark = hashlib.sha256((STATIC / name).read_bytes()).hexdigest()[:12]
     return f"/static/{name}?v={mark}"
 
 
 def page(request: Request, template: str, /, status: int = 200, **values: Any) -> HTMLResponse:
-    """The page that ``template`` makes of ``values``."""
+    """Render a page."""
     values |= {"version": version("trompe"), "static": _static, "signed_in": COOKIE in request.cookies}
     return _TEMPLATES.TemplateResponse(request, template, values, status_code=status, headers=HEADERS)
 
 
 def render(template: str, /, **values: Any) -> str:
-    """A piece of a page."""
+    """Render a part of a page."""
     return _TEMPLATES.get_template(template).render(values)

@@ -1,15 +1,16 @@
-"""An object from all around, as the target renderer shows it, before anything is attacked."""
+"""An object from all sides in the target renderer, for the form."""
 
 from typing import Final
 
 import numpy as np
 
 from trompe_server.api.services import Services
-from trompe_server.target.sailenv import SailenvTarget
+from trompe_server.spec.framing import framing_of
+from trompe_shared.api import ViewOptions
 from trompe_shared.errors import RendererError, SpecError
-from trompe_shared.geometry import Camera, Light, View, colour_of, framing_distance
+from trompe_shared.geometry import Camera, Light, View, colour_of
 from trompe_shared.object3d import encode_png, load_object
-from trompe_shared.shipped import shipped_objects
+from trompe_shared.sailenv_client import SailenvTarget
 
 __all__ = ["TURNS", "turntable"]
 
@@ -18,18 +19,23 @@ SIDE: Final = 224
 ELEVATION: Final = 25.0
 
 
-def turntable(services: Services, reference: str, *, background: str, distance: float | None) -> bytes:
-    """``TURNS`` pictures side by side, PNG. Raises ``RendererError`` where no renderer is up."""
-    renderers = [each for each in services.renderers() if each.alive]
+def turntable(
+    services: Services, reference: str, *, background: str, distance: float | None, renderer: str = ""
+) -> bytes:
+    """``TURNS`` pictures side by side as PNG. ``renderer``: identity of the engine; default: the first one's.
+
+    Raises ``RendererError`` if no such renderer is up.
+    """
+    renderers = [each for each in services.renderers() if each.alive and renderer in ("", each.identity)]
     if not renderers:
-        raise RendererError("No renderer worker is up; the object can be shown once one is.")
+        raise RendererError(f"No renderer worker {renderer} is up: start one with `trompe render`.")
     obj = load_object(services.library.object_bytes(reference))
-    shipped = shipped_objects().get(reference)
-    away = distance or (shipped.distance if shipped else framing_distance(obj.radius))
+    framing = framing_of(obj, ViewOptions(distance=distance), shipped=reference)
     behind = colour_of(background)
     if behind is None:
-        raise SpecError(f"The background {background!r} is no colour; give white, black or #rrggbb.")
-    views = [View(Camera(away, 360 * k / TURNS, ELEVATION), Light(), behind) for k in range(TURNS)]
+        raise SpecError(f"The background {background!r} is not a colour; use white, black or #rrggbb.")
+    cameras = [Camera(framing.distance, 360 * k / TURNS, ELEVATION, centre=framing.centre) for k in range(TURNS)]
+    views = [View(camera, Light(), behind) for camera in cameras]
     host, _, port = renderers[0].address.rpartition(":")
     target = SailenvTarget(host, int(port))
     try:

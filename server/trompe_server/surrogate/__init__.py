@@ -1,6 +1,7 @@
-"""The surrogate renderer: rasterise once, then gather. Usable without any server."""
+"""The surrogate renderer: rasterise once, then gather. Independent of the server."""
 
 from trompe_server.surrogate.canvas import Canvas
+from trompe_server.surrogate.joint import AnyCanvas, AnySurrogate, JointSurrogate, joined
 from trompe_server.surrogate.sampling import SamplingModel
 from trompe_server.surrogate.surrogate import (
     Geometry,
@@ -13,13 +14,17 @@ from trompe_server.surrogate.surrogate import (
 )
 
 __all__ = [
+    "AnyCanvas",
+    "AnySurrogate",
     "Canvas",
     "Geometry",
+    "JointSurrogate",
     "SamplingModel",
     "Surrogate",
     "behind",
     "curve_surrogate",
     "diffuse_surrogate",
+    "joined",
     "prepare_geometry",
     "textures_of",
 ]

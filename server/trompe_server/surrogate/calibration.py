@@ -1,12 +1,12 @@
-"""Finding out, by images alone, how the target samples textures and how little of a colour model the scene needs.
+"""Calibration: find the target's texture sampling and the cheapest sufficient colour model from images alone.
 
-The target stays a black box: it is shown the object painted in greys and in random noise, and every hypothesis is
-judged by how well it predicts what the noise changes in the target's images.
+The target stays a black box. It renders the object painted in greys and in random noise; the score of a hypothesis is
+its prediction of the change that the noise makes in the target's images.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import product
 from typing import Final
 
@@ -23,7 +23,9 @@ from trompe_server.surrogate.surrogate import (
     curve_surrogate,
     diffuse_surrogate,
     prepare_geometry,
+    refiltered,
 )
+from trompe_server.surrogate.tone import ToneMap, measure_tone_map
 from trompe_shared.api import SurrogateModel
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
@@ -35,6 +37,7 @@ __all__ = [
     "Calibration",
     "build_surrogate",
     "calibrate",
+    "find_physics",
     "find_sampling",
     "painted_grey",
     "painted_noise",
@@ -42,33 +45,38 @@ __all__ = [
 
 CALIBRATED_GREYS: Final = (0, 128)
 CURVE_GREYS: Final = (0, 64, 128, 191, 255)
-"""Encoded greys of the probes of the ``calibrated`` and the ``curve`` model. White would saturate and tell little."""
+"""Encoded greys of the probes of the ``calibrated`` and the ``curve`` model. White alone would saturate."""
 
 NOISE_AMPLITUDE: Final = 0.1
 
 TRIAL_VIEWS: Final = 4
-"""Views on which hypotheses and colour models are tried."""
+"""Number of views for trying hypotheses and colour models."""
 
 KEPT_BYTES: Final = 2**29
-"""Memory of the operators of hypotheses that are kept while others are tried."""
+"""Bytes of operators kept from earlier hypotheses."""
 
 Image8 = NDArray[np.uint8]
 Ask = Callable[[Object3D, Sequence[View]], Image8]
-"""Asks the target for images: (views, H, W, 3) uint8."""
+"""Renders images (views, H, W, 3) uint8 in the target."""
+MeasureToneMap = Callable[[Ask, tuple[int, int]], ToneMap]
 
 
 def painted_grey(obj: Object3D, grey: int) -> Object3D:
-    """``obj`` with every albedo texture replaced by one uniform grey (encoded, 0..255); what is cut out stays so."""
+    """``obj`` with every albedo texture replaced by one grey (encoded, 0..255); alpha stays."""
     return obj.with_textures(
         {
-            name: np.full((4, 4, 3) if opacity_of(obj.files[name]) is None else image.shape, grey, dtype=np.uint8)
+            name: np.full(
+                (4, 4, 3) if opacity_of(obj.files[name], blended=name in obj.blended) is None else image.shape,
+                grey,
+                dtype=np.uint8,
+            )
             for name, image in obj.textures.items()
         }
     )
 
 
 def painted_noise(obj: Object3D, generator: np.random.Generator) -> Object3D:
-    """``obj`` with +-0.1 (sRGB) added at random to every channel of every texel."""
+    """``obj`` with random +-0.1 (sRGB) added to every channel of every texel."""
     reach = round(NOISE_AMPLITUDE * 255)
     return obj.with_textures(
         {
@@ -82,11 +90,11 @@ Score = Callable[[SamplingModel], float]
 
 
 def find_sampling(score: Score) -> SamplingModel:
-    """The sampling hypothesis with the highest ``score`` (``Fidelity.score``).
+    """Search the sampling hypothesis with the highest ``score`` (``Fidelity.score``).
 
-    One group of members is varied at a time, the most telling first, until a whole round changes nothing; a change
-    must gain 0.002 to be believed. Only where that leaves much unexplained, what few renderers do is tried too. At the
-    end the bias of the level of detail is read off a parabola.
+    Coordinate ascent over groups of members, the most informative first, until a whole round changes nothing; a change
+    must gain 0.002. Rare practices are tried only if much stays unexplained. Last, a parabola through three scores
+    gives the bias of the level of detail.
     """
     scored = lru_cache(maxsize=None)(score)
     best = _climbed(SamplingModel(), scored)
@@ -100,11 +108,32 @@ def find_sampling(score: Score) -> SamplingModel:
     return _peaked(best, _biased, BIAS_STEP, scored)
 
 
-def _climbed(best: SamplingModel, score: Score) -> SamplingModel:
-    """The best that can be reached from ``best`` by changing one group of members at a time."""
+def find_physics(best: SamplingModel, score: Score, groups: Sequence["Group"]) -> SamplingModel:
+    """Search beyond rasterisers from ``best``: ``groups`` of ``BEYOND``; every change must gain ``CLEARLY``.
+
+    A missed tone curve or reconstruction filter also misleads the search before it: each is tried on the defaults, too.
+    """
     for _ in range(MAX_ROUNDS):
         before = best
-        for group in ALTERNATIVES if best.anisotropy == 1 else ELONGATED:
+        for group in groups:
+            tried = [best.but(**members) for members in group]
+            if group is TONES:
+                kept = {name: getattr(best, name) for name in ("slope", "edges")}
+                tried += [_climbed(SamplingModel(**kept).but(**members), score) for members in group]
+            leader = max(tried, key=score)
+            best = leader if score(leader) > score(best) + CLEARLY else best
+        if best == before:
+            break
+        best = _peaked(_climbed(best, score), _biased, BIAS_STEP, score)
+    return best
+
+
+def _climbed(best: SamplingModel, score: Score) -> SamplingModel:
+    """The best hypothesis reachable from ``best`` by changing one group of members at a time."""
+    groups = FILTERED if best.samples == "grid" else ALTERNATIVES if best.anisotropy == 1 else ELONGATED
+    for _ in range(MAX_ROUNDS):
+        before = best
+        for group in groups:
             leader = max((best.but(**members) for members in group), key=score)
             best = leader if score(leader) > score(best) + 0.002 else best
         if best == before:
@@ -115,10 +144,10 @@ def _climbed(best: SamplingModel, score: Score) -> SamplingModel:
 MAX_ROUNDS: Final = 4
 
 SATISFYING: Final = 0.93
-"""Score from which on nothing rare is looked for."""
+"""Score that ends the search before rare practices."""
 
 CLEARLY: Final = 0.02
-"""What something rare must gain."""
+"""Gain required of a rare practice."""
 
 BIASES: Final = (0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0)
 
@@ -135,19 +164,21 @@ ALTERNATIVES: Final[tuple[Group, ...]] = (
     ({"shade_at": "centre"}, {"shade_at": "centroid"}),
     ({"cull": True}, {"cull": False}),
 )
-"""Groups of members of the hypothesis that make up for each other, and the values they could have."""
+"""Groups of members that can compensate for each other, with their possible values."""
 
 ELONGATED: Final[tuple[Group, ...]] = (
     tuple({"anisotropy": most} for most in (2, 4, 8, 16)),
     tuple({"bias": bias} for bias in BIASES),
     *(group for group in ALTERNATIVES if group is not LEVELS),
 )
-"""The same for filters that follow elongated footprints."""
+"""The same for anisotropic filters."""
 
 SHIFTS: Final[Group] = tuple({"shift": shift} for shift in product((-0.25, 0.0, 0.25), repeat=2) if any(shift))
 
+UNIFORM: Final[dict[str, object]] = {"anisotropy": 1, "elongated": "probes", "lod": "longer", "shade_at": "centre"}
+
 PLAIN_LEVEL: Final[dict[str, object]] = {"lod": "longer", "bias": 0.0, "shade_at": "centre"}
-"""What else makes up for anisotropy that is missed."""
+"""Members that compensate for a missed anisotropy; reset for a trial of it."""
 
 RARE: Final[Group] = (
     {"anisotropy": 2, "elongated": "probes", **PLAIN_LEVEL},
@@ -156,10 +187,43 @@ RARE: Final[Group] = (
     {"anisotropy": 16, "elongated": "ellipse", **PLAIN_LEVEL},
     *SHIFTS,
 )
-"""Where a search for what few renderers do begins."""
+"""Starting points of the search among rare practices."""
+
+SUB_PIXELS: Final[dict[str, object]] = {"samples": "grid", "filtered": "linear", **UNIFORM, "bias": -0.5}
+
+KERNELS: Final[Group] = tuple(
+    SUB_PIXELS | {"kernel": kernel}
+    for kernel in (
+        ("box", 1.0),
+        ("tent", 2.0),
+        ("gaussian", 2.0),
+        ("gaussian", 4.0),
+        ("blackman-harris", 1.5),
+        ("blackman-harris", 3.0),
+        ("blackman-harris", 4.0),
+    )
+)
+"""Averages of sub-pixels; a texture is read at their size, half a level finer."""
+
+FILTERED: Final[tuple[Group, ...]] = (
+    tuple({"bias": bias} for bias in (-1.0, -0.5, 0.0)),
+    ({"filtered": "encoded"}, {"filtered": "linear"}),
+    ({"encoding": "srgb"}, {"encoding": "power"}),
+    ({"cull": True}, {"cull": False}),
+)
+"""What is left to try under a reconstruction filter."""
+
+SLOPES: Final[Group] = ({"slope": "greys"}, {"slope": "chord"})
+
+EDGES: Final[Group] = ({"edges": "encoded"}, {"edges": "linear"})
+
+TONES: Final[Group] = ({"encoding": "measured"},)
+
+BEYOND: Final[tuple[Group, ...]] = (SLOPES, EDGES, KERNELS)
+"""What path tracers do; it costs no image."""
 
 MAX_RARE: Final = 2
-"""How many things that few renderers do one renderer may do."""
+"""Most rare practices of one renderer."""
 
 BIAS_STEP: Final = 0.25
 
@@ -179,7 +243,7 @@ def _shifted_down(model: SamplingModel, by: float) -> SamplingModel:
 
 
 def _centred(best: SamplingModel, score: Score) -> SamplingModel:
-    """``best`` with the shift of its pixels read off parabolas, ever finer; as it is where it has none."""
+    """``best`` with its pixel shift, if any, refined by parabolas of decreasing step."""
     for step in SHIFT_STEPS if any(best.shift) else ():
         best = _peaked(_peaked(best, _shifted_right, step, score), _shifted_down, step, score)
     return best
@@ -188,9 +252,9 @@ def _centred(best: SamplingModel, score: Score) -> SamplingModel:
 def _peaked(
     best: SamplingModel, moved: Callable[[SamplingModel, float], SamplingModel], step: float, score: Score
 ) -> SamplingModel:
-    """``best`` moved to where the parabola through its own and two neighbouring scores peaks, if that gains.
+    """``best`` moved to the peak of the parabola through its score and its neighbours', if that gains.
 
-    A step further uphill, where they are no peak.
+    Without a peak it moves one step uphill.
     """
     low, high = (score(moved(best, by)) for by in (-step, step))
     bend = 2 * score(best) - low - high
@@ -201,10 +265,11 @@ def _peaked(
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was found out about the target for one object and its views: all that the surrogate is built from.
+    """The result of a calibration for one object and its views: everything needed to build the surrogate.
 
-    greys and probes as ``curve_surrogate`` takes them (empty for ``diffuse``). fidelity: measured on the trial views.
-    renders: how many images the target was asked for.
+    greys, probes: as for ``curve_surrogate`` (empty for ``diffuse``). fidelity: measured on the trial views. renders:
+    number of images rendered in the target. tone: the measured tone curve, if ``sampling`` uses one. noise: root mean
+    square of the target's noise on the object, sRGB in [0, 1] units; 0 for a deterministic target.
     """
 
     model: str
@@ -214,6 +279,8 @@ class Calibration:
     probes: Image8
     fidelity: Fidelity
     renders: int
+    tone: ToneMap | None = None
+    noise: float = 0.0
 
 
 def build_surrogate(
@@ -226,9 +293,9 @@ def build_surrogate(
     backdrops: Mapping[str, Image8] = NO_BACKDROPS,
     device: torch.device | str = "cpu",
 ) -> Surrogate:
-    """The surrogate for ``views``, whose target images are ``clean``.
+    """Build the surrogate for ``views`` with the target images ``clean`` (views, H, W, 3) uint8.
 
-    ``geometry``: what ``prepare_geometry`` made of the same, where that has been done. ``backdrops`` as for
+    geometry: the result of ``prepare_geometry`` for the same views, if available. backdrops: as for
     ``diffuse_surrogate``.
     """
     if geometry is None:
@@ -245,11 +312,11 @@ def _shaded(
     clean: Image8,
     backdrops: Mapping[str, Image8],
 ) -> Surrogate:
-    """The surrogate on a geometry that stands already."""
+    """The surrogate on a prepared geometry."""
     if calibration.model == "diffuse":
         return diffuse_surrogate(geometry, views, backdrops=backdrops)
-    greys, probes = calibration.greys, calibration.probes
-    return curve_surrogate(geometry, obj, views, clean, greys, probes, backdrops=backdrops)
+    greys, probes, tone = calibration.greys, calibration.probes, calibration.tone
+    return curve_surrogate(geometry, obj, views, clean, greys, probes, tone=tone, backdrops=backdrops)
 
 
 def calibrate(
@@ -262,31 +329,42 @@ def calibrate(
     generator: np.random.Generator,
     backdrops: Mapping[str, Image8] = NO_BACKDROPS,
     on_sampling: Callable[[SamplingModel], None] = lambda _: None,
+    deterministic: bool = True,
+    tone_map: MeasureToneMap = measure_tone_map,
 ) -> Calibration:
-    """Probe the target as little as the ``wanted`` colour model needs; ``auto`` takes the cheapest that is good enough.
+    """Probe the target as far as the ``wanted`` colour model needs; ``auto`` takes the cheapest within tolerance.
 
-    ``clean`` are the target's images of ``obj``, (views, H, W, 3) uint8. A few trial views decide; only then are all of
-    them probed. ``on_sampling`` is told the sampling model as soon as it is known, before most of the probes.
+    Otherwise ``auto`` takes the best: the two probes under other shading, filters and tone curves, or five probes.
+
+    clean: the target's images of ``obj``, (views, H, W, 3) uint8. on_sampling: receives the sampling model as soon as
+    it is known, before most of the probes. deterministic: equal requests give equal images; otherwise the noise is
+    measured and fidelity is judged above it. tone_map: gives the target's tone curve, if it is needed. A few trial
+    views decide; the other views are probed afterwards.
     """
-    trial = _Trial.of(obj, views, clean, ask, generator, backdrops)
+    trial = _Trial.of(obj, views, clean, ask, generator, backdrops, deterministic=deterministic, tone_map=tone_map)
     if wanted in {"auto", "diffuse"}:
         fidelity = trial.fidelity("diffuse", SamplingModel(), ())
         if wanted == "diffuse" or fidelity.good_enough:
-            reason = "asked for" if wanted == "diffuse" else f"good enough without probes: {_said(fidelity)}"
+            reason = "requested" if wanted == "diffuse" else f"good enough without probes: {_summary(fidelity)}"
             nothing = np.zeros((0, *clean.shape), np.uint8)
-            return Calibration("diffuse", reason, SamplingModel(), (), nothing, fidelity, trial.renders)
-    sampling = find_sampling(lambda model: trial.fidelity("calibrated", model, CALIBRATED_GREYS).score)
+            return Calibration(
+                "diffuse", reason, SamplingModel(), (), nothing, fidelity, trial.renders, noise=trial.noise
+            )
+    model, reason, sampling, fidelity = _chosen(trial, wanted)
     on_sampling(sampling)
-    model, reason, fidelity = _cheapest(trial, sampling, wanted)
     greys = CALIBRATED_GREYS if model == "calibrated" else CURVE_GREYS
     probes = np.stack([trial.probe_all(grey, views) for grey in greys])
     renders = trial.renders + len(greys) * (len(views) - len(trial.views))
-    return Calibration(model, reason, sampling, greys, probes, fidelity, renders)
+    tone = trial.tone if sampling.encoding == "measured" else None
+    return Calibration(model, reason, sampling, greys, probes, fidelity, renders, tone, trial.noise)
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """The trial views, and what the target showed there: unpainted, repainted at random, and in greys as needed."""
+    """The trial views and the target's images of them: unpainted, repainted at random, and in greys on demand.
+
+    again: unpainted with other noise; ``None`` for a deterministic target.
+    """
 
     obj: Object3D
     index: tuple[int, ...]
@@ -296,10 +374,14 @@ class _Trial:
     images: Image8
     backdrops: Mapping[str, Image8]
     ask: Ask
+    again: Image8 | None
+    tone_map: MeasureToneMap
+    charts: list[int] = field(default_factory=list)
+    """Numbers of images of charts that were asked for."""
     probes: dict[int, Image8] = field(default_factory=dict)
-    """What was asked for so far, by grey."""
+    """Images so far, by grey."""
     geometries: dict[SamplingModel, Geometry] = field(default_factory=dict)
-    """Under the hypotheses that were tried last; those that differ in colours alone share one."""
+    """Geometries of recent hypotheses; hypotheses with the same geometry share one."""
 
     @classmethod
     def of(
@@ -310,24 +392,50 @@ class _Trial:
         ask: Ask,
         generator: np.random.Generator,
         backdrops: Mapping[str, Image8],
+        *,
+        deterministic: bool,
+        tone_map: MeasureToneMap,
     ) -> "_Trial":
         index = tuple(sorted({round(k) for k in np.linspace(0, len(views) - 1, TRIAL_VIEWS + 2)[1:-1]}))
         few = tuple(views[k] for k in index)
         repainted = painted_noise(obj, generator)
-        return cls(obj, index, few, clean[list(index)], repainted, ask(repainted, few), backdrops, ask)
+        other = few if deterministic else tuple(replace(view, noise=view.noise + 1) for view in few)
+        again = None if deterministic else ask(obj, other)
+        images = ask(repainted, other)
+        return cls(obj, index, few, clean[list(index)], repainted, images, backdrops, ask, again, tone_map)
 
     @property
     def renders(self) -> int:
-        return len(self.views) * (1 + len(self.probes))
+        each = 1 + len(self.probes) + (self.again is not None)
+        return len(self.views) * each + sum(self.charts)
+
+    @cached_property
+    def tone(self) -> ToneMap:
+        """The target's tone curve; measured when it is first asked for."""
+
+        def ask(chart: Object3D, views: Sequence[View]) -> Image8:
+            self.charts.append(len(views))
+            return self.ask(chart, views)
+
+        return self.tone_map(ask, (self.clean.shape[1], self.clean.shape[2]))
+
+    @cached_property
+    def noise(self) -> float:
+        """Root mean square of the noise of one image on pixels that the random repaint changes."""
+        if self.again is None:
+            return 0.0
+        changed = (self.images != self.clean).any(axis=3)
+        difference = (self.again[changed].astype(np.float64) - self.clean[changed]) / 255
+        return float(np.sqrt(np.square(difference).mean() / 2)) if len(difference) else 0.0
 
     def probe(self, grey: int) -> Image8:
-        """The trial views painted in a grey."""
+        """Images of the trial views with the object painted in ``grey``."""
         if grey not in self.probes:
             self.probes[grey] = self.ask(painted_grey(self.obj, grey), self.views)
         return self.probes[grey]
 
     def probe_all(self, grey: int, views: Sequence[View]) -> Image8:
-        """All ``views`` painted in a grey; the trial views are not asked for again."""
+        """Images of all ``views`` with the object painted in ``grey``; reuses the trial views."""
         others = [k for k in range(len(views)) if k not in self.index]
         images = np.zeros((len(views), *self.clean.shape[1:]), np.uint8)
         images[list(self.index)] = self.probe(grey)
@@ -339,34 +447,83 @@ class _Trial:
         """Fidelity of a colour model under a sampling hypothesis, on the trial views."""
         probes = np.array([self.probe(grey) for grey in greys], np.uint8).reshape(-1, *self.clean.shape)
         nothing = Fidelity((), (), (), ())
-        calibration = Calibration(model, "", sampling, greys, probes, nothing, 0)
+        tone = self.tone if sampling.encoding == "measured" else None
+        calibration = Calibration(model, "", sampling, greys, probes, nothing, 0, tone)
         geometry = replace(self._geometry(sampling), sampling=sampling)
         surrogate = _shaded(calibration, geometry, self.obj, self.views, self.clean, self.backdrops)
-        return measure_fidelity(surrogate, self.obj, self.clean, self.repainted, self.images)
+        return measure_fidelity(surrogate, self.obj, self.clean, self.repainted, self.images, noise=self.noise)
 
     def _geometry(self, sampling: SamplingModel) -> Geometry:
-        key = sampling.but(**{name: getattr(SamplingModel(), name) for name in ("encoding", "filtered", "mips")})
+        key = sampling.but(**{name: getattr(SamplingModel(), name) for name in (*_COLOURS, "kernel")})
         size = (self.clean.shape[1], self.clean.shape[2])
         known = self.geometries.pop(key, None)
-        self.geometries[key] = known or prepare_geometry(self.obj, self.views, size=size, sampling=key)
+        made = key.but(kernel=sampling.kernel)
+        self.geometries[key] = known or prepare_geometry(self.obj, self.views, size=size, sampling=made)
         while len(self.geometries) > 1 and sum(each.nbytes for each in self.geometries.values()) > KEPT_BYTES:
             del self.geometries[next(iter(self.geometries))]
-        return self.geometries[key]
+        found = self.geometries[key]
+        return found if found.sampling.kernel == sampling.kernel else refiltered(found, sampling.kernel)
 
 
-def _cheapest(trial: _Trial, sampling: SamplingModel, wanted: SurrogateModel) -> tuple[str, str, Fidelity]:
-    """(model, why, its fidelity): the wanted one, or with ``auto`` the cheaper of the two if it is good enough."""
-    if wanted == "auto":
-        fidelity = trial.fidelity("calibrated", sampling, CALIBRATED_GREYS)
-        if fidelity.good_enough:
-            return "calibrated", f"good enough with two probes a view: {_said(fidelity)}", fidelity
-        missed = f"two probes a view are not enough ({_said(fidelity)}); with five: "
-        fidelity = trial.fidelity("curve", sampling, CURVE_GREYS)
-        return "curve", missed + _said(fidelity), fidelity
-    greys = CALIBRATED_GREYS if wanted == "calibrated" else CURVE_GREYS
-    return wanted, "asked for", trial.fidelity(wanted, sampling, greys)
+_COLOURS: Final = ("encoding", "filtered", "mips", "slope", "edges")
+"""Members of a hypothesis that its geometry does not depend on."""
 
 
-def _said(fidelity: Fidelity) -> str:
+def _chosen(trial: _Trial, wanted: SurrogateModel) -> tuple[str, str, SamplingModel, Fidelity]:
+    """(model, reason, sampling, fidelity): the wanted model, or with ``auto`` the cheapest within tolerance.
+
+    Without one within tolerance it is the best.
+    """
+
+    def two(sampling: SamplingModel) -> Fidelity:
+        return trial.fidelity("calibrated", sampling, CALIBRATED_GREYS)
+
+    @cache
+    def score(sampling: SamplingModel) -> float:
+        return two(sampling).score
+
+    plain = find_sampling(score)
+    if wanted == "curve":
+        return "curve", "requested", plain, trial.fidelity("curve", plain, CURVE_GREYS)
+    traced = trial.again is not None  # who draws random light paths bounces light and filters pixels
+    sampling = find_physics(plain, score, BEYOND) if traced or score(plain) < SATISFYING else plain
+    if _wrong_colours(two(sampling)):
+        sampling = find_physics(sampling, score, (TONES, *BEYOND))
+    fidelity = two(sampling)
+    told = _summary(fidelity) + _practices(sampling)
+    if wanted == "calibrated":
+        return "calibrated", f"requested{_practices(sampling)}", sampling, fidelity
+    if fidelity.good_enough:
+        return "calibrated", f"good enough with two probes a view: {told}", sampling, fidelity
+    five = trial.fidelity("curve", plain, CURVE_GREYS)
+    if five.score > fidelity.score + CLEARLY:
+        reason = f"two probes a view are not enough ({told}); with five: {_summary(five)}"
+        return "curve", reason, plain, five
+    return "calibrated", f"two probes a view: {told}; five are no better: {_summary(five)}", sampling, fidelity
+
+
+def _wrong_colours(fidelity: Fidelity) -> bool:
+    """Whether a tone curve is worth its images: out of tolerance, or changes are predicted too large or too small."""
+    steep = abs(fidelity.mean()["slope"] - 1) > MAX_STEEPNESS
+    return not fidelity.good_enough or (steep and fidelity.score < SATISFYING)
+
+
+MAX_STEEPNESS: Final = 0.1
+
+
+def _summary(fidelity: Fidelity) -> str:
     mean = fidelity.mean()
     return f"error {mean['error'] * 255:.1f}/255, {mean['explained']:.0%} of a random repaint's effect explained"
+
+
+def _practices(sampling: SamplingModel) -> str:
+    """What ``find_physics`` found, as the end of a phrase."""
+    kernel, width = sampling.kernel
+    practices = {
+        "a measured tone curve": sampling.encoding == "measured",
+        "the chord to the unpainted object": sampling.slope == "chord",
+        "edges averaged in light": sampling.edges == "linear",
+        f"a {kernel} filter of {width:g} pixels": sampling.samples == "grid",
+    }
+    used = [name for name, does in practices.items() if does]
+    return f", with {' and '.join(used)}" if used else ""

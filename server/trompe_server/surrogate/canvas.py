@@ -1,8 +1,8 @@
-"""The part of the textures that moves, as one flat tensor, and what the views read while it does.
+"""The moving part of the textures as one flat tensor, and the texels that views read from it.
 
-Most texels of a texture are seen by no view or lie outside of the charts. What moves is kept in square tiles, and the
-texels of all tiles in an order in which the four that the next mip level averages lie a quarter of the whole apart: so
-a level is made by adding four contiguous arrays, and nothing is made for the rest of the texture, which stays as it is.
+No view sees most texels of a texture. The moving ones are kept in square tiles, in an order that puts the four texels
+averaged by the next mip level a quarter of the array apart: a level is the sum of four contiguous arrays, and the rest
+of the texture costs nothing.
 """
 
 from collections.abc import Sequence
@@ -21,8 +21,8 @@ from trompe_server.surrogate.shading import decode
 __all__ = ["Canvas", "canvas_of"]
 
 DEPTH = 3
-"""Tiles have sides of up to 2 ** DEPTH texels: larger ones hold more texels that need not move, smaller ones leave more
-to the levels that are made whole."""
+"""Tiles have sides of up to 2 ** DEPTH texels: larger ones contain more fixed texels, smaller ones leave more work to
+the complete levels."""
 
 
 def canvas_of(
@@ -33,9 +33,9 @@ def canvas_of(
     linear: bool,
     rounded: bool,
 ) -> "Canvas":
-    """The tiles of ``textures`` (sRGB in [0, 1]) in which a texel is ``moving``.
+    """The tiles of ``textures`` (sRGB in [0, 1]) with a ``moving`` texel.
 
-    ``linear``: averaged in linear light, not as they are. Other arguments as for ``read_texels``.
+    linear: average in linear light instead of encoded values. Other arguments: as for ``read_texels``.
     """
     sheets, source, texels = [], [], []
     for texture, mask, chain in zip(textures, moving, chains, strict=True):
@@ -52,8 +52,7 @@ def canvas_of(
 class Canvas:
     """The texels that may move, (texels, 3) in an order of its own.
 
-    source: their sRGB values before anything moves. still: the texels that views read then, sRGB or linear as they are
-    averaged.
+    source: their initial sRGB values. still: the initial texels read by views, sRGB or linear like the averages.
     """
 
     sheets: tuple["_Sheet", ...]
@@ -64,16 +63,16 @@ class Canvas:
 
     @cached_property
     def counts(self) -> list[int]:
-        """How many texels of each texture may move."""
+        """Number of texels of each texture that may move."""
         return [len(sheet.tiles.order) for sheet in self.sheets]
 
     def join(self, tables: Sequence[Tensor]) -> Tensor:
-        """What tables (H, W, ...), one for each texture, say of the texels that may move, (texels, ...)."""
+        """Entries (texels, ...) of tables (H, W, ...), one for each texture, at the texels that may move."""
         parts = zip(self.sheets, tables, strict=True)
         return torch.cat([table.flatten(0, 1).index_select(0, sheet.tiles.order) for sheet, table in parts])
 
     def split(self, values: Tensor) -> list[Tensor]:
-        """The reverse of ``join``: tables (H, W, ...) that are zero where nothing may move."""
+        """Inverse of ``join``: tables (H, W, ...), zero at fixed texels."""
         tables = []
         for sheet, part in zip(self.sheets, torch.split(values, self.counts), strict=True):
             height, width = sheet.tiles.fine.sizes[0]
@@ -82,19 +81,19 @@ class Canvas:
         return tables
 
     def read(self, values: Float[Tensor, "texels 3"]) -> Float[Tensor, "reads 3"]:
-        """What views read, as ``Surrogate.texels`` has it, when the canvas has ``values`` (sRGB). Differentiable."""
+        """The texels read by views, as ``Surrogate.texels``, for canvas ``values`` (sRGB). Differentiable."""
         texels: Tensor = _ReadCanvas.apply(decode(values) if self.linear else values, self)  # type: ignore[no-untyped-call]
         return texels
 
     def forward(self, values: Float[Tensor, "texels 3"]) -> Float[Tensor, "reads 3"]:
-        """``read`` of values as they are averaged."""
+        """``read`` of values in the space of the averages."""
         texels = self.still.clone()
         for sheet, part, reads in zip(self.sheets, torch.split(values, self.counts), self._split(texels), strict=True):
             sheet.read(part, reads, rounded=self.rounded)
         return texels
 
     def transpose(self, gradient: Float[Tensor, "reads 3"]) -> Float[Tensor, "texels 3"]:
-        """What the texels of the canvas get from the ``gradient`` by what views read."""
+        """Gradient of the canvas from the ``gradient`` of the texels read by views."""
         parts = zip(self.sheets, self._split(gradient), strict=True)
         return torch.cat([sheet.spread(reads) for sheet, reads in parts])
 
@@ -103,7 +102,7 @@ class Canvas:
 
 
 class _ReadCanvas(Function):
-    """``Canvas.read``, with the gradient's way back."""
+    """``Canvas.read`` as an autograd function."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, values: Tensor, canvas: Canvas) -> Tensor:
@@ -117,12 +116,12 @@ class _ReadCanvas(Function):
 
 @dataclass(frozen=True)
 class _Tiles:
-    """The tiles of one texture in which something may move.
+    """The tiles of one texture with texels that may move.
 
-    fine: the mip levels that are made tile by tile, and the first one that is made whole (all of it is read). coarse:
-    that one and the levels behind it. tiles: which texels of that level they are, ascending. order: the texels (row *
-    width + column) of all tiles, (a texel of the 2 x 2 that become one, the same of the next level, ..., tile).
-    hits: of each fine level which of the texels read lie in tiles, and where.
+    fine: the mip levels computed tile by tile, and the first complete one (all of it is read). coarse: that level and
+    the following ones. tiles: the tiles as texels of that level, ascending. order: the texels (row * width + column) of
+    all tiles, indexed by (position in the 2 x 2 block of level 0, of level 1, ..., tile).
+    hits: for each fine level the reads within tiles, and their places.
     """
 
     fine: MipChain
@@ -147,12 +146,12 @@ class _Tiles:
 
     @property
     def n_reads(self) -> int:
-        """How many texels views read of this texture, of all its levels."""
+        """Number of texels read by views from all levels of this texture."""
         return sum(map(len, self.fine.reads[:-1])) + sum(map(len, self.coarse.reads))
 
 
 def _order(tiles: Int[Tensor, " tiles"], width: int, depth: int) -> Int[Tensor, " texels"]:
-    """The texels of level 0 of ``tiles``, which are texels of level ``depth``, ``width`` in a row."""
+    """The texels of level 0 of ``tiles``, given as texels of level ``depth`` with ``width`` in a row."""
     order = tiles
     for level in reversed(range(depth)):
         across = width << depth - level
@@ -165,7 +164,7 @@ def _order(tiles: Int[Tensor, " tiles"], width: int, depth: int) -> Int[Tensor, 
 def _hits(
     fine: MipChain, level: int, place: Int[Tensor, " coarse"], n_tiles: int
 ) -> tuple[Int[Tensor, " hits"], Int[Tensor, " hits"]]:
-    """Which of the texels read of a fine level lie in tiles, and where among the texels of all tiles of the level."""
+    """(Reads of a fine level within tiles, their places among the texels of all tiles of the level)."""
     depth = len(fine.sizes) - 1 - level
     reads, width = fine.reads[level], fine.sizes[level][1]
     row, column = reads // width, reads % width
@@ -180,13 +179,13 @@ def _hits(
 
 @dataclass(frozen=True)
 class _Sheet:
-    """The tiles of one texture, and around them its first level that is made whole, as it is before anything moves."""
+    """The tiles of one texture, and its first complete level before anything moves."""
 
     tiles: _Tiles
     around: Float[Tensor, "coarse 3"]
 
     def read(self, values: Float[Tensor, "texels 3"], reads: Float[Tensor, "reads 3"], *, rounded: bool) -> None:
-        """Write what is read of each level into ``reads``, where that is not still."""
+        """Write the moving texels of each level into ``reads``."""
         tiles, start = self.tiles, 0
         for (inside, where), level in zip(tiles.hits, tiles.fine.reads, strict=False):
             reads[start : start + len(level)].index_copy_(0, inside, values.index_select(0, where))
@@ -208,7 +207,7 @@ class _Sheet:
 
 
 def _averaged(values: Float[Tensor, "texels 3"], *, rounded: bool) -> Float[Tensor, "quarter 3"]:
-    """The next level of all tiles: columns are averaged, then rows."""
+    """The next level of all tiles: the mean of columns, then of rows."""
     values = values.view(2, 2, len(values) // 4, 3)
     for axis in (1, 0):
         first, second = values.unbind(axis)

@@ -1,4 +1,4 @@
-"""How well a surrogate predicts its target: the unpainted object, and what a repaint changes, view by view."""
+"""Prediction quality of a surrogate, view by view: of the unpainted object and of the change by a repaint."""
 
 from dataclasses import asdict, dataclass
 from typing import Final, NamedTuple
@@ -14,23 +14,21 @@ from trompe_shared.object3d import Object3D
 __all__ = ["MAX_ERROR", "MIN_EXPLAINED", "Fidelity", "ViewFit", "compare_views", "measure_fidelity"]
 
 MAX_ERROR: Final = 1.5 / 255
-"""A colour model is good enough when its mean error on the unpainted object's pixels is at most this, sRGB in [0, 1]
-units."""
+"""Largest mean error on the unpainted object's pixels of a colour model within tolerance, sRGB in [0, 1] units."""
 
 MIN_EXPLAINED: Final = 0.8
-"""... and it explains at least this share of the variance of what a random repaint changes."""
+"""Smallest share of the variance of a random repaint's effect that a model within tolerance explains."""
 
 Image8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Fidelity:
-    """How well a surrogate predicts the target, per view.
+    """Prediction quality for each view.
 
     error: mean |predicted - true| of the unpainted object's pixels, without anchoring, sRGB in [0, 1] units.
-    correlation, slope: of predicted against true change of the image under a random repaint, wherever one of them is.
-    explained: share of the variance of the true change that the prediction explains; 1 is perfect, 0 is as good as
-    predicting no change.
+    correlation, slope: of predicted against true change of the image under a random repaint, wherever either changes.
+    explained: share of the variance of the true change; 1 is perfect, 0 equals predicting no change.
     """
 
     error: tuple[float, ...]
@@ -44,7 +42,7 @@ class Fidelity:
 
     @property
     def score(self) -> float:
-        """What hypotheses are compared by: explained variance, less 1 % for each 0.5/255 of error."""
+        """Score of a hypothesis: explained variance, less 1 % for each 0.5/255 of error."""
         mean = self.mean()
         return mean["explained"] - 5 * mean["error"]
 
@@ -56,16 +54,19 @@ class Fidelity:
 
 
 def measure_fidelity(
-    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8
+    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8, *, noise: float = 0.0
 ) -> Fidelity:
-    """Compare ``surrogate`` with the target's images (views, H, W, 3) of ``obj`` (clean) and of ``repainted``."""
-    told = [fit for fit in compare_views(surrogate, obj, clean, repainted, images) if fit is not None]
+    """Compare ``surrogate`` with the target's images (views, H, W, 3) of ``obj`` (clean) and of ``repainted``.
+
+    noise: as for ``compare_views``.
+    """
+    told = [fit for fit in compare_views(surrogate, obj, clean, repainted, images, noise=noise) if fit is not None]
     error, correlation, slope, explained, _ = zip(*(told or [NOTHING_SEEN]), strict=True)
     return Fidelity(error, correlation, slope, explained)
 
 
 class ViewFit(NamedTuple):
-    """The same of one view. change: root of the mean squared true change, sRGB in [0, 1] units."""
+    """``Fidelity`` of one view. change: root mean square of the true change, sRGB in [0, 1] units."""
 
     error: float
     correlation: float
@@ -75,16 +76,18 @@ class ViewFit(NamedTuple):
 
     @property
     def poor(self) -> bool:
-        """Whether less than ``MIN_EXPLAINED`` of the change is explained, beyond what the rounding of both images to 8
-        bits adds to what is not."""
+        """Whether less than ``MIN_EXPLAINED`` of the change is explained, after allowing for 8-bit rounding."""
         power = self.change**2
         return (1 - self.explained) * max(power, ROUNDED) > (1 - MIN_EXPLAINED) * power + 2 * ROUNDED
 
 
 def compare_views(
-    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8
+    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8, *, noise: float = 0.0
 ) -> list[ViewFit | None]:
-    """The fidelity of each view; ``None`` where the repaint changes nothing that is seen, and is not said to."""
+    """The fidelity of each view; ``None`` if neither target nor prediction shows a change.
+
+    noise: root mean square of each image's own noise, sRGB in [0, 1] units; change and residual are judged above it.
+    """
     device = surrogate.base.device
     true = [torch.from_numpy(each).to(device) for each in (clean, images)]
     fits: list[ViewFit | None] = []
@@ -99,21 +102,22 @@ def compare_views(
                 columns = (after - shown, shown - surrogate.missed[number], shown, repainted_shown)
             seen = [torch.split(column, list(batch.counts)) for column in columns]
             by_view = zip(*seen, _unforeseen(batch, *true), strict=True)
-            fits += [_compare(*pixels) if _telling(*pixels) else None for pixels in by_view]
+            floor = 2 * noise**2
+            fits += [_compare(*pixels, floor=floor) if _telling(*pixels) else None for pixels in by_view]
     return fits
 
 
 NOTHING_SEEN: Final = ViewFit(0.0, 0.0, 0.0, 0.0, 0.0)
-"""What is known of a surrogate where no view tells anything: nothing that speaks for it."""
+"""The fidelity if no view shows a change."""
 
 
 def _telling(predicted_change: Tensor, _: Tensor, clean: Tensor, after: Tensor, unforeseen: Tensor) -> bool:
-    """Whether a view shows any change, or was predicted to show one, in 8 bits."""
+    """Whether target or prediction shows a change in 8 bits."""
     return bool((255 * predicted_change).round().any() or (after != clean).any() or len(unforeseen))
 
 
 def _unforeseen(batch: ViewBatch, clean: Tensor, images: Tensor) -> list[Tensor]:
-    """Per view what a repaint changes in pixels where the surrogate sees no object, (values,), sRGB in [0, 1] units."""
+    """Changes (values,) of each view at pixels without object in the surrogate, sRGB in [0, 1] units."""
     some = slice(batch.views.start, batch.views.stop)
     before, after = (each[some].flatten(0, 2) for each in (clean, images))
     elsewhere = (after != before).index_fill_(0, batch.pixel, False)
@@ -122,16 +126,19 @@ def _unforeseen(batch: ViewBatch, clean: Tensor, images: Tensor) -> list[Tensor]
 
 
 ROUNDED: Final = 1 / 255**2 / 12
-"""Variance that rounding an image to 8 bits adds. Where less changes, the rest of a prediction is not held against it.
-"""
+"""Variance of rounding to 8 bits; smaller changes count as this much."""
 
 
-def _compare(predicted_change: Tensor, predicted: Tensor, clean: Tensor, after: Tensor, unforeseen: Tensor) -> ViewFit:
+def _compare(
+    predicted_change: Tensor, predicted: Tensor, clean: Tensor, after: Tensor, unforeseen: Tensor, *, floor: float
+) -> ViewFit:
+    """``floor``: variance of the difference of two images by noise alone."""
     change = torch.cat([(after - clean).flatten(), unforeseen]).double()
     guess = torch.cat([predicted_change.flatten(), torch.zeros_like(unforeseen)]).double()
-    variance, power = float(change.square().mean()), float(guess.square().mean())
+    variance, power = max(float(change.square().mean()) - floor, 0.0), float(guess.square().mean())
     product = float((change * guess).mean())
     correlation = product / max((variance * power) ** 0.5, 1e-12)
-    explained = 1 - float((change - guess).square().mean()) / max(variance, ROUNDED)
+    missed = max(float((change - guess).square().mean()) - floor, 0.0)
+    explained = 1 - missed / max(variance, ROUNDED)
     error = float((predicted - clean).abs().mean()) if len(clean) else 0.0
     return ViewFit(error, correlation, product / max(power, 1e-12), explained, variance**0.5)

@@ -1,7 +1,7 @@
-"""The mip pyramids of all textures as one flat array, of which only the texels that are read are ever put together.
+"""The mip pyramids of all textures as one flat array; only the texels that views read are ever assembled.
 
-Large levels are made, read and dropped in bands of rows that stay in the processor's cache, there and back: the cost of
-a step grows with the number of texels and not with the time that memory takes to answer.
+Large levels are computed, read and dropped in bands of rows within the processor's cache, forward and backward, so that
+memory latency does not dominate the cost of a step.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,16 +17,15 @@ from torch.autograd.function import FunctionCtx
 __all__ = ["MipChain", "MipLayout", "Reads", "mip_chains", "mip_layout", "read_texels", "round_level_"]
 
 Reads = Sequence[Int[Tensor, " _"]]
-"""Of each mip level in the layout's order, texels (row * width + column), in the order in which they are wanted."""
+"""For each mip level in the layout's order, texels (row * width + column) in the requested order."""
 
 BAND_TEXELS = 2**18
-"""Levels with more texels than this are made in bands of about as many."""
+"""Texels of a band; larger levels are computed in bands."""
 
 
 @dataclass(frozen=True)
 class MipLayout:
-    """Where each mip level of each texture lies in the flat array. ``sizes[t][l]`` is (H, W), ``starts[t][l]`` its
-    first texel."""
+    """Places of the mip levels in the flat array: ``sizes[t][l]`` is (H, W), ``starts[t][l]`` the first texel."""
 
     sizes: tuple[tuple[tuple[int, int], ...], ...]
     starts: tuple[tuple[int, ...], ...]
@@ -52,16 +51,16 @@ def mip_layout(sizes: Sequence[tuple[int, int]]) -> MipLayout:
 def read_texels(
     textures: Sequence[Float[Tensor, "H W channels"]], chains: Sequence["MipChain"], *, rounded: bool = False
 ) -> Float[Tensor, "texels channels"]:
-    """What ``chains`` read of the mip levels of ``textures`` (row 0 on top), box filtered. Differentiable.
+    """The texels that ``chains`` read from the box-filtered mip levels of ``textures`` (row 0 on top). Differentiable.
 
-    With ``rounded`` levels are rounded to 8 bits as they are made; the gradient passes as if they were not.
+    rounded: round each level to 8 bits; the gradient ignores the rounding.
     """
     texels: Tensor = _ReadTexels.apply(chains, rounded, *textures)  # type: ignore[no-untyped-call]
     return texels
 
 
 class _ReadTexels(Function):
-    """``read_texels``, with the gradient's way back."""
+    """``read_texels`` as an autograd function."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, chains: Sequence["MipChain"], rounded: bool, *textures: Tensor) -> Tensor:
@@ -78,27 +77,27 @@ class _ReadTexels(Function):
 
 
 def mip_chains(layout: MipLayout, reads: Reads) -> list["MipChain"]:
-    """The mip levels of each texture, with what is read of them."""
+    """The mip levels of each texture with their reads."""
     levels = iter(reads)
     return [MipChain(sizes, tuple(next(levels) for _ in sizes)) for sizes in layout.sizes]
 
 
 @dataclass(frozen=True)
 class MipChain:
-    """The mip levels of one texture, and what is read of them."""
+    """The mip levels of one texture and their reads."""
 
     sizes: tuple[tuple[int, int], ...]
     reads: tuple[Int[Tensor, " _"], ...]
 
     @cached_property
     def banded(self) -> int:
-        """How many of the first levels are made in bands: the large ones, as long as both sides are even."""
+        """Number of leading levels computed in bands: the large ones with even sides."""
         small = (k for k, (h, w) in enumerate(self.sizes) if h * w <= BAND_TEXELS or h % 2 or w % 2)
         return next(small, len(self.sizes) - 1)
 
     @cached_property
     def by_row(self) -> list[tuple[Int[Tensor, " _"], Int[Tensor, " _"]]]:
-        """The reads of each banded level, ascending, and which of them each is."""
+        """(Reads of each banded level in ascending order, their original positions)."""
         return [(order.values, order.indices) for order in (level.sort() for level in self.reads[: self.banded])]
 
     def bands(self) -> Iterator[list["_Strip"]]:
@@ -121,7 +120,7 @@ class MipChain:
         return _Strip(rows, which[places], texels[places].sub(rows.start * self.sizes[level][1]))
 
     def read(self, texture: Float[Tensor, "H W channels"], *, rounded: bool) -> list[Float[Tensor, "_ channels"]]:
-        """What is read of each level (of the large ones band by band)."""
+        """The texels read from each level (large levels band by band)."""
         banded, channels = self.banded, texture.shape[2]
         found = [texture.new_empty(len(reads), channels) for reads in self.reads[:banded]]
         level = texture.new_empty(*self.sizes[banded], channels) if banded else texture
@@ -137,7 +136,7 @@ class MipChain:
         return found
 
     def spread(self, gradients: Sequence[Float[Tensor, "_ channels"]]) -> Float[Tensor, "H W channels"]:
-        """The transpose of ``read``: what the texture gets from what was read of each level."""
+        """The transpose of ``read``: the texture's gradient from the gradients of the reads of each level."""
         banded, channels = self.banded, gradients[0].shape[1]
         total = gradients[0].new_zeros(*self.sizes[-1], channels)
         for k in reversed(range(banded, len(self.sizes))):
@@ -158,7 +157,7 @@ class MipChain:
 
 @dataclass(frozen=True)
 class _Strip:
-    """What a band has of one level: its rows, which of the level's reads lie in them, and at which of their texels."""
+    """A band's part of one level: its rows, the level's reads within them, and their texels."""
 
     rows: slice
     which: Int[Tensor, " _"]
@@ -166,7 +165,7 @@ class _Strip:
 
 
 def _halved(level: Float[Tensor, "H W channels"], *, rounded: bool) -> Float[Tensor, "h w channels"]:
-    """The next mip level: columns are averaged, then rows, two by two (an odd side: three by three that overlap)."""
+    """The next mip level: means of columns, then rows, in pairs (overlapping triples for odd sides)."""
     for axis in (1, 0):
         if level.shape[axis] > 1:
             windows = _windows(level, axis)
@@ -185,7 +184,7 @@ def round_level_(level: Float[Tensor, "*texels channels"]) -> None:
 
 
 def _windows(level: Float[Tensor, "H W channels"], axis: int) -> list[Tensor]:
-    """The first, the second (and if their number is odd the third) of the texels that become one, along ``axis``."""
+    """The first, second and (for odd sides) third texels of each mean along ``axis``."""
     side = level.shape[axis]
     steps = [slice(k, k + side // 2 * 2 - 1, 2) for k in range(2 + side % 2)]
     return [level[step] if axis == 0 else level[:, step] for step in steps]
@@ -194,7 +193,7 @@ def _windows(level: Float[Tensor, "H W channels"], axis: int) -> list[Tensor]:
 def _doubled(
     total: Float[Tensor, "h w channels"], size: tuple[int, int], *, out: Tensor | None = None
 ) -> Float[Tensor, "H W channels"]:
-    """The transpose of averaging a level of ``size`` (H, W), a new tensor or (both sides even) in ``out``."""
+    """The transpose of averaging a level of ``size`` (H, W), in a new tensor or, for even sides, in ``out``."""
     if size[0] % 2 or size[1] % 2:
         return _shared(_shared(total, size[1], 1), size[0], 0)
     quarter = total / 4
@@ -206,7 +205,7 @@ def _doubled(
 
 
 def _shared(total: Float[Tensor, "h w channels"], side: int, axis: int) -> Tensor:
-    """The gradient of each texel shared by the two (or three) of which it is the average, ``side`` along ``axis``."""
+    """Distribute the gradient of each mean to its two or three texels, ``side`` of them along ``axis``."""
     if side == 1:
         return total.clone()
     if side % 2 == 0:

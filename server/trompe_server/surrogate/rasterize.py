@@ -1,21 +1,22 @@
-"""Which triangle does each sub-sample of each pixel see, and where on it? Computed once per view, never again.
+"""Rasterise each view once: the visible triangle of each sub-sample of each pixel, and the position on it.
 
 Triangles are rasterised in homogeneous coordinates (Olano and Greer, 1997): the perspective-correct barycentrics
-divided by depth are *linear* functions of the pixel position, so no clipping is needed, a camera may stand inside the
-object, and UVs and their screen-space derivatives are exact anywhere on (and beyond) a triangle.
+divided by depth are *linear* functions of the pixel position. No clipping is needed, the camera may be inside the
+object, and UVs and their screen-space derivatives are exact on and beyond a triangle.
 """
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera
-from trompe_shared.object3d import Object3D
+from trompe_shared.object3d import Material, Object3D
 from trompe_shared.opacity import opacity_of
 
 __all__ = [
@@ -24,7 +25,9 @@ __all__ = [
     "MSAA4_MIRRORED",
     "Drawn",
     "Mesh",
+    "Opacity",
     "Planes",
+    "Samples",
     "Visibility",
     "chunks",
     "covered",
@@ -34,31 +37,42 @@ __all__ = [
 ]
 
 CENTRE = ((0.5, 0.5),)
-"""One sample in the middle of a pixel."""
+"""One sample at the centre of a pixel."""
 
 MSAA4 = ((0.375, 0.125), (0.875, 0.375), (0.125, 0.625), (0.625, 0.875))
 """The standard sample positions of 4x MSAA (x right, y down, in pixels), common to Direct3D, Vulkan and OpenGL drivers.
 """
 
 MSAA4_MIRRORED = tuple((x, 1 - y) for x, y in MSAA4)
-"""The same for renderers that count rows from the bottom (OpenGL): the pattern in the image is upside down."""
+"""The same for renderers with rows from the bottom (OpenGL): the pattern is upside down."""
 
 NEAR = 1e-3
-"""Nothing nearer to the camera than this is seen, metres."""
+"""Distance of the near plane, metres, for all but tiny objects."""
 
 FACES_AT_ONCE = 2**14
-"""Triangles that are set up at once: what that takes stays in the processor's cache."""
+"""Triangles set up at once, within the processor's cache."""
 
 MAX_CANDIDATES = 2_000_000
-"""Pixel-triangle pairs that are tested at once: bounds the memory of the rasteriser (about 200 bytes each)."""
+"""Pixel-triangle pairs tested at once; bounds the rasteriser's memory (about 200 bytes each)."""
 
 TIE = 2**6 - 1
-"""Last bits of 1/depth in which triangles may differ and count as equally near: those of one plane, whose depths differ
-by rounding alone. That is 3 to 6 micrometres at half a metre, which depth buffers do not tell apart either.
+"""Last bits of 1/depth to ignore: triangles in one plane differ in them by rounding. At half a metre that is 3 to 6
+micrometres, below the resolution of depth buffers, too.
 """
 
 MARGIN = 1
-"""Pixels around the image where triangles are kept, for samples that lie up to a pixel outside of theirs."""
+"""Pixels around the image with triangles, for samples up to a pixel outside of their own."""
+
+LAYERS = 8
+"""Most blended triangles in front of each other at one sample; the rest behind them is ignored."""
+
+
+@dataclass(frozen=True)
+class Opacity:
+    """Alpha in [0, 1] of faces. blended: over what lies behind, not alpha-tested."""
+
+    alpha: Float[Tensor, "H W"]
+    blended: bool
 
 
 @dataclass(frozen=True)
@@ -66,7 +80,7 @@ class Mesh:
     """All triangles of an object.
 
     positions: metres. uvs: v = 0 is the bottom row. normals: unit length. texture: index into ``textures``, the albedo
-    file names. opacities: the alpha of those textures that cut something out, in [0, 1], by their index.
+    file names. opacity: index into ``opacities``, -1 for an opaque face.
     """
 
     positions: Float[Tensor, "faces 3 3"]
@@ -74,60 +88,89 @@ class Mesh:
     normals: Float[Tensor, "faces 3 3"]
     texture: Int[Tensor, " faces"]
     textures: tuple[str, ...]
-    opacities: Mapping[int, Float[Tensor, "H W"]] = field(default_factory=dict)
+    opacity: Int[Tensor, " faces"]
+    opacities: tuple[Opacity, ...] = ()
+
+    @cached_property
+    def extent(self) -> float:
+        """Diagonal of the bounding box, metres."""
+        corners = self.positions.reshape(-1, 3)
+        return float((corners.amax(0) - corners.amin(0)).norm()) if len(corners) else 0.0
 
 
 def mesh_of(obj: Object3D, *, device: torch.device | str = "cpu") -> Mesh:
     """The triangles of ``obj``, in the order of its parts."""
     names = tuple(sorted(obj.textures))
-    gathered: dict[str, list[Tensor]] = {"positions": [], "uvs": [], "normals": [], "texture": []}
+    gathered: dict[str, list[Tensor]] = {"positions": [], "uvs": [], "normals": [], "texture": [], "opacity": []}
+    looks = {(look.albedo, look.opacity): look for look in obj.materials.values()}
+    opacities = {key: _opacity(look, obj.files[look.albedo], device) for key, look in looks.items()}
+    seen_through = [key for key, opacity in opacities.items() if opacity is not None]
     for part in obj.parts:
         faces = torch.from_numpy(part.faces).long()
         gathered["positions"].append(torch.from_numpy(part.vertices)[faces])
         gathered["uvs"].append(torch.from_numpy(part.uvs)[faces])
         gathered["normals"].append(torch.from_numpy(part.normals)[faces])
         gathered["texture"].append(torch.full((len(faces),), names.index(obj.albedo_of(part)), device="cpu"))
-    found = {number: opacity_of(obj.files[name]) for number, name in enumerate(names)}
-    opacities = {k: torch.from_numpy(alpha).to(device) / 255 for k, alpha in found.items() if alpha is not None}
+        look = obj.materials[part.material]
+        key = look.albedo, look.opacity
+        number = seen_through.index(key) if key in seen_through else -1
+        gathered["opacity"].append(torch.full((len(faces),), number, device="cpu"))
     arrays = {key: torch.cat(value).to(device) for key, value in gathered.items()}
-    return Mesh(**arrays, textures=names, opacities=opacities)
+    return Mesh(**arrays, textures=names, opacities=tuple(each for each in opacities.values() if each is not None))
+
+
+def _opacity(material: Material, albedo: bytes, device: torch.device | str) -> Opacity | None:
+    """The opacity of a material with the file ``albedo``; ``None`` if it is opaque."""
+    blended = material.opacity is not None
+    found = opacity_of(albedo, blended=blended)
+    if found is None and not blended:
+        return None
+    alpha = torch.ones(1, 1) if found is None else torch.from_numpy(found) / 255
+    return Opacity(alpha.to(device) * (1.0 if material.opacity is None else material.opacity), blended)
 
 
 @dataclass(frozen=True)
 class Planes:
-    """The triangles that can be seen in one view, as linear functions ``a x + b y + c`` of the pixel position.
+    """The potentially visible triangles of one view, as linear functions ``a x + b y + c`` of the pixel position.
 
     face: index into the mesh. edges: barycentric of each corner over depth. box: first and last pixel column and row.
+    near: distance of the near plane, metres.
     """
 
     face: Int[Tensor, " n"]
     edges: Float[Tensor, "n 3 3"]  # (triangle, coefficient a/b/c, corner)
     box: Int[Tensor, "n 4"]  # x0, y0, x1, y1, inclusive
+    near: float = NEAR
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """What the sub-samples of one view see: ``planes`` row per (pixel, sample), -1 where they see nothing.
+    """Visible triangles of one view: the row of ``planes`` for each (pixel, layer and sample), -1 for none.
 
-    Only pixels with a sample that sees something are kept; ``pixel`` is row * W + column.
+    pixel: row * W + column of the pixels with a visible triangle. row: the samples of the blended layers, the front one
+    first, then those of the opaque triangles.
     """
 
     planes: Planes
     pixel: Int[Tensor, " p"]
-    row: Int[Tensor, "p samples"]
+    row: Int[Tensor, "p layers_samples"]
 
 
 def project(mesh: Mesh, camera: Camera, size: tuple[int, int], *, cull: bool) -> Planes:
     """Set up the triangles of ``mesh`` for ``camera`` and an image of ``size`` (H, W).
 
-    With ``cull`` triangles seen from behind (clockwise) are dropped. Degenerate ones always are.
+    cull: drop triangles seen from behind (clockwise). Degenerate triangles are always dropped.
     """
-    parts = [_set_up(faces, camera, size, cull=cull) for faces in torch.split(mesh.positions, FACES_AT_ONCE)]
-    kept = [part.face + k * FACES_AT_ONCE for k, part in enumerate(parts)]
-    return Planes(torch.cat(kept), torch.cat([part.edges for part in parts]), torch.cat([part.box for part in parts]))
+    near = min(NEAR, mesh.extent / 10) or NEAR
+    groups = torch.split(mesh.positions, FACES_AT_ONCE)
+    parts = [_set_up(faces, camera, size, near=near, cull=cull) for faces in groups]
+    kept = torch.cat([part.face + k * FACES_AT_ONCE for k, part in enumerate(parts)])
+    return Planes(kept, torch.cat([part.edges for part in parts]), torch.cat([part.box for part in parts]), near)
 
 
-def _set_up(positions: Float[Tensor, "faces 3 3"], camera: Camera, size: tuple[int, int], *, cull: bool) -> Planes:
+def _set_up(
+    positions: Float[Tensor, "faces 3 3"], camera: Camera, size: tuple[int, int], *, near: float, cull: bool
+) -> Planes:
     height, width = size
     matrix = torch.from_numpy(camera.world_to_camera()).to(positions.device)
     eye = positions.double() @ matrix[:3, :3].T + matrix[:3, 3]
@@ -139,7 +182,7 @@ def _set_up(positions: Float[Tensor, "faces 3 3"], camera: Camera, size: tuple[i
     first, second, third = corners.unbind(1)
     cofactors = torch.stack([second.cross(third, -1), third.cross(first, -1), first.cross(second, -1)], -1)
     determinant = (first * cofactors[..., 0]).sum(-1)
-    box, touches = _pixel_box(corners, size)
+    box, touches = _pixel_box(corners, size, near)
     scale = corners.abs().amax((1, 2)) ** 3
     facing = -determinant if cull else determinant.abs()
     keep = (touches & (facing > 1e-14 * scale) & torch.isfinite(determinant)).nonzero()[:, 0]
@@ -148,20 +191,22 @@ def _set_up(positions: Float[Tensor, "faces 3 3"], camera: Camera, size: tuple[i
 
 
 def _pixel_box(
-    corners: Float[Tensor, "faces 3 3"], size: tuple[int, int]
+    corners: Float[Tensor, "faces 3 3"], size: tuple[int, int], near: float
 ) -> tuple[Int[Tensor, "faces 4"], Bool[Tensor, " faces"]]:
-    """Pixels of the image and its margin that each triangle can touch, and whether there are any; all of them where it
-    reaches behind the camera."""
+    """(Bounding box of each triangle within image and margin, whether it is not empty).
+
+    For triangles that reach behind the camera the box is the whole image.
+    """
     height, width = size
     depth = corners[..., 2]
-    points = corners[..., :2] / depth.clamp(min=NEAR)[..., None]
+    points = corners[..., :2] / depth.clamp(min=near)[..., None]
     limit = torch.tensor([width, height], device=corners.device)
     low, high = points.amin(1), points.amax(1)
-    behind = (depth < NEAR).any(1)
+    behind = (depth < near).any(1)
     first, last = torch.full_like(low, -MARGIN), limit - 1.0 + MARGIN
     low = torch.where(behind[:, None], first, low.maximum(first)).floor()
     high = torch.where(behind[:, None], last, high.minimum(last)).floor()
-    touches = (high >= low).all(1) & (depth >= NEAR).any(1)
+    touches = (high >= low).all(1) & (depth >= near).any(1)
     return torch.cat([low, high], 1).nan_to_num(0.0).long(), touches
 
 
@@ -170,27 +215,72 @@ Drawn = Callable[[Int[Tensor, " n"], Int[Tensor, " n"], Int[Tensor, " n"]], Bool
 """Whether triangles (rows of the planes) are drawn at the pixels (x, y)."""
 
 
-def rasterize(planes: Planes, size: tuple[int, int], samples: Samples, *, drawn: Drawn | None = None) -> Visibility:
-    """The nearest triangle at each of ``samples`` (x, y in pixels) of every pixel. The first one drawn wins ties.
+def rasterize(
+    planes: Planes,
+    size: tuple[int, int],
+    samples: Samples,
+    *,
+    drawn: Drawn | None = None,
+    blended: Bool[Tensor, " n"] | None = None,
+) -> Visibility:
+    """The nearest triangle at each of ``samples`` (x, y in pixels) of every pixel; the first triangle wins ties.
 
-    Triangles are left out of the pixels where they are not ``drawn``. Samples may lie up to a pixel outside of theirs.
+    drawn: test for triangles with holes. blended: the triangles that do not hide others; the nearest ``LAYERS`` of them
+    in front of the nearest other one are found. Samples may lie up to a pixel outside of their own.
     """
-    height, width = size
     planes = replace(planes, box=_candidates(planes.box, size, samples))
-    nearest = torch.full((height * width * len(samples),), -1, dtype=torch.int64, device=planes.face.device)
-    extent = (planes.box[:, 2:] - planes.box[:, :2] + 1).clamp(min=0)
-    counts = extent[:, 0] * extent[:, 1]
-    for start, stop in chunks(counts):
-        _draw(planes, start, stop, counts, width, samples, drawn, nearest)
-    nearest = nearest.view(-1, len(samples))
+    if blended is None:
+        nearest = _nearest(planes, size, samples, drawn)
+    else:
+        nearest = torch.cat(_peeled(planes, size, samples, drawn, blended), 1)
     pixel = (nearest >= 0).any(1).nonzero()[:, 0]
     keys = nearest[pixel]
     row = torch.where(keys >= 0, 0xFFFFFFFF - (keys & 0xFFFFFFFF), -1)
     return Visibility(planes, pixel, row)
 
 
+def _peeled(
+    planes: Planes, size: tuple[int, int], samples: Samples, drawn: Drawn | None, blended: Bool[Tensor, " n"]
+) -> list[Int[Tensor, "pixels samples"]]:
+    """Keys of the blended layers, front first, and of the opaque triangles, by depth peeling.
+
+    A layer lies clearly behind the one before, by more than ``TIE``: neighbours that meet at a sample count once.
+    """
+    nothing = torch.tensor([0, 0, -1, -1], device=planes.box.device)
+    opaque, through = (
+        replace(planes, box=torch.where(kept[:, None], planes.box, nothing)) for kept in (~blended, blended)
+    )
+    solid = _nearest(opaque, size, samples, drawn)
+    layers: list[Tensor] = []
+    front = torch.full_like(solid, torch.iinfo(torch.int64).max)
+    while len(layers) < LAYERS:
+        between = ((solid + (2 * TIE << 32)).flatten(), (front - (2 * TIE << 32)).flatten())
+        front = _nearest(through, size, samples, drawn, between)
+        if not (front >= 0).any():
+            break
+        layers.append(front)
+    return [*layers, solid]
+
+
+Between = tuple[Int[Tensor, " pixels_samples"], Int[Tensor, " pixels_samples"]]
+"""Keys of ``_draw`` that limit the depth at each sample: the farthest and the nearest, both excluded."""
+
+
+def _nearest(
+    planes: Planes, size: tuple[int, int], samples: Samples, drawn: Drawn | None, between: Between | None = None
+) -> Int[Tensor, "pixels samples"]:
+    """Key of the nearest triangle at each sample, see ``_draw``; -1 for none."""
+    height, width = size
+    nearest = torch.full((height * width * len(samples),), -1, dtype=torch.int64, device=planes.face.device)
+    extent = (planes.box[:, 2:] - planes.box[:, :2] + 1).clamp(min=0)
+    counts = extent[:, 0] * extent[:, 1]
+    for start, stop in chunks(counts):
+        _draw(planes, start, stop, counts, width, samples, drawn, nearest, between)
+    return nearest.view(-1, len(samples))
+
+
 def _candidates(box: Int[Tensor, "n 4"], size: tuple[int, int], samples: Samples) -> Int[Tensor, "n 4"]:
-    """The pixels of the image with a sample in ``box``, as a box (empty where its end lies before its beginning)."""
+    """Box of the image's pixels with a sample in ``box``; empty if it ends before it begins."""
     height, width = size
     most, least = ([math.floor(choose(axis)) for axis in zip(*samples, strict=True)] for choose in (max, min))
     moved = box - torch.tensor([*most, *least], device=box.device)
@@ -199,7 +289,7 @@ def _candidates(box: Int[Tensor, "n 4"], size: tuple[int, int], samples: Samples
 
 
 def chunks(counts: Int[Tensor, " n"]) -> list[tuple[int, int]]:
-    """Runs of things whose candidates fit into ``MAX_CANDIDATES`` (a single larger one is a run of its own)."""
+    """Runs of items with at most ``MAX_CANDIDATES`` candidates together; a larger item is a run of its own."""
     if not len(counts):
         return []
     total = counts.cumsum(0)
@@ -220,10 +310,11 @@ def _draw(
     samples: Samples,
     drawn: Drawn | None,
     nearest: Int[Tensor, " pixels_samples"],
+    between: Between | None,
 ) -> None:
-    """Test triangles ``start:stop`` against the pixels of their boxes and keep the nearest per sample, in ``nearest``.
+    """Test triangles ``start:stop`` against the pixels of their boxes; keep the nearest per sample in ``nearest``.
 
-    A key is the float bits of 1/depth (monotone, as it is positive), less those that ``TIE`` has, above the inverted
+    A key is the float bits of 1/depth (monotone for positive values) without those of ``TIE``, above the inverted
     triangle number.
     """
     row = torch.arange(start, stop, device=counts.device).repeat_interleave(counts[start:stop])
@@ -241,20 +332,23 @@ def _draw(
     for index, (sx, sy) in enumerate(samples):
         value = at_corner + edges[:, 0] * sx + edges[:, 1] * sy
         inverse_depth = value.sum(1)
-        seen = _inside(value, inverse_depth).nonzero()[:, 0]
+        seen = _inside(value, inverse_depth, planes.near).nonzero()[:, 0]
         bits = inverse_depth[seen].contiguous().view(torch.int32).long() & ~TIE
-        keys = (bits << 32) | (0xFFFFFFFF - row[seen])
-        nearest.scatter_reduce_(0, base[seen] + index, keys, "amax")
+        keys, place = (bits << 32) | (0xFFFFFFFF - row[seen]), base[seen] + index
+        if between is not None:
+            inside = (keys > between[0][place]) & (keys < between[1][place])
+            keys, place = keys[inside], place[inside]
+        nearest.scatter_reduce_(0, place, keys, "amax")
 
 
 def covered(
     planes: Planes, row: Int[Tensor, " n"], x: Int[Tensor, " n"], y: Int[Tensor, " n"], samples: Samples
 ) -> Bool[Tensor, "n samples"]:
-    """Which samples of the pixels (x, y) triangles cover."""
+    """Whether triangles cover each sample of the pixels (x, y)."""
     edges = planes.edges[row]
     values = [edges[:, 0] * (x + sx)[:, None] + edges[:, 1] * (y + sy)[:, None] + edges[:, 2] for sx, sy in samples]
-    return torch.stack([_inside(value, value.sum(1)) for value in values], 1)
+    return torch.stack([_inside(value, value.sum(1), planes.near) for value in values], 1)
 
 
-def _inside(over_depth: Float[Tensor, "n 3"], inverse_depth: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    return (over_depth >= 0).all(1) & (inverse_depth > 0) & (inverse_depth < 1 / NEAR)
+def _inside(over_depth: Float[Tensor, "n 3"], inverse_depth: Float[Tensor, " n"], near: float) -> Bool[Tensor, " n"]:
+    return (over_depth >= 0).all(1) & (inverse_depth > 0) & (inverse_depth < 1 / near)

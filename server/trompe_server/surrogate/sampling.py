@@ -1,72 +1,85 @@
-"""What a renderer reads from a texture for a pixel, as one sparse linear operator.
+"""Texture sampling of a renderer as one sparse linear operator.
 
-All mip levels of all textures lie in one flat array of texels. For every pixel the operator holds which texels it reads
-and with which weights (trilinear, per fragment, fragments weighted by the samples they cover), so that some views of a
-repainted object are a single gather, and the gradient its transpose.
+All mip levels of all textures form one flat array of texels. The operator maps it to pixels: trilinear weights for each
+fragment, fragments weighted by the samples they cover. Rendering a repainted object is one gather, its gradient the
+transpose.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Final, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from trompe_server.surrogate.pyramid import MipLayout, mip_chains, mip_layout, read_texels
+from trompe_server.surrogate.pixel_filter import KernelName, PixelFilter
+from trompe_server.surrogate.pyramid import MipLayout
 from trompe_server.surrogate.rasterize import (
     CENTRE,
     MSAA4,
     MSAA4_MIRRORED,
     Mesh,
     Planes,
+    Samples,
     Visibility,
     chunks,
-    covered,
 )
-from trompe_shared.opacity import CUTOFF
+from trompe_server.surrogate.shading import Encoding
 
 __all__ = [
-    "AlphaTest",
+    "SUBPIXELS",
+    "FilteredGather",
     "Fragments",
     "Gather",
     "SamplingModel",
     "Taps",
     "fragments_of",
+    "reads_of",
+    "shading_point",
     "taps_of",
+    "texture_coordinates",
 ]
+
+
+SUBPIXELS: Final = 4
+"""Sub-pixels along a pixel's side under a reconstruction filter."""
 
 
 @dataclass(frozen=True)
 class SamplingModel:
-    """A hypothesis on how a renderer samples textures and encodes images. All members are common practice of engines.
+    """A hypothesis on a renderer's texture sampling, shading and image encoding, from the common practices of engines.
 
-    samples: where a pixel looks: at the positions of 4x MSAA (rows counted from the top or from the bottom), or at its
-        centre alone.
-    shade_at: where the texture coordinates of a fragment are taken: at the pixel's centre (even if the fragment does
-        not cover it: the default of OpenGL and Direct3D) or at the mean of the samples it covers (centroid sampling).
-    lod: the level of detail is log2 of the footprint's longer axis, or of the root of its area.
-    filtered: mip levels and texels are averaged on encoded (sRGB) values or in linear light.
-    mips: encoded mip levels are exact averages, or rounded to 8 bits after averaging columns and again after rows.
-    encoding: linear light becomes an image by the sRGB curve or by the power 1 / 2.2.
+    samples: sample positions: 4x MSAA (rows counted from the top or from the bottom), the pixel's centre, or
+        ``SUBPIXELS`` x ``SUBPIXELS`` sub-pixels averaged under ``kernel`` (path tracers).
+    kernel: reconstruction filter of sub-pixels: its name, and its width in pixels (``pixel_filter``).
+    shade_at: position of a fragment's texture coordinates: the pixel's centre (even if not covered: the default of
+        OpenGL and Direct3D) or the mean of the covered samples (centroid sampling).
+    lod: level of detail: log2 of the footprint's longer axis, or of the root of its area.
+    filtered: averaging of mip levels and texels on encoded (sRGB) values or in linear light.
+    mips: exact encoded mip levels, or rounded to 8 bits after averaging columns and again after rows.
+    encoding: encoding of linear light in the image: the sRGB curve, the power 1 / 2.2, or a measured ``ToneMap``.
+    slope: light per albedo: from the grey probes, or with the chord to the unpainted object (``Chord``).
+    edges: averaging of covered and uncovered samples of a pixel: of encoded colours, or of light.
     bias: added to the level of detail.
-    cull: triangles seen from behind are invisible.
-    anisotropy: how many times longer than wide a footprint may be that is averaged over; 1 is no more than wide, and
-        then ``lod`` says how wide.
-    elongated: how that is done: by as many trilinear probes along the longer axis as it is times the shorter one, at
-        the level of a probe's share of it (graphics cards), or by a Gaussian over an ellipse of texels (Heckbert, 1989;
+    cull: whether triangles seen from behind are invisible.
+    anisotropy: largest ratio of a footprint's axes for anisotropic filtering; 1 is isotropic, at the level of ``lod``.
+    elongated: kind of anisotropic filtering: trilinear probes along the longer axis, as many as the ratio of the axes,
+        at the level of one probe's length (graphics cards), or a Gaussian over an ellipse of texels (Heckbert, 1989;
         Mesa's software renderers).
-    shift: where the samples and the centre of a pixel lie, added to where they should: x right and y down, in pixels,
-        within [-1, 1].
+    shift: offset of samples and centre within a pixel: x right and y down, in pixels, within [-1, 1].
     """
 
-    samples: Literal["msaa4", "msaa4-mirrored", "centre"] = "msaa4"
+    samples: Literal["msaa4", "msaa4-mirrored", "centre", "grid"] = "msaa4"
+    kernel: tuple[KernelName, float] = ("box", 1.0)
     shade_at: Literal["centre", "centroid"] = "centre"
     lod: Literal["longer", "area"] = "longer"
     filtered: Literal["encoded", "linear"] = "encoded"
     mips: Literal["exact", "rounded"] = "exact"
-    encoding: Literal["srgb", "power"] = "srgb"
+    encoding: Encoding | Literal["measured"] = "srgb"
+    slope: Literal["greys", "chord"] = "greys"
+    edges: Literal["encoded", "linear"] = "encoded"
     bias: float = 0.0
     cull: bool = True
     anisotropy: int = 1
@@ -74,14 +87,19 @@ class SamplingModel:
     shift: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def positions(self) -> tuple[tuple[float, float], ...]:
-        """Sample positions in a pixel, x right and y down. Their mean is where the pixel is shaded."""
-        right, down = self.shift
-        table = {"msaa4": MSAA4, "msaa4-mirrored": MSAA4_MIRRORED, "centre": CENTRE}
-        return tuple((x + right, y + down) for x, y in table[self.samples])
+    def positions(self) -> Samples:
+        """Sample positions in a pixel or sub-pixel, x right and y down; their mean is the shading point."""
+        right, down = (by * self.subdivision for by in self.shift)
+        table = {"msaa4": MSAA4, "msaa4-mirrored": MSAA4_MIRRORED}
+        return tuple((x + right, y + down) for x, y in table.get(self.samples, CENTRE))
+
+    @property
+    def subdivision(self) -> int:
+        """Sub-pixels along a pixel's side."""
+        return SUBPIXELS if self.samples == "grid" else 1
 
     def but(self, **changes: object) -> "SamplingModel":
-        """This hypothesis with some members changed."""
+        """The hypothesis with some members changed."""
         return replace(self, **changes)  # type: ignore[arg-type]
 
 
@@ -89,10 +107,10 @@ class SamplingModel:
 class Fragments:
     """The (pixel, triangle) pairs of one view.
 
-    entry: which pixel of the visibility each belongs to, ascending. weight: share of the pixel's samples, so that the
-    weights of a pixel sum to its coverage. uv: texture coordinates. duv: their derivatives, [..., 0] per pixel to the
-    right, [..., 1] per pixel down.
-    barycentric: weights of the triangle's corners (outside [0, 1] where the triangle does not cover the shading point).
+    entry: pixel of the visibility, ascending. weight: share of the pixel's samples, times alpha and the transmittance
+    of blended layers in front; the weights of a pixel sum to its coverage. uv: texture coordinates. duv: their
+    derivatives, [..., 0] per pixel to the right, [..., 1] per pixel down.
+    barycentric: weights of the triangle's corners (outside [0, 1] if the shading point is not covered).
     """
 
     face: Int[Tensor, " n"]
@@ -104,37 +122,60 @@ class Fragments:
 
 
 def fragments_of(
-    visibility: Visibility, mesh: Mesh, width: int, *, samples: tuple[tuple[float, float], ...], shade_at: str
+    visibility: Visibility,
+    mesh: Mesh,
+    width: int,
+    *,
+    samples: Samples,
+    shade_at: str,
+    alpha: Callable[[Fragments], Float[Tensor, " n"]] | None = None,
 ) -> Fragments:
-    """The distinct triangles that the samples of each pixel see, with their exact texture coordinates."""
-    rows, n_samples = visibility.row, visibility.row.shape[1]
+    """The distinct triangles visible in each pixel, with exact texture coordinates.
+
+    alpha: of each fragment, in [0, 1]; ``None``: all are opaque, the visibility has one layer.
+    """
+    rows, n_slots = visibility.row, visibility.row.shape[1]
     same = rows[:, :, None] == rows[:, None, :]
-    earlier = torch.ones(n_samples, n_samples, device=rows.device).tril(-1).bool()
+    earlier = torch.ones(n_slots, n_slots, device=rows.device).tril(-1).bool()
     first = (rows >= 0) & ~(same & earlier).any(2)
-    entry, sample = first.nonzero(as_tuple=True)
-    share = same[entry, sample].float()
-    row = rows[entry, sample]
-    offset = _shading_point(share, samples, shade_at)
+    entry, slot = first.nonzero(as_tuple=True)
+    share = same[entry, slot].float()
+    row = rows[entry, slot]
+    offset = shading_point(share, samples * (n_slots // len(samples)), shade_at)
     pixel = visibility.pixel[entry]
     point = torch.stack([pixel % width, pixel // width], 1) + offset
-    uv, duv, barycentric = _texture_coordinates(visibility.planes, mesh, row, point)
-    return Fragments(visibility.planes.face[row], entry, share.sum(1) / n_samples, uv, duv, barycentric)
+    uv, duv, barycentric = texture_coordinates(visibility.planes, mesh, row, point)
+    found = Fragments(visibility.planes.face[row], entry, share.sum(1) / len(samples), uv, duv, barycentric)
+    if alpha is None:
+        return found
+    seen = _composited(entry, share, alpha(found), (len(rows), n_slots // len(samples), len(samples)))
+    return replace(found, weight=seen)
 
 
-def _shading_point(
-    share: Float[Tensor, "n samples"], samples: tuple[tuple[float, float], ...], shade_at: str
-) -> Float[Tensor, "_ 2"]:
-    """Where in the pixel a fragment that covers the samples with a ``share`` of 1 (not 0) reads its texture."""
+def _composited(
+    entry: Int[Tensor, " n"],
+    share: Float[Tensor, "n slots"],
+    alpha: Float[Tensor, " n"],
+    shape: tuple[int, int, int],
+) -> Float[Tensor, " n"]:
+    """Weights of fragments composited over each other; ``shape``: pixels, layers (front first), samples."""
+    opacity = share.new_zeros(shape[0], share.shape[1]).index_add_(0, entry, share * alpha[:, None]).view(shape)
+    clear = torch.cat([torch.ones_like(opacity[:, :1]), (1 - opacity[:, :-1]).cumprod(1)], 1)
+    return (share * (opacity * clear).flatten(1)[entry]).sum(1) / shape[2]
+
+
+def shading_point(share: Float[Tensor, "n samples"], samples: Samples, shade_at: str) -> Float[Tensor, "_ 2"]:
+    """Shading point, within the pixel, of fragments that cover the samples with ``share`` 1."""
     positions = torch.tensor(samples, device=share.device)
     if shade_at == "centre":
         return positions.mean(0, keepdim=True)
     return (share @ positions) / share.sum(1, keepdim=True)
 
 
-def _texture_coordinates(
+def texture_coordinates(
     planes: Planes, mesh: Mesh, row: Int[Tensor, " n"], point: Float[Tensor, "n 2"]
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, "n 3"]]:
-    """UV, its derivatives by the pixel position, and the barycentrics, at ``point`` of triangle ``row``."""
+    """UV, its derivatives by the pixel position, and barycentrics at ``point`` of triangle ``row``."""
     edges = planes.edges[row]  # (n, abc, corner)
     over_depth = edges[:, 0] * point[:, :1] + edges[:, 1] * point[:, 1:] + edges[:, 2]
     inverse_depth = over_depth.sum(1, keepdim=True)
@@ -147,7 +188,7 @@ def _texture_coordinates(
 
 @dataclass(frozen=True)
 class Taps:
-    """Which pixel (``entry``, ascending) reads which texel with which weight, int32 and float32; no pair twice."""
+    """Reads: pixel (``entry``, ascending), texel and weight (int32, int32, float32), without duplicate pairs."""
 
     entry: Int[Tensor, " taps"]
     index: Int[Tensor, " taps"]
@@ -167,7 +208,7 @@ class Gather:
 
     @classmethod
     def of(cls, taps: Taps, n_pixels: int, n_texels: int) -> "Gather":
-        """Order the taps by texel too."""
+        """Build both directions from the taps."""
         by_texel = taps.index.argsort(stable=True)
         return cls(
             taps.index,
@@ -179,30 +220,56 @@ class Gather:
         )
 
     def forward(self, texels: Float[Tensor, "texels 3"]) -> Float[Tensor, "pixels 3"]:
-        """Weighted sums of the texels that each pixel reads."""
+        """Weighted sums of the texels of each pixel."""
         return embedding_bag(self.index, texels, self.offsets, mode="sum", per_sample_weights=self.weight)
 
     def transpose(self, pixels: Float[Tensor, "pixels 3"]) -> Float[Tensor, "texels 3"]:
-        """What each texel gets from the ``pixels`` that read it: the transpose of ``forward``."""
+        """Weighted sums of the ``pixels`` of each texel: the transpose of ``forward``."""
         offsets, weight = self.transposed_offsets, self.transposed_weight
         return embedding_bag(self.pixel, pixels, offsets, mode="sum", per_sample_weights=weight)
 
     @property
     def nbytes(self) -> int:
-        """Memory it takes."""
+        """Memory in bytes."""
         return sum(t.nbytes for t in vars(self).values())
 
 
+@dataclass(frozen=True)
+class FilteredGather:
+    """A ``Gather`` of sub-pixels under a reconstruction filter; the interface of ``Gather``.
+
+    coverage: of each sub-pixel. share: 1 / coverage of each pixel: the weights of a pixel sum to one.
+    """
+
+    inner: Gather
+    filter: PixelFilter
+    coverage: Float[Tensor, "sub_pixels 1"]
+    share: Float[Tensor, "pixels 1"]
+
+    def forward(self, texels: Float[Tensor, "texels 3"]) -> Float[Tensor, "pixels 3"]:
+        """See ``Gather``."""
+        return self.filter.forward(self.inner.forward(texels).mul_(self.coverage)).mul_(self.share)
+
+    def transpose(self, pixels: Float[Tensor, "pixels 3"]) -> Float[Tensor, "texels 3"]:
+        """See ``Gather``."""
+        return self.inner.transpose(self.filter.transpose(pixels * self.share).mul_(self.coverage))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes."""
+        return self.inner.nbytes + self.filter.nbytes + self.coverage.nbytes + self.share.nbytes
+
+
 def _starts(keys: Int[Tensor, " taps"], n_keys: int) -> Int[Tensor, " keys"]:
-    """Where each key's run would begin if the taps were sorted by key."""
+    """Start of each key's run among taps sorted by key."""
     counts = torch.bincount(keys, minlength=n_keys)
     return (counts.cumsum(0) - counts).int()
 
 
 def taps_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout, model: SamplingModel) -> Taps:
-    """What the pixels of one view read under the hypothesis ``model``.
+    """The reads of one view's pixels under the hypothesis ``model``.
 
-    Weights of a pixel sum to one: the share of it that the object covers belongs to the colour model.
+    The weights of a pixel sum to one; coverage belongs to the colour model.
     """
     entries, indices, weights = [], [], []
     share = (
@@ -214,7 +281,7 @@ def taps_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout, 
     for texture, (sizes, starts) in enumerate(zip(layout.sizes, layout.starts, strict=True)):
         mine = (mesh.texture[fragments.face] == texture).nonzero()[:, 0]
         uv, duv, entry, part = fragments.uv[mine], fragments.duv[mine], fragments.entry[mine], share[mine]
-        for used, index, weight, blend in _reads(uv, duv, sizes, starts, model):
+        for used, index, weight, blend in reads_of(uv, duv, sizes, starts, model):
             entries.append(entry[used, None].expand_as(index).reshape(-1))
             indices.append(index.reshape(-1))
             weights.append((weight * (blend * part[used])[:, None]).reshape(-1))
@@ -223,14 +290,13 @@ def taps_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout, 
 
 Sizes = tuple[tuple[int, int], ...]
 Reads = Iterator[tuple[Int[Tensor, " m"], Int[Tensor, "m k"], Float[Tensor, "m k"], Float[Tensor, " m"]]]
-"""Portions of what is read: who reads, flat indices and weights there, and the portion's own weight for each who reads.
-"""
+"""Portions of reads: fragments, flat indices, weights of the texels, and weight of the portion for each fragment."""
 
 
-def _reads(
+def reads_of(
     uv: Float[Tensor, "n 2"], duv: Float[Tensor, "n 2 2"], sizes: Sizes, starts: tuple[int, ...], model: SamplingModel
 ) -> Reads:
-    """What fragments read of a texture whose mip levels have ``sizes`` and begin at ``starts``."""
+    """The reads of fragments from a texture with mip levels of ``sizes`` at ``starts``."""
     if model.anisotropy == 1:
         return _trilinear(uv, level_of_detail(duv, sizes[0], model), sizes, starts)
     texels = (duv * torch.tensor([sizes[0][1], sizes[0][0]], device=duv.device)[:, None]).nan_to_num(0.0)
@@ -240,13 +306,13 @@ def _reads(
 
 
 def _axes(texels: Float[Tensor, "n 2 2"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Length of the longer and of the shorter axis of footprints."""
+    """Lengths of the longer and the shorter axis of footprints."""
     extent = texels.norm(dim=1).clamp(min=1e-8)
     return extent.amax(1), extent.amin(1)
 
 
 ROUND = 1e-3
-"""A footprint this little longer than wide is as long as wide."""
+"""Relative difference of the axes below which a footprint counts as isotropic."""
 
 
 def _probes(
@@ -257,8 +323,8 @@ def _probes(
     starts: tuple[int, ...],
     model: SamplingModel,
 ) -> Reads:
-    """Trilinear probes side by side along the longer axis (EXT_texture_filter_anisotropic); ``texels`` is ``duv`` in
-    texels of level 0."""
+    """Trilinear probes along the longer axis (EXT_texture_filter_anisotropic); ``texels``: ``duv`` in texels of level
+    0."""
     longer, shorter = _axes(texels)
     probes = (longer / shorter - ROUND).ceil().clamp(1, model.anisotropy)
     axis = duv.nan_to_num(0.0).gather(2, texels.norm(dim=1).argmax(1)[:, None, None].expand(-1, 2, 1))[..., 0]
@@ -278,14 +344,14 @@ def _ellipses(
     starts: tuple[int, ...],
     model: SamplingModel,
 ) -> Reads:
-    """All texels of one mip level in an ellipse with the footprint's axes, a texel wider, by a Gaussian's weights.
+    """Gaussian-weighted texels of one mip level in the footprint's ellipse, a texel wider.
 
-    The level is that of the shorter axis, but at least that of the longer one's share ``1 / model.anisotropy``.
+    The level is that of the shorter axis, but at least that of the longer one divided by ``model.anisotropy``.
     """
     longer, shorter = _axes(texels)
     level = torch.maximum(shorter, longer / model.anisotropy).log2() + model.bias
     level = level.clamp(0, len(sizes) - 1).floor()
-    scale = torch.minimum(0.5**level, 2 * model.anisotropy / longer)  # no larger where no level is coarse enough
+    scale = torch.minimum(0.5**level, 2 * model.anisotropy / longer)  # bounded if no level is coarse enough
     size, start = (torch.tensor(table, device=uv.device)[level.long()] for table in (sizes, starts))
     u, v = uv.nan_to_num(0.0).remainder(1.0).unbind(1)
     centre = torch.stack([u * size[:, 1], (1 - v) * size[:, 0]], 1) - 0.5
@@ -295,8 +361,7 @@ def _ellipses(
 
 
 def _form(texels: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 3"]:
-    """(a, b, c) of the ellipses ``a x^2 + 2 b x y + c y^2 < a c - b^2`` (x right, y down) that are footprints, a texel
-    wider."""
+    """(a, b, c) of footprints, widened by a texel, as ellipses ``a x^2 + 2 b x y + c y^2 < a c - b^2`` (y down)."""
     across, up = texels.unbind(1)
     return torch.stack([up.square().sum(1) + 1, (across * up).sum(1), across.square().sum(1) + 1], 1)
 
@@ -304,9 +369,9 @@ def _form(texels: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 3"]:
 def _within(
     centre: Float[Tensor, "n 2"], form: Float[Tensor, "n 3"]
 ) -> Iterator[tuple[Int[Tensor, " m"], Int[Tensor, " m"], Int[Tensor, " m"], Float[Tensor, " m"]]]:
-    """Which ellipse (``form`` around ``centre``) holds which texels (x, y), by what weight; those of each sum to one.
+    """(Ellipse, x, y, weight) of all texels in the ellipses ``form`` around ``centre``; weights sum to one per ellipse.
 
-    The weight is exp(-2 r^2), where r is the distance in units of the ellipse's radius there.
+    The weight is exp(-2 r^2) with the distance r in units of the ellipse's radius.
     """
     reach = form[:, [2, 0]].sqrt()
     first = (centre - reach).floor().long()
@@ -325,7 +390,7 @@ def _within(
 
 
 def _trilinear(uv: Float[Tensor, "n 2"], level: Float[Tensor, " n"], sizes: Sizes, starts: tuple[int, ...]) -> Reads:
-    """The finer and the coarser mip level around ``level`` (unclamped)."""
+    """Reads from the finer and the coarser mip level around ``level`` (unclamped)."""
     level = level.clamp(0, len(sizes) - 1)
     lower = level.floor().clamp(max=max(len(sizes) - 2, 0))
     for step in (0, 1):
@@ -366,54 +431,9 @@ def _bilinear(
 def _merged(
     entry: Int[Tensor, " taps"], index: Int[Tensor, " taps"], weight: Float[Tensor, " taps"], n_texels: int
 ) -> Taps:
-    """The taps that count, in order, those of the same pixel and texel in one."""
+    """Sorted taps without negligible weights, equal pairs merged."""
     used = (weight > 1e-6).nonzero()[:, 0]
     pair, order = (entry[used] * n_texels + index[used]).sort(stable=True)
     pair, which = torch.unique_consecutive(pair, return_inverse=True)
     total = torch.zeros(len(pair), device=weight.device).index_add_(0, which, weight[used][order].float())
     return Taps((pair // n_texels).int(), (pair % n_texels).int(), total)
-
-
-@dataclass(frozen=True)
-class AlphaTest:
-    """Alpha-tested textures: a fragment is drawn only where the alpha that it reads is at least ``CUTOFF``.
-
-    layout, alpha: the mip levels of ``mesh.opacities``, in order, as one flat array.
-    """
-
-    mesh: Mesh
-    model: SamplingModel
-    layout: MipLayout
-    alpha: Float[Tensor, " texels"]
-
-    @classmethod
-    def of(cls, mesh: Mesh, model: SamplingModel) -> "AlphaTest | None":
-        """The test of a mesh under a hypothesis; ``None`` where all of it is opaque."""
-        if not mesh.opacities:
-            return None
-        layout = mip_layout([(len(alpha), alpha.shape[1]) for alpha in mesh.opacities.values()])
-        everything = [torch.arange(h * w, device=mesh.texture.device) for sizes in layout.sizes for h, w in sizes]
-        planes = [alpha[..., None] for alpha in mesh.opacities.values()]
-        alpha = read_texels(planes, mip_chains(layout, everything), rounded=model.mips == "rounded")
-        return cls(mesh, model, layout, alpha[:, 0])
-
-    def drawn(
-        self, planes: Planes, row: Int[Tensor, " n"], x: Int[Tensor, " n"], y: Int[Tensor, " n"]
-    ) -> Bool[Tensor, " n"]:
-        """Whether triangles (rows of ``planes``) are drawn at the pixels (x, y)."""
-        texture = self.mesh.texture[planes.face[row]]
-        passed = torch.ones_like(texture, dtype=torch.bool)
-        for number, sizes, starts in zip(self.mesh.opacities, self.layout.sizes, self.layout.starts, strict=True):
-            mine = (texture == number).nonzero()[:, 0]
-            share = covered(planes, row[mine], x[mine], y[mine], self.model.positions)
-            passed[mine] = False
-            mine, share = mine[share.any(1)], share[share.any(1)].float()
-            point = torch.stack([x[mine], y[mine]], 1) + _shading_point(
-                share, self.model.positions, self.model.shade_at
-            )
-            uv, duv, _ = _texture_coordinates(planes, self.mesh, row[mine], point)
-            read = torch.zeros(len(mine), device=uv.device)
-            for used, index, weight, blend in _reads(uv, duv, sizes, starts, self.model):
-                read.index_add_(0, used, (self.alpha[index] * weight).sum(1) * blend)
-            passed[mine] = read >= CUTOFF
-        return passed

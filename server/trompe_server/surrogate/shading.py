@@ -1,7 +1,7 @@
-"""From the texture value that a pixel reads to the colour it shows: the ladder of colour models.
+"""Colour models: from a pixel's texture value to its colour.
 
-Each model is a function of one number per pixel and channel, applied elementwise, and gives its derivative along with
-its value. sRGB encoding follows IEC 61966-2-1.
+Each model is an elementwise function of one number per pixel and channel and returns value and derivative. sRGB
+encoding follows IEC 61966-2-1.
 """
 
 import math
@@ -16,9 +16,10 @@ from torch import Tensor
 Encoding = Literal["srgb", "power"]
 
 POWER = 2.2
-"""Exponent of the plain power-law encoding that some renderers use in place of the sRGB curve."""
+"""Exponent of the power-law encoding of some renderers, in place of the sRGB curve."""
 
 __all__ = [
+    "Chord",
     "CurveShading",
     "DiffuseShading",
     "Encoder",
@@ -28,6 +29,7 @@ __all__ = [
     "encode",
     "fit_curve",
     "lambert",
+    "own_colours",
 ]
 
 
@@ -36,9 +38,15 @@ class Shading(Protocol):
 
     def __call__(
         self, values: Float[Tensor, "pixels 3"]
-    ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"]]:
-        """Colours (encoded, clipped to [0, 1]) of pixels that read ``values`` (encoded, in [0, 1]), and d colour /
-        d value."""
+    ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"] | Float[Tensor, "pixels 3 3"]]:
+        """(Colours, d colour / d value) of pixels with texture ``values``, both encoded and in [0, 1].
+
+        The derivatives are of each channel by itself, or [..., i, j] of channel i by channel j.
+        """
+        ...
+
+    def anchored(self, anchor: Float[Tensor, "pixels 3"]) -> "Shading":
+        """The model with ``anchor`` added to all colours."""
         ...
 
 
@@ -56,15 +64,15 @@ def decode(encoded: Tensor) -> Tensor:
 def decode_with_slope(encoded: Tensor) -> tuple[Tensor, Tensor]:
     """Linear light of sRGB-encoded values, and its derivative in units of GAMMA / GAIN.
 
-    The line below the knee is written as what it lacks of the power there: one power does for both, without branches.
-    Its slope is taken to be that of the power at the knee (they differ by 2 %).
+    The line below the knee is written as an offset to the power at the knee: one power without branches. Its slope is
+    taken as that of the power at the knee (2 % off).
     """
     light, power, bright = _decoded(encoded)
     return light, power.div_(bright)
 
 
 def _decoded(encoded: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Linear light, and of it what is a power, and of what."""
+    """(Linear light, its power term, base of the power)."""
     base = encoded.add(OFFSET).mul_(1 / GAIN)
     bright = base.clamp(min=KNEE)
     power = _power(bright, GAMMA)
@@ -72,15 +80,16 @@ def _decoded(encoded: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _power(base: Tensor, exponent: float) -> Tensor:
-    """``base ** exponent`` of values in about [0.001, 1], to 1e-6: half the time of ``pow``, which is exact for all."""
+    """``base ** exponent`` of values in about [0.001, 1] to 1e-6, in half the time of ``pow``."""
     return base.sub(1).log1p_().mul_(exponent / math.log(2)).exp2_()
 
 
 @dataclass(frozen=True)
 class Encoder:
-    """An encoding of linear light: ``gain * (bright ** exponent + toe * dim) - offset``, where ``bright`` is the light,
-    ``dark`` at least, and ``dim`` the light, ``dark`` at most. ``steepest`` bounds ``bright ** exponent / bright``, and
-    with it the slope. Light is clipped to [0, 1]."""
+    """An encoding of linear light: ``gain * (max(light, dark) ** exponent + toe * min(light, dark)) - offset``.
+
+    steepest: bound of ``bright ** exponent / bright`` and thus of the slope. Light is clipped to [0, 1].
+    """
 
     exponent: float
     gain: float
@@ -91,7 +100,7 @@ class Encoder:
 
     @property
     def steepness(self) -> float:
-        """What turns the slopes of ``decode_with_slope`` times those of ``partly`` into a derivative."""
+        """Factor from the product of the slopes of ``decode_with_slope`` and ``partly`` to a derivative."""
         return GAMMA / GAIN * self.exponent * self.gain
 
     def __call__(self, light: Tensor) -> Tensor:
@@ -99,31 +108,30 @@ class Encoder:
         return self._encoded(light)[0] * self.gain - self.offset
 
     def with_slope(self, light: Tensor) -> tuple[Tensor, Tensor]:
-        """Encoded values, and their derivative by the light."""
+        """(Encoded values, their derivative by the light)."""
         part, slope = self.partly(light)
         return part * self.gain - self.offset, slope * (self.exponent * self.gain)
 
     def partly(self, light: Tensor) -> tuple[Tensor, Tensor]:
-        """Encoded values before gain and offset, and their derivative in units of the exponent."""
+        """(Encoded values before gain and offset, their derivative in units of the exponent)."""
         part, power, bright = self._encoded(light)
         return part, power.div_(bright).clamp_(max=self.steepest)
 
     def _encoded(self, light: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Encoded values before gain and offset, and of them what is a power, and of what."""
+        """(Encoded values before gain and offset, their power term, base of the power)."""
         bright = light.clamp(self.dark, 1)
         power = _power(bright, self.exponent)
         return light.clamp(0, self.dark).mul_(self.toe).add_(power), power, bright
 
 
 DIM = 1e-4
-"""Linear light below which the slope of the power encoding grows no further: a chord over the first 8-bit steps, not a
-tangent."""
+"""Linear light below which the power encoding's slope stays constant: a chord over the first 8-bit steps."""
 
 LEAST = 1e-7
-"""Linear light below which the power encoding is a chord too, less than a tenth of an 8-bit step from the curve."""
+"""Linear light below which the power encoding itself is a chord, within a tenth of an 8-bit step of the curve."""
 
 DARK = 0.0031308
-"""Linear light from which on sRGB is a power."""
+"""Linear light above which sRGB is a power."""
 
 ENCODERS: Final[Mapping[Encoding, Encoder]] = {
     "srgb": Encoder(1 / GAMMA, GAIN, OFFSET + TOE * DARK, TOE / GAIN, DARK, DARK ** (1 / GAMMA - 1)),
@@ -143,8 +151,7 @@ def decode_as(encoded: Tensor, encoding: Encoding) -> Tensor:
 class DiffuseShading:
     """The paper's surrogate: texture value times (ambient + Lambert), in encoded values, over a known background.
 
-    factor: ambient + diffuse * max(0, n . l) of each pixel, times the share of it that the object covers. shift: what
-    the background adds.
+    factor: (ambient + diffuse * max(0, n . l)) of each pixel, times its coverage. shift: the background's share.
     """
 
     factor: Float[Tensor, "pixels 1"]
@@ -154,6 +161,10 @@ class DiffuseShading:
         self, values: Float[Tensor, "pixels 3"]
     ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"]]:
         return torch.addcmul(self.shift, values, self.factor).clamp_(0, 1), self.factor.expand_as(values)
+
+    def anchored(self, anchor: Float[Tensor, "pixels 3"]) -> "DiffuseShading":
+        """See ``Shading``."""
+        return replace(self, shift=self.shift + anchor)
 
 
 AMBIENT, DIFFUSE = 0.5, 0.3
@@ -168,15 +179,15 @@ def lambert(normals: Float[Tensor, "n 3"], towards_light: Float[Tensor, " 3"]) -
 
 @dataclass(frozen=True)
 class CurveShading:
-    """What was measured on the target: per pixel and channel the light it shows for any albedo.
+    """The measured colour model: light of each pixel and channel for any albedo.
 
-    The covered share of a pixel shows light that is piecewise linear in linear albedo, clipped at white, and encoded;
-    the rest shows the background. For one shading point under fixed light that is exact physics whatever the material,
-    with two probes; more greys follow what several shading points in one pixel make of saturation.
+    The covered share of a pixel shows light piecewise linear in linear albedo, clipped at white and encoded; the rest
+    shows the background. For one shading point under fixed light two probes are exact physics for any material; more
+    greys model the saturation of several shading points in one pixel.
 
-    light, slope: the line that black begins. nodes: linear albedo where the next segments begin, ascending. bends: how
-    much the slope changes there. steepness: share of the pixel that the object covers, times that of the encoder.
-    shift: added to the colour of that share: what the background adds, and what anchors the prediction.
+    light, slope: the first segment, from black. nodes: linear albedo at the starts of the next segments, ascending.
+    bends: changes of the slope there. steepness: the pixel's coverage times the encoder's. shift: added to the colour:
+    the background's share and the anchor.
     """
 
     light: Float[Tensor, "pixels 3"]
@@ -204,29 +215,65 @@ class CurveShading:
     def _segment(
         self, linear: Float[Tensor, "pixels 3"]
     ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"]]:
-        """The line that holds at each albedo: its light at black, and its slope."""
+        """(Light at black, slope) of the line at each albedo."""
         light, slope, beyond = self.light, self.slope, torch.empty_like(linear)
         for node, bend in zip(self.nodes, self.bends, strict=True):
-            torch.gt(linear, node, out=beyond)  # 0.0 or 1.0: booleans would take four times as long
+            torch.gt(linear, node, out=beyond)  # 0.0 or 1.0: booleans take four times as long
             light = torch.addcmul(light, bend, beyond, value=-node)
             slope = torch.addcmul(slope, bend, beyond)
         return light, slope
 
     def anchored(self, anchor: Float[Tensor, "pixels 3"]) -> "CurveShading":
-        """The same with ``anchor`` added to all colours."""
+        """The model with ``anchor`` added to all colours."""
         return replace(self, shift=self.shift + anchor)
 
 
 def _zero_where_clipped(slopes: Tensor, clipped: Tensor) -> None:
-    """Make ``slopes`` zero where values that are ``clipped`` to [0, 1] lie beyond it."""
+    """Set ``slopes`` to zero at values ``clipped`` to [0, 1] from outside."""
     torch.ops.aten.hardtanh_backward.grad_input(slopes, clipped, -ROUNDING, 1 + ROUNDING, grad_input=slopes)
 
 
 ROUNDING = 1e-5
-"""A value so little below black or above white is not clipped, just rounded."""
+"""Tolerance below black and above white that counts as rounding, not clipping."""
 
 WHITE = 0.996
-"""Encoded values from here on may be clipped."""
+"""Encoded value above which a probe may be clipped."""
+
+
+def own_colours(
+    shown: UInt8[Tensor, "*k pixels 3"], coverage: Float[Tensor, "pixels 1"], uncovered: Float[Tensor, "pixels 3"]
+) -> Float[Tensor, "*k pixels 3"]:
+    """Colours of the covered share of pixels in an image, encoded; ``uncovered``: the background's share."""
+    return ((shown.float() / 255 - uncovered) / coverage).clamp(0, 1)
+
+
+CHORD_WEIGHT: Final = 30.0
+"""Weight of the chord against the slope of greys; dark albedos show little of their own slope."""
+
+
+@dataclass(frozen=True)
+class Chord:
+    """The unpainted object as a third probe.
+
+    Light from a grey neighbour is part of the slope between two greys, but not of the effect of paint with zero mean.
+    The chord from black to the unpainted object holds the light of unpainted neighbours instead.
+
+    shown: the target's image. albedo: linear albedo in [0, 1].
+    """
+
+    shown: UInt8[Tensor, "pixels 3"]
+    albedo: Float[Tensor, "pixels 3"]
+
+    def corrected(
+        self, slope: Tensor, black: Tensor, light: Tensor, shown: Float[Tensor, "pixels 3"], grey: float
+    ) -> Tensor:
+        """Least-squares slope of chord and greys; the greys' alone where the unpainted object may be clipped.
+
+        black, light: light of the black and of the unpainted object. shown: its colours. grey: albedo of the grey.
+        """
+        weight = (CHORD_WEIGHT * self.albedo).mul_(shown < WHITE)
+        along = weight * (light - black).clamp(min=0) + grey * grey * slope
+        return along / (weight * self.albedo + grey * grey)
 
 
 def fit_curve(
@@ -235,17 +282,21 @@ def fit_curve(
     coverage: Float[Tensor, "pixels 1"],
     background: Float[Tensor, "pixels 3"],
     encoding: Encoding,
+    chord: Chord | None = None,
 ) -> CurveShading:
-    """The colour model through the target's own images of the object painted in K greys (encoded, ascending, from 0).
+    """Fit the colour model to the target's images of the object painted in K greys (encoded, ascending, from 0).
 
-    A segment that ends in white may bend on the way there: it takes the slope of the one before it, if that is steeper,
-    and is clipped.
+    A segment that ends in white may bend on the way: it takes the slope of the previous one, if steeper, and is
+    clipped. chord: corrects the slope of two greys.
     """
     uncovered = (1 - coverage) * background
     nodes = decode(greys.float() / 255)
-    shown = ((probes.float() / 255 - uncovered) / coverage).clamp(0, 1)
+    shown = own_colours(probes, coverage, uncovered)
     light = decode_as(shown, encoding)
     slope = light.diff(dim=0) / nodes.diff()[:, None, None]
+    if chord is not None:
+        clean = own_colours(chord.shown, coverage, uncovered)
+        slope = chord.corrected(slope, light[0], decode_as(clean, encoding), clean, float(nodes[1]))
     bends = (shown[1:] >= WHITE) & (shown[:-1] < WHITE)
     for segment in range(1, len(slope)):
         steeper = slope[segment].maximum(slope[segment - 1])

@@ -1,12 +1,13 @@
-"""The surrogate renderer: images of a repainted object for fixed views, and their gradients, at the cost of a gather.
+"""The surrogate renderer: images of a repainted object and their gradients, at the cost of one gather per view.
 
 geometry = prepare_geometry(obj, views, size=(224, 224), sampling=SamplingModel())
 surrogate = curve_surrogate(geometry, obj, views, clean, greys, probes)  # or diffuse_surrogate(geometry, views)
 texels = surrogate.texels(textures)
-images = surrogate.render(texels, batch=0)  # of the views surrogate.batches[0]; differentiable in the textures
+images = surrogate.render(texels, batch=0)  # views surrogate.batches[0]; differentiable in the textures
 """
 
 import itertools
+import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,10 +24,13 @@ from torch.autograd.function import FunctionCtx
 from torch.nn.functional import softshrink
 
 from trompe_server.surrogate.canvas import Canvas, canvas_of
+from trompe_server.surrogate.opacity import Opacities
+from trompe_server.surrogate.pixel_filter import KernelName, PixelFilter, kernel_of
 from trompe_server.surrogate.pyramid import MipChain, MipLayout, mip_chains, mip_layout, read_texels
 from trompe_server.surrogate.rasterize import Mesh, mesh_of, project, rasterize
-from trompe_server.surrogate.sampling import AlphaTest, Gather, SamplingModel, Taps, fragments_of, taps_of
-from trompe_server.surrogate.shading import CurveShading, DiffuseShading, Shading, decode, encode, fit_curve, lambert
+from trompe_server.surrogate.sampling import FilteredGather, Gather, SamplingModel, Taps, fragments_of, taps_of
+from trompe_server.surrogate.shading import Chord, DiffuseShading, Shading, decode, encode, fit_curve, lambert
+from trompe_server.surrogate.tone import ToneMap, fit_tone
 from trompe_shared.geometry import View, spherical
 from trompe_shared.object3d import Object3D
 
@@ -40,6 +44,7 @@ __all__ = [
     "curve_surrogate",
     "diffuse_surrogate",
     "prepare_geometry",
+    "refiltered",
     "textures_of",
 ]
 
@@ -49,25 +54,27 @@ Image8 = NDArray[np.uint8]
 NO_BACKDROPS: Final[Mapping[str, Image8]] = {}
 
 BATCH = 10
-"""Views that are one operator: the fastest on CPUs (larger batches miss the caches)."""
+"""Views per operator: the fastest on CPUs (larger batches miss the caches)."""
 
 
 @dataclass(frozen=True)
 class ViewBatch:
-    """Some successive views, rasterised: their object pixels, what they read, and how the paper's light shades them.
+    """Consecutive rasterised views: object pixels, their reads, and their shade under the paper's light.
 
-    pixel: (view * H + row) * W + column, the views of the batch counted from 0. counts: object pixels of each view.
+    pixel: (view * H + row) * W + column, with the batch's views from 0. counts: object pixels of each view. sub_pixels:
+    the same in sub-pixels, if a reconstruction filter averages them.
     """
 
     views: range
     pixel: Int[Tensor, " pixels"]
     counts: tuple[int, ...]
-    gather: Gather
+    gather: Gather | FilteredGather
     coverage: Float[Tensor, "pixels 1"]
     shade: Float[Tensor, "pixels 1"]
+    sub_pixels: "ViewBatch | None" = None
 
     def of(self, images: Shaped[Tensor, "views H W ..."]) -> Shaped[Tensor, "pixels ..."]:
-        """What ``images`` of all views show at the object's pixels of these, (pixels, ...)."""
+        """Values (pixels, ...) of the images of all views at the object pixels of this batch."""
         return images[self.views.start : self.views.stop].flatten(0, 2).index_select(0, self.pixel)
 
 
@@ -75,9 +82,8 @@ class ViewBatch:
 class Geometry:
     """All views of one object under one sampling hypothesis. ``size`` is (H, W).
 
-    reads: of each mip level in the layout's order, the texels that some view reads, in the order in which views first
-    do: what lies side by side in an image does so in memory. These alone, one level after the other, are what the
-    operators know as ``texels``.
+    reads: for each mip level in the layout's order, the texels read by any view, in the order of the first read, so
+    that neighbours in an image are neighbours in memory. Concatenated they are the operators' ``texels``.
     """
 
     textures: tuple[str, ...]
@@ -88,22 +94,29 @@ class Geometry:
     batches: tuple[ViewBatch, ...]
 
     def texels(self, textures: Sequence[Float[Tensor, "H W 3"]], *, rounded: bool = False) -> Float[Tensor, "texels 3"]:
-        """The texels that some view reads of the mip levels of ``textures``. Differentiable."""
+        """The texels read by any view from the mip levels of ``textures``. Differentiable."""
         return read_texels(textures, self.chains, rounded=rounded)
+
+    def values(self, textures: Mapping[str, Float[Tensor, "H W 3"]]) -> Float[Tensor, "texels 3"]:
+        """``texels`` of sRGB ``textures`` by name: encoded, or linear if the sampling model filters light."""
+        ordered = [textures[name] for name in self.textures]
+        if self.sampling.filtered == "linear":
+            return self.texels([decode(texture) for texture in ordered])
+        return self.texels(ordered, rounded=self.sampling.mips == "rounded")
 
     @cached_property
     def chains(self) -> list[MipChain]:
-        """The mip levels of each texture, with what is read of them."""
+        """The mip levels of each texture with their reads."""
         return mip_chains(self.layout, self.reads)
 
     @property
     def device(self) -> torch.device:
-        """Where the operators lie."""
+        """Device of the operators."""
         return self.reads[0].device
 
     @property
     def nbytes(self) -> int:
-        """Memory of the operators."""
+        """Memory of the operators in bytes."""
         return sum(batch.gather.nbytes + batch.pixel.nbytes for batch in self.batches)
 
 
@@ -118,15 +131,17 @@ def prepare_geometry(
     """Rasterise ``obj`` once for all ``views`` and images of ``size`` (H, W)."""
     mesh = mesh_of(obj, device=device)
     layout = mip_layout([obj.textures[name].shape[:2] for name in mesh.textures])
-    test = AlphaTest.of(mesh, sampling)
-    prepared = [_prepare_view(mesh, layout, test, view, size, sampling) for view in views]
+    opacities = Opacities.of(mesh, sampling)
+    prepared = [_prepare_view(mesh, layout, opacities, view, size, sampling) for view in views]
     reads = _in_order_of_reading([view.taps.index for view in prepared], layout)
     starts = itertools.chain.from_iterable(layout.starts)
     texels = torch.cat([level + start for level, start in zip(reads, starts, strict=True)])
     place = torch.empty(layout.total, dtype=torch.int32, device=device)
     place[texels] = torch.arange(len(texels), dtype=torch.int32, device=device)
     numbers = [range(first, min(first + BATCH, len(views))) for first in range(0, len(views), BATCH)]
-    batches = tuple(_joined(some, prepared[some.start : some.stop], place, len(texels), size) for some in numbers)
+    batches = tuple(
+        _joined(some, prepared[some.start : some.stop], place, len(texels), size, sampling) for some in numbers
+    )
     return Geometry(mesh.textures, layout, reads, sampling, size, batches)
 
 
@@ -134,7 +149,7 @@ NEVER: Final = torch.iinfo(torch.int64).max
 
 
 def _in_order_of_reading(taps: Sequence[Int[Tensor, " taps"]], layout: MipLayout) -> tuple[Int[Tensor, " _"], ...]:
-    """Of each mip level the texels that the ``taps`` of some view read, those first that are read first."""
+    """The texels of each mip level in the ``taps`` of any view, in the order of their first read."""
     first, count = torch.full((layout.total,), NEVER, device=taps[0].device), 0
     for index in taps:
         number = torch.arange(count, count + len(index), device=index.device)
@@ -149,7 +164,7 @@ def _in_order_of_reading(taps: Sequence[Int[Tensor, " taps"]], layout: MipLayout
 
 @dataclass(frozen=True)
 class _View:
-    """One view, as ``ViewBatch`` has several."""
+    """One view of a ``ViewBatch``, in pixels or sub-pixels."""
 
     pixel: Int[Tensor, " pixels"]
     taps: Taps
@@ -160,15 +175,21 @@ class _View:
 def _prepare_view(
     mesh: Mesh,
     layout: MipLayout,
-    test: AlphaTest | None,
+    opacities: Opacities | None,
     view: View,
     size: tuple[int, int],
     sampling: SamplingModel,
 ) -> _View:
+    size = (size[0] * sampling.subdivision, size[1] * sampling.subdivision)
     planes = project(mesh, view.camera, size, cull=sampling.cull)
-    drawn = None if test is None else partial(test.drawn, planes)
-    visibility = rasterize(planes, size, sampling.positions, drawn=drawn)
-    fragments = fragments_of(visibility, mesh, size[1], samples=sampling.positions, shade_at=sampling.shade_at)
+    samples = sampling.positions
+    drawn, blended, alpha = None, None, None
+    if opacities is not None:
+        drawn = partial(opacities.drawn, planes)
+        if opacities.blended is not None:
+            blended, alpha = opacities.blended[planes.face], opacities.of_fragments
+    visibility = rasterize(planes, size, samples, drawn=drawn, blended=blended)
+    fragments = fragments_of(visibility, mesh, size[1], samples=samples, shade_at=sampling.shade_at, alpha=alpha)
     n_pixels = len(visibility.pixel)
     normals = (fragments.barycentric.clamp(0, 1)[..., None] * mesh.normals[fragments.face]).sum(1)
     towards = torch.from_numpy(spherical(view.light.azimuth, view.light.elevation)).float().to(normals.device)
@@ -180,31 +201,62 @@ def _prepare_view(
 
 
 def _joined(
-    numbers: range, views: Sequence[_View], place: Int[Tensor, " texels"], n_texels: int, size: tuple[int, int]
+    numbers: range,
+    views: Sequence[_View],
+    place: Int[Tensor, " texels"],
+    n_texels: int,
+    size: tuple[int, int],
+    sampling: SamplingModel,
 ) -> ViewBatch:
-    """``views``, which are those of ``numbers``, as one operator that finds texel ``t`` of those read, of which there
-    are ``n_texels``, at ``place[t]``."""
+    """The ``views`` with ``numbers`` as one operator; texel ``t`` is the read number ``place[t]`` of ``n_texels``."""
+    parts = sampling.subdivision
     counts = tuple(len(view.pixel) for view in views)
     taps = Taps(
         torch.cat([view.taps.entry + sum(counts[:k]) for k, view in enumerate(views)]),
         place.index_select(0, torch.cat([view.taps.index for view in views])),
         torch.cat([view.taps.weight for view in views]),
     )
-    return ViewBatch(
+    batch = ViewBatch(
         numbers,
-        torch.cat([view.pixel + k * size[0] * size[1] for k, view in enumerate(views)]),
+        torch.cat([view.pixel + k * size[0] * size[1] * parts**2 for k, view in enumerate(views)]),
         counts,
         Gather.of(taps, sum(counts), n_texels),
         torch.cat([view.coverage for view in views]),
         torch.cat([view.shade for view in views]),
     )
+    return batch if parts == 1 else _filtered(batch, size, sampling)
+
+
+def _filtered(batch: ViewBatch, size: tuple[int, int], sampling: SamplingModel) -> ViewBatch:
+    """A batch of sub-pixels under the reconstruction filter of ``sampling``; ``size``: (H, W) of the image."""
+    assert isinstance(batch.gather, Gather)
+    shape, parts = (len(batch.views), *size), sampling.subdivision
+    kernel = kernel_of(*sampling.kernel, parts)
+    pixel_filter, coverage = PixelFilter.of(batch.pixel, batch.coverage, shape, kernel, parts)
+    counts = torch.bincount(pixel_filter.pixel // (size[0] * size[1]), minlength=len(batch.views))
+    return ViewBatch(
+        batch.views,
+        pixel_filter.pixel,
+        tuple(counts.tolist()),
+        FilteredGather(batch.gather, pixel_filter, batch.coverage, 1 / coverage),
+        coverage,
+        pixel_filter.forward(batch.shade * batch.coverage) / coverage,
+        batch,
+    )
+
+
+def refiltered(geometry: Geometry, kernel: tuple[KernelName, float]) -> Geometry:
+    """``geometry`` of sub-pixels under another reconstruction filter."""
+    sampling = geometry.sampling.but(kernel=kernel)
+    sub_pixels = [batch.sub_pixels for batch in geometry.batches]
+    batches = tuple(_filtered(batch, geometry.size, sampling) for batch in sub_pixels if batch is not None)
+    return replace(geometry, sampling=sampling, batches=batches)
 
 
 class _RenderViews(Function):
-    """Images of a batch of views from the texels, with the gradient's way back (where that is not finite, as zero).
+    """Images of a batch of views as an autograd function of the texels; non-finite gradients count as zero.
 
-    ``masks`` (saliency), where given, multiplies the image gradient before it flows into the texture (the paper's
-    equation 4).
+    masks: saliency that multiplies the image gradient before it flows into the texture (the paper's equation 4).
     """
 
     @staticmethod
@@ -220,27 +272,29 @@ class _RenderViews(Function):
         images = surrogate.base[some.views.start : some.views.stop].float().div_(255)
         images.view(-1, 3).index_copy_(0, some.pixel, colours)
         if masks is not None:
-            slopes = slopes * some.of(masks)[:, None]
+            slopes = slopes * some.of(masks).view(-1, *[1] * (slopes.dim() - 1))
         ctx.some, ctx.slopes = some, slopes  # type: ignore[attr-defined]
         return images.permute(0, 3, 1, 2)
 
     @staticmethod
     def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[Tensor, None, None, None]:
         some: ViewBatch = ctx.some  # type: ignore[attr-defined]
+        slopes: Tensor = ctx.slopes  # type: ignore[attr-defined]
         pixels = gradient.permute(0, 2, 3, 1).reshape(-1, 3).index_select(0, some.pixel).nan_to_num_(0, 0, 0)
-        return some.gather.transpose(pixels.mul_(ctx.slopes)), None, None, None  # type: ignore[attr-defined]
+        pulled = pixels.mul_(slopes) if slopes.dim() == 2 else (pixels[:, None, :] @ slopes)[:, 0]
+        return some.gather.transpose(pulled), None, None, None
 
 
 @dataclass(frozen=True)
 class _Painted:
-    """A canvas, and what it was made for."""
+    """A canvas and its arguments."""
 
     textures: Sequence[Float[Tensor, "H W 3"]]
     moving: Sequence[Bool[Tensor, "H W"]]
     canvas: Canvas
 
     def fits(self, textures: Sequence[Float[Tensor, "H W 3"]], moving: Sequence[Bool[Tensor, "H W"]]) -> bool:
-        """Whether it is the one for these textures, which must be the same tensors."""
+        """Whether the canvas is for these textures (the same tensors) and masks."""
         return all(map(operator.is_, self.textures, textures)) and all(map(torch.equal, self.moving, moving))
 
 
@@ -248,9 +302,8 @@ class _Painted:
 class Surrogate:
     """A differentiable model of the target renderer for fixed views.
 
-    base: (views, H, W, 3) uint8, what every pixel shows that the object does not touch.
-    shadings: the colour model of each batch of views. missed: true minus predicted colours of the unpainted object, as
-    the colour model alone would have it; ``None`` where the target has not been asked.
+    base: (views, H, W, 3) uint8, colours of the pixels without object. shadings: colour model of each batch of views.
+    missed: true minus predicted colours of the unpainted object without anchoring; ``None`` without target images.
     """
 
     geometry: Geometry
@@ -262,7 +315,7 @@ class Surrogate:
 
     @property
     def n_views(self) -> int:
-        """How many views it knows."""
+        """Number of views."""
         return len(self.base)
 
     @property
@@ -270,18 +323,37 @@ class Surrogate:
         """The views of each batch."""
         return tuple(batch.views for batch in self.geometry.batches)
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) of the images."""
+        return self.geometry.size
+
+    @property
+    def textures(self) -> tuple[str, ...]:
+        """Names of the textures."""
+        return self.geometry.textures
+
+    @property
+    def n_texels(self) -> int:
+        """Number of texels read by any view."""
+        return sum(map(len, self.geometry.reads))
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the operators."""
+        return self.geometry.device
+
     def texels(self, textures: Mapping[str, Float[Tensor, "H W 3"]]) -> Float[Tensor, "texels 3"]:
-        """What the views read of ``textures`` (sRGB in [0, 1], row 0 on top). Differentiable; do it once a step."""
-        ordered = [textures[name] for name in self.geometry.textures]
-        if self.geometry.sampling.filtered == "linear":
-            return self.geometry.texels([decode(texture) for texture in ordered])
-        return self.geometry.texels(ordered, rounded=self.geometry.sampling.mips == "rounded")
+        """The texels read from ``textures`` (sRGB in [0, 1], row 0 on top). Differentiable; call it once per step."""
+        return self.geometry.values(textures)
 
     def canvas(
         self, textures: Mapping[str, Float[Tensor, "H W 3"]], moving: Mapping[str, Bool[Tensor, "H W"]]
     ) -> Canvas:
-        """What may move of ``textures``: the tiles that hold a texel which is ``moving``. ``canvas.read`` is then a
-        cheaper ``texels``. An attack asks for the same one every few steps: the last one is kept."""
+        """The tiles of ``textures`` with a ``moving`` texel; ``canvas.read`` is a cheaper ``texels``.
+
+        The last canvas is cached, because an attack asks for the same one every few steps.
+        """
         geometry, linear = self.geometry, self.geometry.sampling.filtered == "linear"
         whole, masks = ([table[name] for name in geometry.textures] for table in (textures, moving))
         if not (self._last_canvas and self._last_canvas[0].fits(whole, masks)):
@@ -293,10 +365,9 @@ class Surrogate:
     def render(
         self, texels: Float[Tensor, "texels 3"], batch: int, *, masks: Bool[Tensor, "views H W"] | None = None
     ) -> Float[Tensor, "batch 3 H W"]:
-        """Images of the views ``batches[batch]`` (sRGB in [0, 1]; channels last in memory), differentiable in
-        ``texels``.
+        """Images of the views ``batches[batch]``, sRGB in [0, 1], channels last in memory. Differentiable.
 
-        ``masks`` has a row for every view of the surrogate; pixels outside of it pass no gradient.
+        masks: for all views of the surrogate; pixels outside pass no gradient.
         """
         images: Tensor = _RenderViews.apply(texels, self, batch, masks)  # type: ignore[no-untyped-call]
         return images
@@ -307,10 +378,17 @@ class Surrogate:
         """The images of all views at once."""
         return torch.cat([self.render(texels, batch, masks=masks) for batch in range(len(self.batches))])
 
-    def clean_errors(self) -> tuple[float, ...]:
-        """Per view the mean error of the unpainted object's pixels before anchoring, sRGB in [0, 1] units.
+    @torch.no_grad()
+    def images(self, obj: Object3D) -> UInt8[np.ndarray, "views H W 3"]:
+        """Images of ``obj`` in 8 bits, as a target renders them."""
+        shown = self.render_all(self.texels(textures_of(obj, device=self.geometry.device)))
+        images: UInt8[np.ndarray, "views H W 3"] = shown.mul(255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
+        return images
 
-        Zero where a view shows no object, and where the target has not been asked.
+    def clean_errors(self) -> tuple[float, ...]:
+        """Mean error of the unpainted object's pixels before anchoring, for each view, sRGB in [0, 1] units.
+
+        Zero for views without object and without target images.
         """
         if self.missed is None:
             return (0.0,) * self.n_views
@@ -322,35 +400,56 @@ class Surrogate:
         return tuple(float(error) for error in per_view)
 
     def influence(self, masks: Bool[Tensor, "views H W"] | None = None) -> dict[str, Float[Tensor, "H W"]]:
-        """Total weight with which the pixels of all views (those of ``masks`` alone, where given) read each texel."""
+        """Total weight of each texel in the pixels of all views, or in those of ``masks``."""
         geometry, device = self.geometry, self.base.device
-        ones = [torch.ones(*sizes[0], 3, device=device, requires_grad=True) for sizes in geometry.layout.sizes]
-        texels = geometry.texels(ones)
-        total = torch.zeros_like(texels)
-        for batch in geometry.batches:
-            seen = torch.ones(len(batch.pixel), 3, device=device)
-            total += batch.gather.transpose(seen if masks is None else seen * batch.of(masks)[:, None])
-        weights = torch.autograd.grad(texels, ones, total)
+        ones = [torch.ones(*sizes[0], 1, device=device, requires_grad=True) for sizes in geometry.layout.sizes]
+        weights = torch.autograd.grad(geometry.texels(ones), ones, self._read_weights(masks))
         return {name: weight[..., 0] for name, weight in zip(geometry.textures, weights, strict=True)}
 
-    def colours(
-        self, texels: Float[Tensor, "texels 3"], batch: int
-    ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"]]:
-        """Colours of a batch's object pixels, and their derivative by the texture value each pixel reads."""
+    def _read_weights(self, masks: Bool[Tensor, "views H W"] | None = None) -> Float[Tensor, "texels 1"]:
+        """Total weight of each read in the pixels of all views, or in those of ``masks``."""
+        geometry = self.geometry
+        total = torch.zeros(self.n_texels, 1, device=geometry.device)
+        for batch in geometry.batches:
+            seen = torch.ones(len(batch.pixel), 1, device=geometry.device)
+            total += batch.gather.transpose(seen if masks is None else seen * batch.of(masks)[:, None])
+        return total
+
+    @cached_property
+    def footprint(self) -> Mapping[str, float]:
+        """Texels that a pixel reads of each texture: the geometric mean over all views; 1 for an unseen texture.
+
+        A texture stored twice as finely has four times the footprint.
+        """
+        geometry = self.geometry
+        by_level = iter(torch.split(self._read_weights()[:, 0], [len(level) for level in geometry.reads]))
+        found = {}
+        for name, sizes in zip(geometry.textures, geometry.layout.sizes, strict=True):
+            weights = torch.stack([next(by_level).sum() for _ in sizes])
+            texels = torch.tensor([math.log(sizes[0][0] * sizes[0][1] / (h * w)) for h, w in sizes])
+            found[name] = math.exp(float((weights.cpu() * texels).sum() / weights.sum().clamp(min=1e-9).cpu()))
+        return found
+
+    def spread(self, pixels: Float[Tensor, "pixels 3"], batch: int) -> Float[Tensor, "texels 3"]:
+        """Weighted sums of a batch's ``pixels`` at each texel read: the transpose of the texels' gathering."""
+        return self.geometry.batches[batch].gather.transpose(pixels)
+
+    def colours(self, texels: Float[Tensor, "texels 3"], batch: int) -> tuple[Float[Tensor, "pixels 3"], Tensor]:
+        """(Colours of a batch's object pixels, their derivative by the pixel's texture value as in ``Shading``)."""
         values = self.geometry.batches[batch].gather.forward(texels)
         if self.geometry.sampling.filtered != "linear":
             return self.shadings[batch](values)
         encoded, rate = encode.with_slope(values.clamp_(0, 1))
         colour, slope = self.shadings[batch](encoded)
-        return colour, slope * rate
+        return colour, slope * (rate if slope.dim() == 2 else rate[:, None, :])
 
 
 def diffuse_surrogate(
     geometry: Geometry, views: Sequence[View], *, backdrops: Mapping[str, Image8] = NO_BACKDROPS
 ) -> Surrogate:
-    """The paper's surrogate: asks nothing of the target. ``views`` are those of ``geometry``.
+    """The paper's surrogate; it needs no image of the target. ``views``: those of ``geometry``.
 
-    ``backdrops`` are the pictures that stand behind the object where a view has one, (H, W, 3) uint8 by name.
+    backdrops: pictures behind the object by the name in a view, (H, W, 3) uint8.
     """
     base = _behind(geometry, views, backdrops)
     shadings = tuple(
@@ -363,7 +462,7 @@ def diffuse_surrogate(
 def behind(
     views: Sequence[View], backdrops: Mapping[str, Image8], size: tuple[int, int]
 ) -> UInt8[np.ndarray, "views H W 3"]:
-    """What each view shows where there is no object: its background, or the picture of ``backdrops`` that it names."""
+    """The background of each view: its colour, or its picture from ``backdrops``."""
     images = np.empty((len(views), *size, 3), np.uint8)
     for image, view in zip(images, views, strict=True):
         image[:] = view.background if view.backdrop is None else backdrops[view.backdrop]
@@ -382,50 +481,73 @@ def curve_surrogate(
     greys: Sequence[int],
     probes: Image8,
     *,
+    tone: ToneMap | None = None,
     backdrops: Mapping[str, Image8] = NO_BACKDROPS,
 ) -> Surrogate:
     """A surrogate measured on the target: ``calibrated`` with two greys, ``curve`` with more.
 
     clean: the target's images of ``obj``, (views, H, W, 3) uint8. greys: encoded values, ascending, the first 0.
-    probes: the target's images of ``obj`` painted in each grey, (greys, views, H, W, 3) uint8. ``backdrops`` as for
-    ``diffuse_surrogate``.
+    probes: the target's images of ``obj`` painted in each grey, (greys, views, H, W, 3) uint8. tone: for a sampling
+    model with ``encoding`` "measured", with two greys. backdrops: as for ``diffuse_surrogate``.
     """
     base = torch.from_numpy(clean).to(geometry.device)
-    levels = torch.tensor(list(greys), dtype=torch.uint8, device=base.device)
+    shown = [torch.from_numpy(probe).to(base.device) for probe in probes]
     uncovered = _behind(geometry, views, backdrops)
-    shadings = [
-        fit_curve(
-            levels,
-            torch.stack([batch.of(torch.from_numpy(probe).to(base.device)) for probe in probes]),
-            batch.coverage,
-            batch.of(uncovered) / 255,
-            geometry.sampling.encoding,
-        )
-        for batch in geometry.batches
-    ]
+    texels = geometry.values(textures_of(obj, device=base.device))
+    by_chord = geometry.sampling.slope == "chord" and len(greys) == 2
+    shadings: list[Shading] = []
+    for batch in geometry.batches:
+        chord = Chord(batch.of(base), _albedo(geometry, batch, texels)) if by_chord else None
+        coverage, background = batch.coverage, batch.of(uncovered) / 255
+        if geometry.sampling.edges == "linear":  # the light behind a pixel's uncovered share is part of its light
+            coverage, background = torch.ones_like(coverage), torch.zeros_like(background)
+        seen = torch.stack([batch.of(probe) for probe in shown])
+        shadings.append(_fit(geometry.sampling, greys, seen, coverage, background, tone, chord))
     plain = Surrogate(geometry, "calibrated" if len(greys) == 2 else "curve", base, tuple(shadings))
-    return _anchored(plain, obj, shadings)
+    return _anchored(plain, texels)
 
 
-def _anchored(plain: Surrogate, obj: Object3D, shadings: Sequence[CurveShading]) -> Surrogate:
-    """``plain``, whose ``shadings`` these are, made to predict the unpainted object as the target shows it.
+def _fit(
+    sampling: SamplingModel,
+    greys: Sequence[int],
+    probes: UInt8[Tensor, "k pixels 3"],
+    coverage: Float[Tensor, "pixels 1"],
+    background: Float[Tensor, "pixels 3"],
+    tone: ToneMap | None,
+    chord: Chord | None,
+) -> Shading:
+    """The colour model of one batch."""
+    if sampling.encoding != "measured":
+        levels = torch.tensor(list(greys), dtype=torch.uint8, device=probes.device)
+        return fit_curve(levels, probes, coverage, background, sampling.encoding, chord)
+    if tone is None or len(greys) != 2:
+        raise ValueError("a measured tone curve needs a `tone` and two greys")
+    return fit_tone(greys[1], probes, coverage, background, tone, chord)
 
-    The target's image is rounded to 8 bits: a prediction that would be rounded to it is believed as it is, any other is
-    shifted until it would.
+
+def _albedo(geometry: Geometry, batch: ViewBatch, texels: Float[Tensor, "texels 3"]) -> Float[Tensor, "pixels 3"]:
+    """Linear albedo of a batch's object pixels."""
+    values = batch.gather.forward(texels).clamp_(0, 1)
+    return values if geometry.sampling.filtered == "linear" else decode(values)
+
+
+def _anchored(plain: Surrogate, texels: Float[Tensor, "texels 3"]) -> Surrogate:
+    """``plain`` anchored to the target's image of the unpainted object, whose ``texels`` these are.
+
+    The target's image is rounded to 8 bits: a prediction that rounds to it stays, any other is shifted until it does.
     """
-    texels = plain.texels(textures_of(obj, device=plain.base.device))
     missed = tuple(
         batch.of(plain.base) / 255 - plain.colours(texels, number)[0]
         for number, batch in enumerate(plain.geometry.batches)
     )
     anchored = tuple(
-        shading.anchored(softshrink(miss, SAME_LEVEL)) for shading, miss in zip(shadings, missed, strict=True)
+        shading.anchored(softshrink(miss, SAME_LEVEL)) for shading, miss in zip(plain.shadings, missed, strict=True)
     )
     return replace(plain, shadings=anchored, missed=missed)
 
 
 SAME_LEVEL = 0.499 / 255
-"""A prediction this near to an 8-bit value is rounded to it."""
+"""Largest distance of a prediction to the 8-bit value it rounds to."""
 
 
 def textures_of(obj: Object3D, *, device: torch.device | str = "cpu") -> dict[str, Float[Tensor, "H W 3"]]:

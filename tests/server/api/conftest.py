@@ -9,20 +9,21 @@ from typing import Any
 import httpx
 import pytest
 
-from trompe_server import library as library_module
-from trompe_server.access import Right, Tokens
 from trompe_server.api import guard
 from trompe_server.api.services import Services
-from trompe_server.app import create_app
-from trompe_server.artifacts import job_artifacts, open_folder
-from trompe_server.database import clock, write
-from trompe_server.jobs.store import JobStore
-from trompe_server.jobs.tables import update_job
 from trompe_server.library import Library
+from trompe_server.queue.store import JobStore
+from trompe_server.queue.tables import update_job
+from trompe_server.service.app import create_app
 from trompe_server.settings import Settings
-from trompe_shared.api import JobState, RendererInfo
+from trompe_server.storage.database import clock, write
+from trompe_server.storage.folders import job_artifacts, open_folder
+from trompe_server.storage.tokens import Right, Tokens
+from trompe_shared.api import JobState, RendererInfo, in_parts
 from trompe_shared.errors import ClassifierError
 
+GIF = bytes.fromhex("47494638396101000100800000000000ffffff2c00000000010001000002024401003b")
+"""A picture of one pixel."""
 CLASSES = ["mug, cup", "vase", "toilet tissue, toilet paper"]
 
 
@@ -30,16 +31,20 @@ class Api:
     """Requests to the application, made in this process; ``headers`` go with each of them."""
 
     def __init__(self, services: Services) -> None:
-        self.services, self.headers = services, {}
+        self.services, self.headers = services, dict[str, str]()
         self.app = create_app(services)
 
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         return asyncio.run(self._request(method, path, options))
 
     async def _request(self, method: str, path: str, options: dict[str, Any]) -> httpx.Response:
-        transport = httpx.ASGITransport(self.app, raise_app_exceptions=False)
-        async with httpx.AsyncClient(transport=transport, base_url="http://trompe", headers=self.headers) as client:
+        async with self.connect() as client:
             return await client.request(method, path, **options)
+
+    def connect(self) -> httpx.AsyncClient:
+        """A client to enter, for requests at the same time."""
+        transport = httpx.ASGITransport(self.app, raise_app_exceptions=False)
+        return httpx.AsyncClient(transport=transport, base_url="http://trompe", headers=self.headers)
 
     def get(self, path: str, **options: Any) -> httpx.Response:
         return self.request("GET", path, **options)
@@ -56,13 +61,13 @@ class Api:
     def upload_classifier(self, data: bytes, name: str = "net.pt2", **form: str) -> httpx.Response:
         return self.post("/v1/classifiers", files={"file": (name, data)}, data=form)
 
-    def submit(self, *, key: str | None = None, **spec: Any) -> httpx.Response:
+    def submit(self, object: str = "triangle", *, key: str | None = None, **spec: Any) -> httpx.Response:
         headers = {"Idempotency-Key": key} if key else {}
-        body = {"object": "triangle", "label": 0, "classifier": "net"} | spec
+        body = {"object": object} | in_parts({"label": 0, "classifier": "net"} | spec)
         return self.post("/v1/jobs", json=body, headers=headers)
 
     def job(self, **spec: Any) -> str:
-        """The id of a new job."""
+        """The id of a new job, by keywords."""
         answer = self.submit(**spec)
         assert answer.status_code == 201, answer.text
         return str(answer.json()["id"])
@@ -80,7 +85,7 @@ class Api:
         assert body["request_id"] == response.headers["x-request-id"]
         return body
 
-    def tell(self, job: str, message: str, **values: Any) -> None:
+    def tell(self, job: str, message: str | None, **values: Any) -> None:
         """Write to a job's record what a worker would write."""
         with write(self.services.store.engine) as connection:
             update_job(connection, job, message=message, **values)
@@ -111,12 +116,11 @@ def api(settings: Settings, missing: list[str], monkeypatch: pytest.MonkeyPatch)
 
     What it knows of tokens is never older than the request.
     """
-    monkeypatch.setattr(library_module, "_inspect", _inspect)
     monkeypatch.setattr(guard, "FRESH", -1.0)
     store, files = JobStore(settings.database_url), open_folder(settings.store_url)
     store.migrate()
     renderers = [RendererInfo(address="127.0.0.1:8085", alive=True)]
-    library = Library(files.within("library"))
+    library = Library(files.within("library"), inspect=_inspect)
     yield Api(Services(settings, library, store, files, Tokens(store.engine), lambda: renderers, lambda: missing))
     store.close()
 

@@ -4,27 +4,36 @@ import hashlib
 import io
 import zipfile
 
+import httpx
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.server.api.conftest import Api
 from trompe_server.api import downloads
 from trompe_shared.api import JobState
 
 TEN = b"0123456789"
 
 
+class Ended:
+    """A job that ended with a few files."""
+
+    def __init__(self, api: Api, job: str) -> None:
+        self.api, self.job = api, job
+
+    def get(self, name: str = "digits.txt", headers: dict[str, str] | None = None) -> httpx.Response:
+        return self.api.get(f"/v1/jobs/{self.job}/artifacts/{name}", headers=headers)
+
+
 @pytest.fixture
-def done(stocked):
-    """A job that ended with a few files, and a function that gets one of them."""
+def done(stocked: Api) -> Ended:
     job = stocked.job()
     stocked.end(job, result__json=b'{"a": 1.50}', digits__txt=TEN, empty__txt=b"")
-    stocked.files = f"/v1/jobs/{job}/artifacts"
-    stocked.done = job
-    return stocked
+    return Ended(stocked, job)
 
 
-def test_a_result_is_refused_until_the_job_has_ended_and_then_served_as_it_was_written(stocked):
+def test_a_result_is_refused_until_the_job_has_ended_and_then_served_as_it_was_written(stocked: Api) -> None:
     job = stocked.job()
     assert "is queued" in stocked.problem(stocked.get(f"/v1/jobs/{job}/result"), 409)["detail"]
     stocked.end(job, result__json=b'{"a": 1.50}')
@@ -36,37 +45,38 @@ def test_a_result_is_refused_until_the_job_has_ended_and_then_served_as_it_was_w
         assert (answer.content, answer.headers["content-type"]) == (b'{"a": 1.50}', "application/json")
 
 
-def test_only_public_files_are_served(done):
-    done.tell(done.done, "fewer", artifacts=["digits.txt"])
+def test_only_public_files_are_served(done: Ended) -> None:
+    done.api.tell(done.job, "fewer", artifacts=["digits.txt"])
     for private in ("result.json", "..%2F..%2Ftrompe.sqlite", "%2Fetc%2Fpasswd", ".%00"):
-        assert done.get(f"{done.files}/{private}").status_code == 404
-    assert "It has: digits.txt." in done.problem(done.get(f"{done.files}/x"), 404)["detail"]
+        assert done.get(private).status_code == 404
+    assert "It has: digits.txt." in done.api.problem(done.get("x"), 404)["detail"]
 
 
-def test_a_file_that_is_gone_from_the_store_is_not_found(done):
-    done.services.artifacts(done.done).delete()
-    assert "not in the store any more" in done.problem(done.get(f"{done.files}/digits.txt"), 404)["detail"]
+def test_a_file_that_is_gone_from_the_store_is_not_found(done: Ended) -> None:
+    done.api.services.artifacts(done.job).delete()
+    assert "no longer in the store" in done.api.problem(done.get(), 404)["detail"]
 
 
-def test_a_job_that_failed_has_no_result_but_a_reason(stocked):
+def test_without_a_result_the_reason_is_told_and_there_is_no_archive(stocked: Api) -> None:
     job = stocked.job()
     stocked.end(job, JobState.failed)
     stocked.tell(job, "why", error="The renderer is gone.")
     assert "The renderer is gone." in stocked.problem(stocked.get(f"/v1/jobs/{job}/result"), 409)["detail"]
+    assert "has no artifacts" in stocked.problem(stocked.get(f"/v1/jobs/{job}/archive"), 404)["detail"]
 
 
-def test_the_etag_is_the_hash_of_the_bytes_and_saves_sending_them_again(done):
-    first = done.get(f"{done.files}/digits.txt")
+def test_the_etag_is_the_hash_of_the_bytes_and_saves_sending_them_again(done: Ended) -> None:
+    first = done.get()
     etag = first.headers["etag"]
     assert etag == f'"{hashlib.sha256(TEN).hexdigest()}"'
     assert first.headers["cache-control"] == "private, no-cache"
     for known in (etag, f'"x", {etag}', f"W/{etag}", "*"):
-        again = done.get(f"{done.files}/digits.txt", headers={"If-None-Match": known})
+        again = done.get("digits.txt", {"If-None-Match": known})
         assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", etag)
-    assert done.get(f"{done.files}/digits.txt", headers={"If-None-Match": '"x"'}).content == TEN
+    assert done.get("digits.txt", {"If-None-Match": '"x"'}).content == TEN
 
 
-def test_a_file_of_a_job_that_goes_on_is_hashed_anew_each_time(stocked):
+def test_a_file_of_a_job_that_goes_on_is_hashed_anew_each_time(stocked: Api) -> None:
     job = stocked.job()
     stocked.end(job, JobState.running, a__txt=b"one")
     first = stocked.get(f"/v1/jobs/{job}/artifacts/a.txt").headers["etag"]
@@ -82,8 +92,8 @@ def test_a_file_of_a_job_that_goes_on_is_hashed_anew_each_time(stocked):
         ("bytes=-3", 206, b"789"),
         ("bytes=9-99", 206, b"9"),
         ("bytes=-99", 206, TEN),
-        ("bytes=10-", 416, None),
-        ("bytes=-0", 416, None),
+        ("bytes=10-", 416, b""),
+        ("bytes=-0", 416, b""),
         ("bytes=5-4", 200, TEN),
         ("bytes=0-1,4-5", 200, TEN),
         ("bytes=-", 200, TEN),
@@ -91,11 +101,11 @@ def test_a_file_of_a_job_that_goes_on_is_hashed_anew_each_time(stocked):
         ("lines=1-2", 200, TEN),
     ],
 )
-def test_a_range_of_a_file(done, asked, status, content):
-    answer = done.get(f"{done.files}/digits.txt", headers={"Range": asked})
+def test_a_range_of_a_file(done: Ended, asked: str, status: int, content: bytes) -> None:
+    answer = done.get("digits.txt", {"Range": asked})
     assert answer.status_code == status
     if status == 416:
-        assert done.problem(answer, 416)["type"] == "urn:trompe:no-such-range"
+        assert done.api.problem(answer, 416)["type"] == "urn:trompe:no-such-range"
         assert answer.headers["content-range"] == "bytes */10"
         return
     assert answer.content == content
@@ -105,51 +115,43 @@ def test_a_range_of_a_file(done, asked, status, content):
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
 @given(st.integers(0, 9), st.integers(0, 12))
-def test_content_range_says_which_bytes_these_are(done, first, length):
-    answer = done.get(f"{done.files}/digits.txt", headers={"Range": f"bytes={first}-{first + length}"})
+def test_content_range_says_which_bytes_these_are(done: Ended, first: int, length: int) -> None:
+    answer = done.get("digits.txt", {"Range": f"bytes={first}-{first + length}"})
     last = min(first + length, 9)
     assert answer.headers["content-range"] == f"bytes {first}-{last}/10"
     assert answer.content == TEN[first : last + 1]
 
 
-def test_a_download_goes_on_only_if_the_file_is_the_same(done):
-    etag = done.get(f"{done.files}/digits.txt").headers["etag"]
-    part = {"Range": "bytes=5-", "If-Range": etag}
-    assert done.get(f"{done.files}/digits.txt", headers=part).content == TEN[5:]
-    assert done.get(f"{done.files}/digits.txt", headers=part | {"If-Range": '"other"'}).content == TEN
+def test_a_download_goes_on_only_if_the_file_is_the_same(done: Ended) -> None:
+    part = {"Range": "bytes=5-", "If-Range": done.get().headers["etag"]}
+    assert done.get(headers=part).content == TEN[5:]
+    assert done.get(headers=part | {"If-Range": '"other"'}).content == TEN
 
 
-def test_head_tells_size_and_hash_alone(done):
-    head = done.request("HEAD", f"{done.files}/digits.txt")
+def test_head_tells_size_and_hash_alone_and_an_empty_file_is_served(done: Ended) -> None:
+    head = done.api.request("HEAD", f"/v1/jobs/{done.job}/artifacts/digits.txt")
     assert (head.status_code, head.content, head.headers["content-length"]) == (200, b"", "10")
-    assert head.headers["etag"] == done.get(f"{done.files}/digits.txt").headers["etag"]
+    assert head.headers["etag"] == done.get().headers["etag"]
+    assert done.get("empty.txt").content == b""
+    assert done.get("empty.txt", {"Range": "bytes=0-"}).status_code == 416
 
 
-def test_an_empty_file_is_served(done):
-    assert done.get(f"{done.files}/empty.txt").content == b""
-    assert done.get(f"{done.files}/empty.txt", headers={"Range": "bytes=0-"}).status_code == 416
-
-
-def test_the_archive_holds_all_artifacts_and_nothing_else(done):
-    answer = done.get(f"/v1/jobs/{done.done}/archive")
+def test_the_archive_holds_all_artifacts_and_nothing_else(done: Ended) -> None:
+    answer = done.api.get(f"/v1/jobs/{done.job}/archive")
     assert answer.headers["content-type"] == "application/zip"
-    assert answer.headers["content-disposition"] == f'attachment; filename="trompe-{done.done}.zip"'
+    assert answer.headers["content-disposition"] == f'attachment; filename="trompe-{done.job}.zip"'
     archive = zipfile.ZipFile(io.BytesIO(answer.content))
     assert archive.testzip() is None
     assert archive.namelist() == ["result.json", "digits.txt", "empty.txt"]
     assert archive.read("digits.txt") == TEN
-    assert done.get(f"/v1/jobs/{done.done}/archive").content == answer.content
+    assert done.api.get(f"/v1/jobs/{done.job}/archive").content == answer.content
 
 
-def test_there_is_no_archive_of_nothing(stocked):
-    assert "no artifacts to pack" in stocked.problem(stocked.get(f"/v1/jobs/{stocked.job()}/archive"), 404)["detail"]
-
-
-def test_an_archive_is_made_part_by_part(stocked, monkeypatch):
+def test_an_archive_is_made_part_by_part(stocked: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(downloads, "PART", 1000)
     job = stocked.job()
     stocked.end(job, big__png=bytes(50_000), text__txt=b"x" * 5000)
     found = stocked.services.store.get(job)
-    parts = list(downloads.zip_stream(stocked.services.artifacts(job), found.artifacts, time=found.finished))
+    parts = list(downloads.zip_stream(stocked.services.artifacts(job), found.artifacts, time=found.created))
     assert max(map(len, parts)) < 2000
     assert zipfile.ZipFile(io.BytesIO(b"".join(parts))).read("big.png") == bytes(50_000)

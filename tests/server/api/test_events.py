@@ -3,13 +3,16 @@
 import asyncio
 import json
 import time
+from collections.abc import Callable
+from unittest.mock import Mock
 
 import httpx
 import pytest
 
+from tests.server.api.conftest import Api
 from trompe_server.api import following
-from trompe_server.database import DatabaseDownError
-from trompe_shared.api import JobState, Progress
+from trompe_server.storage.database import DatabaseDownError
+from trompe_shared.api import Job, JobState, Progress
 
 
 def progress(fraction: float) -> dict[str, object]:
@@ -23,7 +26,7 @@ def sse(response: httpx.Response) -> list[dict[str, str]]:
     return [dict(line.split(": ", 1) for line in block.splitlines()) for block in blocks]
 
 
-def test_events_are_replayed_from_the_beginning_or_after_the_last_one_seen(stocked):
+def test_events_are_replayed_from_the_beginning_or_after_the_last_one_seen(stocked: Api) -> None:
     job = stocked.job()
     stocked.tell(job, "started", state="running")
     for fraction in (0.25, 0.5):
@@ -45,87 +48,88 @@ def test_events_are_replayed_from_the_beginning_or_after_the_last_one_seen(stock
         assert sse(stocked.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": late})) == []
 
 
-def follow(api, job, *, meanwhile) -> list[dict[str, str]]:
-    """The events of a job while ``meanwhile`` happens."""
+def follow(api: Api, job: str, *, meanwhile: Callable[[], None]) -> httpx.Response:
+    """The stream of a job while ``meanwhile`` happens."""
 
     async def both() -> httpx.Response:
-        transport = httpx.ASGITransport(api.app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://trompe") as client:
+        async with api.connect() as client:
             stream = asyncio.create_task(client.get(f"/v1/jobs/{job}/events"))
             await asyncio.sleep(0.1)
             await asyncio.to_thread(meanwhile)
             return await asyncio.wait_for(stream, 10)
 
-    return sse(asyncio.run(both()))
+    return asyncio.run(both())
 
 
 @pytest.fixture
-def quick(monkeypatch):
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(following, "INTERVAL", 0.02)
     monkeypatch.setattr(following, "PATIENCE", 0.05)
 
 
-def test_a_stream_ends_with_the_event_that_ends_the_job(stocked, quick):
+@pytest.mark.usefixtures("quick")
+def test_a_stream_ends_with_the_event_that_ends_the_job(stocked: Api) -> None:
     job = stocked.job()
-    events = follow(stocked, job, meanwhile=lambda: stocked.end(job))
+    events = sse(follow(stocked, job, meanwhile=lambda: stocked.end(job)))
     assert [json.loads(event["data"])["state"] for event in events] == ["queued", "succeeded"]
 
 
-def test_a_stream_ends_when_its_job_is_deleted(stocked, quick, monkeypatch):
+@pytest.mark.usefixtures("quick")
+def test_a_stream_ends_when_its_job_is_deleted(stocked: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     job = stocked.job()
 
-    def delete():
+    def delete() -> None:
         monkeypatch.setattr(stocked.services.store, "events", lambda *_, **__: [])
         stocked.end(job)
         stocked.services.store.delete(job)
 
-    assert [event["id"] for event in follow(stocked, job, meanwhile=delete)] == ["1"]
+    assert [event["id"] for event in sse(follow(stocked, job, meanwhile=delete))] == ["1"]
 
 
-def test_a_follower_waits_for_a_database_that_is_away_for_a_moment(stocked, quick, monkeypatch):
+@pytest.mark.usefixtures("quick")
+def test_a_follower_waits_for_a_database_that_is_away_for_a_moment(
+    stocked: Api, monkeypatch: pytest.MonkeyPatch
+) -> None:
     job, store = stocked.job(), stocked.services.store
-    get, failures = store.get, []
+    get, failures = store.get, list[str]()
 
-    def flaky(job):
+    def flaky(job: str) -> Job:
         if len(failures) < 3:
             failures.append(job)
             raise DatabaseDownError("The database is away.")
         return get(job)
 
-    def lose():
+    def lose() -> None:
         monkeypatch.setattr(store, "get", flaky)
         time.sleep(0.3)
         monkeypatch.setattr(store, "get", get)
         stocked.end(job)
 
-    events = follow(stocked, job, meanwhile=lose)
+    events = sse(follow(stocked, job, meanwhile=lose))
     assert [json.loads(event["data"])["state"] for event in events] == ["queued", "succeeded"]
     assert len(failures) == 3
 
 
-def test_a_connection_in_which_nothing_happens_is_kept_alive(stocked, quick, monkeypatch):
+@pytest.mark.usefixtures("quick")
+def test_a_connection_in_which_nothing_happens_is_kept_alive(stocked: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(following, "KEEP_ALIVE", 0.05)
     job = stocked.job()
 
-    async def look() -> str:
-        transport = httpx.ASGITransport(stocked.app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://trompe") as client:
-            stream = asyncio.create_task(client.get(f"/v1/jobs/{job}/events"))
-            await asyncio.sleep(0.5)
-            await asyncio.to_thread(stocked.end, job, JobState.cancelled)
-            return (await stream).text
+    def wait() -> None:
+        time.sleep(0.4)
+        stocked.end(job, JobState.cancelled)
 
-    assert asyncio.run(look()).count("\n: ping") >= 3
+    assert follow(stocked, job, meanwhile=wait).text.count("\n: ping") >= 3
 
 
-def test_many_followers_of_waiting_jobs_ask_the_database_seldom(stocked, monkeypatch):
-    job, looks = stocked.job(), []
-    look = following._look
-    monkeypatch.setattr(following, "_look", lambda *args: looks.append(time.monotonic()) or look(*args))
+def test_many_followers_of_waiting_jobs_ask_the_database_seldom(stocked: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = stocked.job()
+    look = Mock(side_effect=following._look)
+    monkeypatch.setattr(following, "_look", look)
 
-    def wait():
+    def wait() -> None:
         time.sleep(2.5)
         stocked.end(job)
 
     follow(stocked, job, meanwhile=wait)
-    assert len(looks) <= 9
+    assert look.call_count <= 9

@@ -3,28 +3,26 @@
 import asyncio
 import threading
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Any
 
 import httpx
+import pytest
 
+from tests.server.api.conftest import CLASSES, GIF, Api
 from trompe_client._plan import CLASSIFIER_SUFFIXES
 from trompe_server.api.library import UPLOADS
 from trompe_server.classifiers.registry import ENDINGS
 from trompe_server.library import Library
-
-GIF = bytes.fromhex("47494638396101000100800000000000ffffff2c00000000010001000002024401003b")
-"""A picture of one pixel."""
+from trompe_shared.api import ObjectInfo
 
 
-CLASSES = ["mug, cup", "vase", "toilet tissue, toilet paper"]
-
-
-def stored_files(api) -> list[Path]:
+def stored_files(api: Api) -> list[Path]:
     return [file for file in (api.services.settings.data / "library").rglob("*") if file.is_file()]
 
 
-def test_an_object_is_found_by_its_id_its_beginning_and_its_name(api, triangle_zip):
+def test_an_object_is_found_by_its_id_its_beginning_and_its_name(api: Api, triangle_zip: Callable[..., bytes]) -> None:
     uploaded = api.upload_object(triangle_zip()).json()
     assert uploaded["name"] == "triangle"
     assert (uploaded["triangles"], uploaded["materials"]) == (1, ["paint"])
@@ -34,49 +32,52 @@ def test_an_object_is_found_by_its_id_its_beginning_and_its_name(api, triangle_z
     assert uploaded in api.get("/v1/objects").json()
 
 
-def test_the_same_object_is_stored_once(api, triangle_zip):
+def test_the_same_object_is_stored_once(api: Api, triangle_zip: Callable[..., bytes]) -> None:
     first = api.upload_object(triangle_zip()).json()
     again = api.upload_object(triangle_zip(), "other.zip").json()
     assert again["id"] == first["id"]
     assert [each["name"] for each in api.get("/v1/objects").json() if not each["shipped"]] == ["other"]
 
 
-def test_a_broken_archive_is_refused_and_nothing_is_kept(api, triangle_zip):
+def test_a_broken_archive_is_refused_and_nothing_is_kept(api: Api, triangle_zip: Callable[..., bytes]) -> None:
     refusal = api.problem(api.upload_object(triangle_zip()[:-40]), 422)
     assert refusal["type"] == "urn:trompe:invalid-object"
     assert stored_files(api) == []
 
 
-def test_a_broken_classifier_is_refused_and_nothing_is_kept(api):
+def test_a_broken_classifier_is_refused_and_nothing_is_kept(api: Api) -> None:
     refusal = api.problem(api.upload_classifier(b"?"), 422)
     assert (refusal["type"], refusal["detail"]) == ("urn:trompe:invalid-classifier", "The classifier is broken.")
-    assert "neither a .pt2" in api.problem(api.upload_classifier(b"W", "net.pth"), 422)["detail"]
     assert (
-        "2 class names came with a classifier of 3"
+        "is not a supported classifier: upload a .pt2"
+        in api.problem(api.upload_classifier(b"W", "net.pth"), 422)["detail"]
+    )
+    assert (
+        "2 class names for a classifier of 3"
         in api.problem(api.upload_classifier(b"W", classes='["a", "b"]'), 422)["detail"]
     )
     assert "JSON list" in api.problem(api.upload_classifier(b"W", classes="a, b, c"), 422)["detail"]
     assert stored_files(api) == []
 
 
-def test_a_classifier_sent_again_without_its_class_names_keeps_them(stocked):
+def test_a_classifier_sent_again_without_its_class_names_keeps_them(stocked: Api) -> None:
     again = stocked.upload_classifier(b"W", "again.pt2").json()
     assert (again["name"], again["classes"]) == ("again", CLASSES)
     renamed = stocked.upload_classifier(b"W", classes='["a", "b", "c"]').json()
     assert (renamed["id"], renamed["classes"]) == (again["id"], ["a", "b", "c"])
 
 
-def test_a_background_is_an_image(api, tmp_path: Path):
+def test_a_background_is_an_image(api: Api, tmp_path: Path) -> None:
     stored = api.post("/v1/backgrounds", files={"file": ("beach.gif", GIF)}).json()
     assert stored["name"] == "beach"
     assert api.get("/v1/backgrounds").json() == [stored]
     assert (
-        "cannot be read as an image"
+        "is not a readable image"
         in api.problem(api.post("/v1/backgrounds", files={"file": ("x.png", b"no")}), 422)["detail"]
     )
 
 
-def test_an_upload_over_the_limit_is_refused_however_it_comes(api):
+def test_an_upload_over_the_limit_is_refused_however_it_comes(api: Api) -> None:
     announced = api.upload_object(b"0" * 200_000)
     assert "0.0953674 MiB" in api.problem(announced, 413)["detail"]
 
@@ -90,27 +91,31 @@ def test_an_upload_over_the_limit_is_refused_however_it_comes(api):
     assert "larger than" in api.problem(chunked, 413)["detail"]
 
 
-def test_the_client_uploads_the_files_that_classifiers_are_read_from():
+def test_the_client_uploads_the_files_that_classifiers_are_read_from() -> None:
     assert set(CLASSIFIER_SUFFIXES) == set(ENDINGS)
 
 
-def test_shipped_things_are_named_by_name(stocked, triangle_zip):
+def test_shipped_things_are_named_by_name(stocked: Api, triangle_zip: Callable[..., bytes]) -> None:
     stocked.upload_object(triangle_zip(), "mug.zip")
-    spec = stocked.submit(object="mug", classifier="tiny").json()["spec"]
-    assert (spec["object"], spec["classifier"]) == ("mug", "tiny")
+    spec = stocked.submit("mug", classifier="tiny").json()["spec"]
+    assert (spec["object"], spec["victim"]["classifier"]) == ("mug", "tiny")
 
 
-def test_a_name_that_several_uploads_share_is_refused_with_their_ids(stocked, triangle_zip):
+def test_a_name_that_several_uploads_share_is_refused_with_their_ids(
+    stocked: Api, triangle_zip: Callable[..., bytes]
+) -> None:
     other = stocked.upload_object(triangle_zip(colour=(0, 0, 255))).json()["id"]
     assert other[:12] in stocked.problem(stocked.submit(), 422)["detail"]
     assert stocked.submit(object=other).status_code == 201
 
 
-def test_uploads_are_looked_into_a_few_at_a_time_and_nothing_else_waits_for_them(api, triangle_zip, monkeypatch):
+def test_uploads_are_looked_into_a_few_at_a_time_and_nothing_else_waits_for_them(
+    api: Api, triangle_zip: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
     at_work, most, lock = 0, 0, threading.Lock()
     add = Library.add_object
 
-    def slowly(*arguments, **options):
+    def slowly(*arguments: Any, **options: Any) -> ObjectInfo:
         nonlocal at_work, most
         with lock:
             at_work += 1
@@ -123,8 +128,7 @@ def test_uploads_are_looked_into_a_few_at_a_time_and_nothing_else_waits_for_them
     monkeypatch.setattr(Library, "add_object", slowly)
 
     async def many() -> list[httpx.Response]:
-        transport = httpx.ASGITransport(api.app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://trompe") as client:
+        async with api.connect() as client:
             posts = [client.post("/v1/objects", files={"file": ("a.zip", triangle_zip())}) for _ in range(10)]
             uploads = asyncio.gather(*posts)
             await asyncio.sleep(0.05)

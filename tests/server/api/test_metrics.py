@@ -1,13 +1,18 @@
-"""What Prometheus is told."""
+"""Metrics for Prometheus."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterable
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from trompe_server.access import Right
-from trompe_server.jobs.store import Statistics
+from tests.server.api.conftest import Api
+from trompe_server.storage.tokens import Right
 from trompe_shared.api import JobState
 
 
-def scrape(api):
+def scrape(api: Api) -> dict[tuple[str, ...], float]:
     """Samples by name and labels."""
     answer = api.get("/metrics")
     assert answer.headers["content-type"].startswith("text/plain; version=")
@@ -15,7 +20,7 @@ def scrape(api):
     return {(s.name, *sorted(s.labels.values())): s.value for family in families for s in family.samples}
 
 
-def test_jobs_are_counted_by_state_and_the_age_of_the_queue_is_told(stocked):
+def test_jobs_are_counted_by_state_and_the_age_of_the_queue_is_told(stocked: Api) -> None:
     jobs = [stocked.job() for _ in range(3)]
     stocked.end(jobs[0], JobState.failed)
     samples = scrape(stocked)
@@ -25,19 +30,27 @@ def test_jobs_are_counted_by_state_and_the_age_of_the_queue_is_told(stocked):
     assert 0 < samples["trompe_queue_age_seconds",] < 60
 
 
-def test_the_work_of_all_workers_is_summed_up(api, monkeypatch):
-    figures = Statistics({}, 0.0, 30, 2.5, 1200, 60.0, 300, 9.0)
-    monkeypatch.setattr(api.services.store, "statistics", lambda: figures)
+COUNT = """
+from prometheus_client import Counter
+Counter("trompe_attack_steps", "Steps of attacks.").inc(30)
+Counter("trompe_phase_seconds", "Seconds by phase.", ["phase"]).labels("judge").inc(2.5)
+"""
+
+
+def test_counters_of_the_workers_are_summed_over_their_processes(api: Api) -> None:
+    assert ("trompe_attack_steps_total",) not in scrape(api)
+    folder = api.services.settings.data / "metrics"
+    folder.mkdir()
+    assert ("trompe_attack_steps_total",) not in scrape(api)
+    for _ in range(2):
+        environment = os.environ | {"PROMETHEUS_MULTIPROC_DIR": str(folder)}
+        subprocess.run([sys.executable, "-c", COUNT], env=environment, check=True)
     samples = scrape(api)
-    assert samples["trompe_attack_steps_total",] == 30
-    assert samples["trompe_step_seconds_total",] == 2.5
-    assert samples["trompe_classifier_images_total",] == 1200
-    assert samples["trompe_classifier_seconds_total",] == 60.0
-    assert samples["trompe_target_renders_total",] == 300
-    assert samples["trompe_target_seconds_total",] == 9.0
+    assert samples["trompe_attack_steps_total",] == 60
+    assert samples["trompe_phase_seconds_total", "judge"] == 5
 
 
-def test_requests_are_counted_by_route_and_status_and_timed(stocked):
+def test_requests_are_counted_by_route_and_status_and_timed(stocked: Api) -> None:
     job = stocked.job()
     for path in (f"/v1/jobs/{job}", "/v1/jobs/a", "/v1/jobs/b", "/nothing", "/nowhere", "/v1/jobs?limit=0"):
         stocked.get(path)
@@ -50,7 +63,7 @@ def test_requests_are_counted_by_route_and_status_and_timed(stocked):
     assert samples["trompe_http_request_seconds_count", "/v1/jobs/{job}", "GET"] == 3
 
 
-def test_a_request_that_is_turned_away_is_counted_too(api):
+def test_a_request_that_is_turned_away_is_counted_too(api: Api) -> None:
     api.token("ci", Right.read)
     api.get("/v1/jobs")
     header = api.token("prometheus", Right.read)
@@ -59,8 +72,8 @@ def test_a_request_that_is_turned_away_is_counted_too(api):
     assert 'trompe_http_requests_total{method="GET",route="none",status="401"} 2.0' in text
 
 
-def test_made_up_methods_and_paths_make_no_new_series(api):
-    def make_up(numbers) -> int:
+def test_made_up_methods_and_paths_make_no_new_series(api: Api) -> None:
+    def make_up(numbers: Iterable[int]) -> int:
         for number in numbers:
             api.request("GET", f"/nothing/{number}")
             api.request(f"BREW{number}", "/v1/jobs")

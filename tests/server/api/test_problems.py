@@ -2,14 +2,19 @@
 
 import errno
 import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
-from trompe_server.database import DatabaseDownError
+from tests.server.api.conftest import Api
 from trompe_server.errors import ServiceError
-from trompe_server.jobs.store import JobStore
 from trompe_server.library import Library
+from trompe_server.queue.store import JobStore
+from trompe_server.storage.database import DatabaseDownError
 
 
 @pytest.mark.parametrize(
@@ -38,16 +43,21 @@ from trompe_server.library import Library
         ("GET", "/v1", 404),
     ],
 )
-def test_every_error_is_problem_details(api, method: str, path: str, status: int):
+def test_every_error_is_problem_details(api: Api, method: str, path: str, status: int) -> None:
     assert api.problem(api.request(method, path), status)["instance"] == path.partition("?")[0]
 
 
-def test_a_mistake_of_the_server_is_problem_details_without_its_secrets(api, monkeypatch: pytest.MonkeyPatch):
+def test_a_mistake_of_the_server_is_told_without_its_secrets_and_logged_with_the_id_that_the_client_was_told(
+    api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr(JobStore, "page", lambda *_, **__: 1 / 0)
-    assert "division" not in api.problem(api.get("/v1/jobs"), 500)["detail"]
+    told = api.problem(api.get("/v1/jobs"), 500)
+    assert "division" not in told["detail"]
+    assert f"request {told['request_id']} failed" in caplog.text
+    assert "ZeroDivisionError" in caplog.text
 
 
-def test_the_service_is_ready_when_nothing_is_missing(api, missing):
+def test_the_service_is_ready_when_nothing_is_missing(api: Api, missing: list[str]) -> None:
     assert api.get("/healthz").json() == {"status": "ok"}
     assert api.get("/readyz").json() == {"status": "ready"}
     missing.append("the attack worker is not up")
@@ -55,26 +65,24 @@ def test_the_service_is_ready_when_nothing_is_missing(api, missing):
     assert api.get("/healthz").status_code == 200
 
 
-def test_a_body_that_is_no_json_is_told_apart_from_one_that_is_wrong(api):
+def test_a_body_that_is_no_json_is_told_apart_from_one_that_is_wrong(api: Api) -> None:
     broken = api.post("/v1/jobs", content=b"{", headers={"Content-Type": "application/json"})
     assert "JSON" in api.problem(broken, 422)["detail"]
     api.problem(api.post("/v1/jobs", content=b"object=mug"), 422)
 
 
-def test_a_database_that_is_away_is_a_matter_of_seconds_and_no_mistake(api, monkeypatch, caplog):
+def test_a_database_that_is_away_is_a_matter_of_seconds_and_no_mistake(
+    api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     for error in (DatabaseDownError("It is away."), PoolTimeoutError("QueuePool limit")):
-
-        def away(*_, error=error, **__):
-            raise error
-
-        monkeypatch.setattr(JobStore, "page", away)
+        monkeypatch.setattr(JobStore, "page", Mock(side_effect=error))
         answer = api.get("/v1/jobs")
         assert api.problem(answer, 503)["type"] == "urn:trompe:database-down"
         assert answer.headers["retry-after"] == "5"
     assert "Traceback" not in caplog.text
 
 
-def test_a_real_database_that_cannot_be_opened_is_answered_with_503_on_every_path(api, tmp_path):
+def test_a_real_database_that_cannot_be_opened_is_answered_with_503_on_every_path(api: Api, tmp_path: Path) -> None:
     api.services.store.close()
     for file in tmp_path.glob("trompe.sqlite*"):
         file.unlink()
@@ -85,8 +93,10 @@ def test_a_real_database_that_cannot_be_opened_is_answered_with_503_on_every_pat
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_a_full_disk_is_named(api, triangle_zip, monkeypatch, wrapped):
-    def full(*_, **__):
+def test_a_full_disk_is_named(
+    api: Api, triangle_zip: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch, wrapped: bool
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
         try:
             raise OSError(errno.ENOSPC, "No space left on device")
         except OSError as error:
@@ -100,37 +110,27 @@ def test_a_full_disk_is_named(api, triangle_zip, monkeypatch, wrapped):
     assert ("/data" in refusal["detail"]) == wrapped
 
 
-def test_a_disk_that_is_full_while_the_upload_is_spooled_is_named(api, monkeypatch):
-    class FullDisk:
-        def __init__(self, *_, **__):
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("starlette.formparsers.SpooledTemporaryFile", FullDisk)
+def test_a_disk_that_is_full_while_the_upload_is_spooled_is_named(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+    monkeypatch.setattr("starlette.formparsers.SpooledTemporaryFile", full)
     assert api.problem(api.upload_object(b"x"), 507)["type"] == "urn:trompe:disk-full"
 
 
-def test_a_database_whose_disk_is_full_is_told_so(api, monkeypatch):
-    def full(*_, **__):
-        error = sqlite3.OperationalError("database or disk is full")
-        error.sqlite_errorcode = sqlite3.SQLITE_FULL
-        raise DatabaseDownError("The database cannot be used just now.") from error
-
-    monkeypatch.setattr(JobStore, "page", full)
+def test_a_database_whose_disk_is_full_is_told_so(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    cause = sqlite3.OperationalError("database or disk is full")
+    cause.sqlite_errorcode = sqlite3.SQLITE_FULL
+    error = DatabaseDownError("The database cannot be used just now.")
+    error.__cause__ = cause
+    monkeypatch.setattr(JobStore, "page", Mock(side_effect=error))
     api.problem(api.get("/v1/jobs"), 507)
 
 
-def test_a_mistake_is_logged_with_the_id_that_the_client_was_told(api, monkeypatch, caplog):
-    monkeypatch.setattr(JobStore, "page", lambda *_, **__: 1 / 0)
-    told = api.problem(api.get("/v1/jobs"), 500)["request_id"]
-    assert f"request {told} failed" in caplog.text
-    assert "ZeroDivisionError" in caplog.text
-
-
-def test_writes_are_logged_with_request_token_and_job(stocked, caplog):
+def test_writes_are_logged_with_request_token_and_job(stocked: Api, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", logger="trompe_server.api.middleware")
     job = stocked.job()
     stocked.headers = stocked.token("ci", "write")
     answer = stocked.post(f"/v1/jobs/{job}/cancel")
     record = caplog.records[-1]
     assert record.getMessage().startswith(f"POST /v1/jobs/{job}/cancel 200 in ")
-    assert (record.request, record.token, record.job) == (answer.headers["x-request-id"], "ci", job)
+    told = {name: vars(record)[name] for name in ("request", "token", "job")}
+    assert told == {"request": answer.headers["x-request-id"], "token": "ci", "job": job}

@@ -1,4 +1,4 @@
-// What all pages share: requests with the API's own error messages, buttons that post, one notice for what goes wrong.
+// Shared by all pages: requests with the API's error messages, buttons that post, and one notice for errors.
 
 const notice = document.getElementById("notice");
 
@@ -14,7 +14,7 @@ export class Refused extends Error {
   }
 }
 
-// The JSON of an answer. Throws Refused with the server's own words, or a TypeError where there is no connection.
+// The JSON of an answer. Throws Refused with the server's message, or a TypeError without a connection.
 export async function ask(path, options = {}) {
   const answer = await fetch(path, options);
   if (answer.status === 401) location.assign(`/login?next=${encodeURIComponent(location.pathname)}`);
@@ -25,7 +25,7 @@ export async function ask(path, options = {}) {
 export const words = (error) =>
   error instanceof Refused ? error.message : "The server cannot be reached; check that it runs, then try again.";
 
-// Events of a stream, again and again after a lost connection; `onMessage` gets each one's data. Returns a stop function.
+// Follow a stream, across lost connections; `onMessage` gets the data of each event. Returns a stop function.
 export function follow(path, name, onMessage) {
   let source, timer, lost = false;
   const open = () => {
@@ -37,7 +37,7 @@ export function follow(path, name, onMessage) {
     };
     source.onerror = () => {
       lost = true;
-      tell("The connection to the server is lost; trying again.");
+      tell("The connection to the server is lost; reconnecting.");
       if (source.readyState === EventSource.CLOSED) timer = setTimeout(open, 2000);
     };
   };
@@ -50,7 +50,7 @@ export function follow(path, name, onMessage) {
   return stop;
 }
 
-// Buttons with data-post: what they start is shown by the page that they lead to.
+// Buttons with data-post.
 document.addEventListener("click", async (event) => {
   const button = event.target.closest("button[data-post]");
   if (!button) return;

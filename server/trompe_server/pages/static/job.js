@@ -1,4 +1,4 @@
-// A job that runs: its progress as it comes, and its result once it is there.
+// A running job: its progress, then its result.
 import { ask, follow } from "./common.js";
 
 const live = document.getElementById("live");
@@ -10,7 +10,12 @@ function show(progress) {
   put("step", progress.step == null ? null : `${progress.step} of ${progress.steps}`);
   put("loss", progress.loss?.toFixed(3));
   put("fooled", progress.fooled == null ? null : `${Math.round(100 * progress.fooled)} %`);
-  put("eta", progress.eta_seconds == null ? null : span(progress.eta_seconds));
+  put("eta", progress.eta_seconds == null ? null : left(progress));
+}
+
+function left(progress) {
+  const most = span(progress.eta_seconds), least = span(progress.eta_least_seconds ?? progress.eta_seconds);
+  return least === most ? most : `${least} to ${most}`;
 }
 
 const span = (seconds) => (seconds < 90 ? `${Math.round(seconds)} s` : `${Math.round(seconds / 60)} min`);
@@ -21,7 +26,7 @@ function preview(progress) {
   const chunk = Math.floor((progress.step ?? 0) / 5);
   if (!chunk || chunk === shown) return;
   const picture = new Image(448, 224);
-  picture.alt = "The object as it is now, in the surrogate and in the target renderer";
+  picture.alt = "The object at present, in the surrogate and in the target renderer";
   picture.onload = () => {
     figure.querySelector("img").replaceWith(picture);
     figure.hidden = false;
@@ -40,7 +45,7 @@ if (live) {
       location.reload();
     }
   });
-  // After the server was away a stream can end without its last event: ask now and then.
+  // A stream can end without its last event if the server restarts, so poll too.
   setInterval(async () => {
     const job = await ask(`/v1/jobs/${live.dataset.job}`).catch(() => null);
     if (job && !["queued", "running"].includes(job.state)) location.reload();

@@ -1,4 +1,4 @@
-// A list of jobs that keeps up: the server sends rows as it would have put them into the page.
+// A live list of jobs: the server sends changed rows as HTML.
 import { follow } from "./common.js";
 
 const table = document.querySelector("table[data-stream]");

@@ -1,14 +1,16 @@
-// The form of a new job: uploads at once, checks with the API's own words before anything is queued.
+// The form of a new job: uploads at once, and shows the API's faults before anything is queued.
 import { Refused, ask, words } from "./common.js";
 
 const form = document.getElementById("new");
-const { object, classifier, label, background } = form.elements;
+const { object } = form.elements;
+const option = (name) => form.elements[name];
+const classifier = option("victim.classifier"), label = option("goal.label");
 const file = document.getElementById("file");
 const drop = document.getElementById("drop");
 const says = document.getElementById("file-says");
 const keys = new Map();
 
-// The same request sent twice makes one job; a changed one another.
+// The same request has the same key, and makes one job.
 function keyOf(body) {
   if (!keys.has(body)) keys.set(body, Array.from(crypto.getRandomValues(new Uint32Array(4)), (n) => n.toString(16)).join("-"));
   return keys.get(body);
@@ -21,7 +23,8 @@ function complain(error, fallback = "") {
     ? error.problem.errors.map((each) => [String(each.field ?? each.loc?.at(-1) ?? ""), each.message ?? each.msg ?? ""])
     : [[fallback, words(error)]];
   for (const [field, text] of problems) {
-    const known = [...form.querySelectorAll("[data-error]")].find((each) => field && each.dataset.error.split(" ").includes(field));
+    const known = [...form.querySelectorAll("[data-error]")].find(
+      (each) => each.dataset.error && each.dataset.error.split(" ").some((name) => `${field}.`.startsWith(`${name}.`)));
     const place = known ?? form.querySelector('[data-error=""]');
     place.textContent = known || !field ? text : `${field}: ${text}`;
     place.hidden = false;
@@ -50,18 +53,22 @@ async function take(picked) {
   const stored = await upload("/v1/objects", picked, object, "object");
   says.textContent = stored
     ? `${stored.name}: ${stored.triangles} triangles, ${Object.keys(stored.textures).length} textures`
-    : `${picked.name} was not taken`;
+    : `${picked.name} was refused`;
   if (stored) await chosen();
 }
 
-// The turntable is one picture of all turns side by side; the slider shows one of them.
+// The turntable is one picture of all turns, side by side; the slider shows one of them.
 let turntable = null;
 async function chosen() {
-  const option = object.selectedOptions[0];
-  if (option?.dataset.label) label.value = option.dataset.label;
+  const known = object.selectedOptions[0]?.dataset.label;
+  if (known && known !== label.value) {
+    label.value = known;
+    for (const more of [...form.querySelectorAll(`[name='${label.name}']`)].slice(1)) more.remove();
+  }
   const figure = document.querySelector(".turntable");
-  const asked = new URLSearchParams({ background: background.value });
-  if (form.elements.distance.value) asked.set("distance", form.elements.distance.value);
+  const asked = new URLSearchParams({ background: option("views.background").value });
+  if (option("views.distance").value) asked.set("distance", option("views.distance").value);
+  if (option("views.renderers")) asked.set("renderer", option("views.renderers").value);
   const answer = await fetch(`/jobs/turntable/${encodeURIComponent(object.value)}.png?${asked}`).catch(() => null);
   figure.hidden = !answer?.ok;
   if (!answer?.ok) return;
@@ -82,16 +89,15 @@ async function classes() {
 }
 
 function request() {
-  const given = new FormData(form);
-  const options = JSON.parse(form.querySelector("[name=preset]:checked").dataset.options);
-  const spec = { ...options, object: given.get("object"), classifier: given.get("classifier"), label: given.get("label"), priority: "interactive" };
-  if (/^\d+$/.test(spec.label)) spec.label = Number(spec.label);
-  spec.attack_on = given.get("attack_on");
-  const numbers = spec.attack_on === "texture" ? ["epsilon", "tau", "distance", "seed"] : ["distance", "seed"];
-  for (const name of numbers) if (given.get(name)) spec[name] = Number(given.get(name));
-  if (spec.tau !== undefined) spec.saliency_scope = given.get("saliency_scope");
-  if (given.get("background")) spec.background = [given.get("background")];
-  return JSON.stringify(spec);
+  const spec = JSON.parse(form.querySelector("[name=preset]:checked").dataset.options);
+  for (const input of form.querySelectorAll("[name*='.']")) {
+    const [part, field] = input.name.split(".");
+    const isNumber = ["number", "range"].includes(input.type) || (input.name === label.name && /^\d+$/.test(input.value));
+    const value = input.type === "checkbox" ? input.checked : isNumber && input.value ? Number(input.value) : input.value;
+    const several = input.name === label.name;
+    if (value !== "") spec[part] = { ...spec[part], [field]: several ? [...(spec[part]?.[field] ?? []), value] : value };
+  }
+  return JSON.stringify({ ...spec, object: object.value, priority: "interactive" });
 }
 
 const send = (path, headers = {}) =>
@@ -120,12 +126,19 @@ document.getElementById("classifier-file").onchange = async (event) => {
   if (picked && (await upload("/v1/classifiers", picked, classifier, "classifier"))) await classes();
 };
 object.onchange = chosen;
-background.onchange = chosen;
-form.elements.distance.onchange = chosen;
+option("views.background").onchange = chosen;
+option("views.distance").onchange = chosen;
+if (option("views.renderers")) option("views.renderers").onchange = chosen;
 classifier.onchange = classes;
+document.getElementById("more-labels").onclick = (event) => {
+  const more = Object.assign(label.cloneNode(), { value: "", required: false });
+  more.ariaLabel = "Another class that counts as the object";
+  event.target.before(more);
+  more.focus();
+};
 document.getElementById("turn").oninput = turn;
 form.addEventListener("input", (event) => {
-  if (event.target.name === "epsilon") form.elements["epsilon-says"].value = event.target.value;
+  if (event.target.name === "paint.epsilon") form.elements["epsilon-says"].value = event.target.value;
 });
 form.addEventListener("change", check);
 form.addEventListener("submit", async (event) => {

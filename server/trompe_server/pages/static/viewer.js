@@ -7,12 +7,15 @@ const element = (tag, properties = {}, ...children) => {
   return made;
 };
 
+// The first fooled view: one that was recognised shows more than one that never was.
+const first = (views) => Math.max(0, views.findIndex((view) => view.kept_before && !view.kept_after));
+
 class Viewer extends HTMLElement {
   connectedCallback() {
     this.sets = JSON.parse(this.querySelector("script").textContent);
     this.views = this.sets[0].views;
     this.build();
-    this.go(0);
+    this.go(first(this.views));
   }
 
   build() {
@@ -67,10 +70,10 @@ class Viewer extends HTMLElement {
     this.play.textContent = this.timer ? "Pause" : "Play";
   }
 
-  choose(number, index = 0) {
+  choose(number, index) {
     this.views = this.sets[number].views;
     if (this.choice) this.choice.selectedIndex = number;
-    this.go(index);
+    this.go(index ?? first(this.views));
   }
 
   go(index) {

@@ -1,0 +1,174 @@
+"""File of an experiment: objects, options, and the number of seeds.
+
+    name: quick                       # its jobs get the label experiment=quick
+    base: {classifier: tiny, steps: 20}       # options of every job; `preset: fast` sets those of a preset
+    objects: shipped                  # or {assets: $TROMPE_ASSETS}, or a table of objects
+    grid: {epsilon: [0.02, 0.05], tau: [null, 0.05]}      # all combinations; each grid of a list is one series
+    cases: {dark: {ranges: {intensity: [0.2, 0.2]}}}      # named variations, each combined with the grid
+    seeds: [0, 1, 2]
+
+Options are keywords of the SDK (``trompe_shared.api.OPTIONS``). Later ones override earlier ones: base, object, grid,
+case.
+"""
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import yaml
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from trompe_shared.api import OPTIONS
+from trompe_shared.errors import SpecError
+from trompe_shared.faults import Fault, faults_of
+from trompe_shared.presets import PRESETS
+
+__all__ = ["AssetsFolder", "Experiment", "expanded", "experiment_file", "load_experiment", "shipped_experiments"]
+
+ELSEWHERE: Final = {"object": "list objects under `objects`", "seed": "list seeds under `seeds`"}
+"""Options of a job that a file sets in another place."""
+ALLOWED: Final = [*(name for name in OPTIONS if name not in ELSEWHERE), "priority", "needs"]
+FRACTION: Final = re.compile(r"^(\d+(?:\.\d+)?)/(\d+)$")
+
+Options = dict[str, Any]
+
+
+def _known(options: Options, *, also: Sequence[str] = ()) -> Options:
+    """Options with fractions such as 4/255 as numbers. Raises ``ValueError`` for an unknown one."""
+    allowed = [*ALLOWED, *also]
+    for name in options:
+        if name in allowed:
+            continue
+        if name in ELSEWHERE:
+            raise ValueError(f"{name!r} is not an option here: {ELSEWHERE[name]}")
+        close = get_close_matches(str(name), allowed, n=1)
+        hint = f"did you mean {close[0]!r}? " if close else ""
+        raise ValueError(f"unknown option {name!r}; {hint}Options: {', '.join(allowed)}")
+    return {name: _number(value) for name, value in options.items()}
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_number(each) for each in value]
+    found = FRACTION.match(value) if isinstance(value, str) else None
+    return float(found[1]) / float(found[2]) if found else value
+
+
+def _base(options: Options) -> Options:
+    """Replace ``preset`` by its options; explicit ones override them."""
+    preset = options.pop("preset", None)
+    if preset is not None and preset not in PRESETS:
+        raise ValueError(f"unknown preset {preset!r}; presets: {', '.join(PRESETS)}")
+    return _known((dict(PRESETS[preset].options) if preset else {}) | options)
+
+
+def _case(options: Options) -> Options:
+    """A case may have seeds of its own."""
+    seeds = _seeds(options.get("seeds", [0]))
+    if not isinstance(seeds, list) or not seeds or not all(isinstance(seed, int) for seed in seeds):
+        raise ValueError(f"'seeds' must be a list of integers or their number; got {options['seeds']!r}")
+    others = _base({name: value for name, value in options.items() if name != "seeds"})
+    return others | ({"seeds": seeds} if "seeds" in options else {})
+
+
+def _object(options: Options) -> Options:
+    return _known(options, also=["file"])
+
+
+def _grids(given: Any) -> Any:
+    return [given] if isinstance(given, dict) else given
+
+
+def _grid(options: Options) -> Options:
+    known = _known({name: values for name, values in options.items() if name != "preset"})
+    for name, values in options.items():
+        if not isinstance(values, list) or not values:
+            raise ValueError(f"{name!r} must be a list of values; got {values!r}")
+    return known | {name: options[name] for name in options if name == "preset"}
+
+
+def _seeds(given: Any) -> Any:
+    return list(range(given)) if isinstance(given, int) and not isinstance(given, bool) else given
+
+
+class _Schema(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class AssetsFolder(_Schema):
+    """Objects of a folder with ``objects/objects.json``, which gives distance, elevations, class and background.
+
+    ``only``: names of the objects to use.
+    """
+
+    assets: str
+    only: list[str] = Field(default_factory=list)
+
+
+class Experiment(_Schema):
+    """A checked file. Relative paths start at ``folder``."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,62}$")]
+    description: str = ""
+    base: Annotated[Options, AfterValidator(_base)] = Field(default_factory=dict)
+    objects: (
+        Literal["shipped"]
+        | AssetsFolder
+        | Annotated[dict[str, Annotated[Options, AfterValidator(_object)]], Field(min_length=1)]
+    )
+    grid: Annotated[list[Annotated[Options, AfterValidator(_grid)]], BeforeValidator(_grids), Field(min_length=1)] = (
+        Field(default=[{}])
+    )
+    cases: dict[str, Annotated[Options, AfterValidator(_case)]] = Field(default_factory=dict)
+    seeds: Annotated[list[int], BeforeValidator(_seeds), Field(min_length=1)] = Field(default_factory=lambda: [0])
+    artifacts: list[str] = Field(default_factory=list, description="files of each job to keep; * and ? match")
+    folder: Path = Path()
+
+
+def shipped_experiments() -> dict[str, Path]:
+    """The shipped files by name."""
+    folder = Path(str(resources.files("trompe_experiments"))) / "files"
+    return {file.stem: file for file in sorted(folder.glob("*.yaml"))}
+
+
+def experiment_file(source: str | Path) -> Path:
+    """The shipped file of that name, otherwise ``source`` itself."""
+    return shipped_experiments().get(str(source), Path(source))
+
+
+def load_experiment(source: str | Path) -> Experiment:
+    """Read and check a file, or a shipped one by its name. Raises ``SpecError``."""
+    path = experiment_file(source)
+    try:
+        read = yaml.safe_load(path.read_text("utf-8"))
+    except FileNotFoundError as error:
+        raise SpecError(
+            f"No experiment {str(source)!r}. Give a file, or one of {', '.join(shipped_experiments())}."
+        ) from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise SpecError(f"{str(path)!r} is not YAML: {error}") from error
+    if not isinstance(read, Mapping):
+        raise SpecError(f"{str(path)!r} must be a table with name, objects and grid; see docs/experiments.md.")
+    try:
+        return Experiment.model_validate({**read, "folder": path.parent.absolute()})
+    except ValidationError as error:
+        raise SpecError(f"{str(path)!r}: " + "; ".join(map(_told, faults_of(error)))) from error
+
+
+def expanded(text: str) -> str:
+    """``text`` with environment variables replaced. Raises ``SpecError`` for an unset one."""
+    missing = [name for name in re.findall(r"\$\{?(\w+)", text) if not os.environ.get(name)]
+    if missing:
+        raise SpecError(f"{text!r} needs the environment variable {missing[0]}; set it to a folder.")
+    return os.path.expandvars(text)
+
+
+def _told(fault: Fault) -> str:
+    if fault.kind == "extra_forbidden":
+        known = [name for name in Experiment.model_fields if name != "folder"]
+        return f"unknown key {fault.place!r}; keys: {', '.join(known)}"
+    return str(fault)

@@ -1,0 +1,171 @@
+"""All figures and tables of an experiment by name, made from its rows alone."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from trompe_experiments.engines import engines_chart, engines_markdown
+from trompe_experiments.histograms import prediction_histograms
+from trompe_experiments.paper import paper_means_markdown, table_one_chart, table_one_markdown
+from trompe_experiments.pareto import pareto_markdown, speed_accuracy_chart
+from trompe_experiments.scatter import texels_scatter
+from trompe_experiments.stability.chart import stability_chart, stability_markdown
+from trompe_experiments.style import Drawing, stamp_of
+from trompe_experiments.surrogates import surrogates_chart, surrogates_markdown, surrogates_of
+from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, read_table
+from trompe_shared.comparison import grouped
+from trompe_shared.errors import SpecError
+
+__all__ = ["FIGURES", "Data", "Kind", "figures_of", "histogram_rows", "plain_rows", "read_data"]
+
+MOST_PANELS = 12
+
+
+@dataclass(frozen=True)
+class Data:
+    """The two tables of an experiment, and their folder."""
+
+    folder: Path
+    rows: tuple[ResultRow, ...]
+    predictions: tuple[PredictionRow, ...]
+
+    @property
+    def stamp(self) -> str:
+        """Name of these tables."""
+        return stamp_of([*self.rows, *self.predictions])
+
+    def draw(self, name: str) -> list[Path]:
+        """Draw the figure ``name`` into ``figures`` as SVG and PNG; returns their paths."""
+        return FIGURES[name].draw(self).save(self.folder / "figures", name, stamp=self.stamp)
+
+    @property
+    def results(self) -> list[ResultRow]:
+        """Rows with an ``A_drop``."""
+        return _done(self.rows)
+
+    @property
+    def grid(self) -> list[ResultRow]:
+        """Rows of the first surrogate; rows of others are there for comparison."""
+        return [row for row in self.rows if row.surrogate == self.rows[0].surrogate]
+
+
+def read_data(folder: Path) -> Data:
+    """The tables of a folder; predictions may be missing. Raises ``SpecError``."""
+    rows = read_table(folder / RESULTS, ResultRow)
+    if not rows:
+        raise SpecError(f"{str(folder / RESULTS)!r} has no rows yet; `trompe experiment run` writes them as jobs end.")
+    path = folder / PREDICTIONS
+    return Data(folder, tuple(rows), tuple(read_table(path, PredictionRow)) if path.exists() else ())
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A figure. ``fits``: whether the rows suit it; ``table``: its table in Markdown, if it has one."""
+
+    title: str
+    fits: Callable[[Data], bool]
+    draw: Callable[[Data], Drawing]
+    table: Callable[[Data], str] | None = None
+
+
+def _done(rows: Sequence[ResultRow]) -> list[ResultRow]:
+    return [row for row in rows if row.target_a_drop is not None]
+
+
+def histogram_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
+    """The first row of each object, for the histograms."""
+    first = [group[0] for group in grouped(rows, lambda row: row.object).values()]
+    return first[:MOST_PANELS]
+
+
+def plain_rows(data: Data) -> list[ResultRow]:
+    """Rows that attacked all texels with the budget nearest to the paper's 0.05."""
+    rows = [row for row in _done(data.grid) if row.tau is None and row.keep is None]
+    nearest = min((row.epsilon for row in rows), key=lambda epsilon: abs(epsilon - 0.05), default=0.0)
+    return [row for row in rows if row.epsilon == nearest]
+
+
+FIGURES: dict[str, Kind] = {
+    "table_one": Kind(
+        "A_drop per object, classifier and epsilon (the paper's Table I)",
+        lambda data: _one_setting(data) and bool(plain_rows(data)),
+        lambda data: table_one_chart(data.grid),
+        lambda data: table_one_markdown(data.grid),
+    ),
+    "scatter": Kind(
+        "A_drop against the share of texels altered",
+        lambda data: _one_setting(data) and _values(data, "tau") + _values(data, "keep") > 2,
+        lambda data: texels_scatter(_done(data.grid)),
+        lambda data: paper_means_markdown(data.grid),
+    ),
+    "surrogates": Kind(
+        "What the surrogate predicts, and what the target keeps",
+        lambda data: _one_setting(data) and len(surrogates_of(data.results)) > 1,
+        lambda data: surrogates_chart(data.results),
+        lambda data: surrogates_markdown(data.results),
+    ),
+    "engines": Kind(
+        "Agreement and drop by renderer",
+        lambda data: _values(data, "renderers") > 1,
+        lambda data: engines_chart(data.results),
+        lambda data: engines_markdown(data.results),
+    ),
+    "histograms": Kind(
+        "Predicted classes, before and after",
+        lambda data: _one_setting(data) and bool(data.predictions and plain_rows(data)),
+        lambda data: prediction_histograms(histogram_rows(plain_rows(data)), data.predictions),
+    ),
+    "speed_accuracy": Kind(
+        "Speed against accuracy",
+        lambda data: _compares(data),
+        lambda data: speed_accuracy_chart(data.results),
+        lambda data: pareto_markdown(data.results),
+    ),
+    "evaluations_accuracy": Kind(
+        "Images shown to the classifier against accuracy",
+        lambda data: _compares(data),
+        lambda data: speed_accuracy_chart(data.results, cost="evaluations"),
+    ),
+    "visibility": Kind(
+        "Visibility of the change (colour difference) against accuracy",
+        lambda data: _compares(data) and _values(data, "perceptual") > 1,
+        lambda data: speed_accuracy_chart(data.results, cost="delta_e"),
+    ),
+    "visibility_ssim": Kind(
+        "Visibility of the change (structure) against accuracy",
+        lambda data: _compares(data) and _values(data, "perceptual") > 1,
+        lambda data: speed_accuracy_chart(data.results, cost="dissimilarity"),
+    ),
+    "stability": Kind(
+        "Where methods fail",
+        lambda data: _cases(data),
+        lambda data: stability_chart(data.rows),
+        lambda data: stability_markdown(data.rows),
+    ),
+}
+
+
+def _one_setting(data: Data) -> bool:
+    """Whether rows differ only by object, classifier, epsilon, texels, surrogate and seed."""
+    columns = ("object", "classifier", "epsilon", "tau", "keep", "surrogate", "seed")
+    places = grouped(data.results, lambda row: tuple(getattr(row, name) for name in columns))
+    return not _cases(data) and all(len(rows) == 1 for rows in places.values())
+
+
+def _values(data: Data, column: str) -> int:
+    return len({getattr(row, column) for row in data.results})
+
+
+def _compares(data: Data) -> bool:
+    """Whether the rows are series of configurations."""
+    several = _values(data, "configuration") > 2 and _values(data, "series") > 1
+    return several and not _cases(data) and not _one_setting(data)
+
+
+def _cases(data: Data) -> bool:
+    return any(row.case for row in data.rows)
+
+
+def figures_of(data: Data) -> dict[str, Kind]:
+    """The figures that suit the rows."""
+    return {name: kind for name, kind in FIGURES.items() if kind.fits(data)}

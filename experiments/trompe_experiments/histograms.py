@@ -1,0 +1,62 @@
+"""Predicted classes of an object: number of views by class, before and after."""
+
+from collections.abc import Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.patches import Patch
+
+from trompe_experiments.style import BLUE, ORANGE, Drawing, drawing
+from trompe_experiments.table import PredictionRow, ResultRow
+from trompe_shared.comparison import grouped
+from trompe_shared.errors import SpecError
+
+__all__ = ["prediction_histograms"]
+
+TOP = 6
+COLUMNS = 3
+
+
+def prediction_histograms(rows: Sequence[ResultRow], predictions: Sequence[PredictionRow]) -> Drawing:
+    """A panel for each job of ``rows``: the true class first, then the most frequent ones.
+
+    Raises ``SpecError`` if no row has predictions of the target views.
+    """
+    by_key = grouped((p for p in predictions if p.views == "target"), lambda p: p.key)
+    jobs = [row for row in rows if row.key in by_key]
+    if not jobs:
+        raise SpecError("No predictions of the target views of these rows; run the experiment again.")
+    columns = min(COLUMNS, len(jobs))
+    shape = -(-len(jobs) // columns), columns
+    with drawing(size=(3.6 * columns, 0.5 + 2.1 * shape[0]), panels=shape) as made:
+        for axes, row in zip(made.panels, jobs, strict=False):
+            _bars(axes, by_key[row.key])
+            axes.set_title(f"{row.object}, ε {row.epsilon:g}" + ("" if row.tau is None else f", τ {row.tau:g}"))
+        for axes in made.panels[len(jobs) :]:
+            axes.set_axis_off()
+        for axes in made.panels[max(0, len(jobs) - columns) : len(jobs)]:
+            axes.set_xlabel("views (number)")
+        patches = [Patch(color=BLUE, label="before"), Patch(color=ORANGE, label="after")]
+        made.figure.legend(handles=patches, loc="outside upper right", ncols=2)
+    return made
+
+
+def _bars(axes: Axes, predictions: Sequence[PredictionRow]) -> None:
+    counts = {
+        name: {p.moment: p.count for p in group} for name, group in grouped(predictions, lambda p: _short(p)).items()
+    }
+    own = list(dict.fromkeys(_short(p) for p in predictions if p.true_class))
+    others = sorted((name for name in counts if name not in own), key=lambda name: -sum(counts[name].values()))
+    shown = [*own, *others[:TOP]]
+    rest = {moment: sum(counts[name].get(moment, 0) for name in others[TOP:]) for moment in ("before", "after")}
+    bars = [(name + (" (true class)" if name in own else ""), counts[name]) for name in shown]
+    bars += [(f"{len(others) - TOP} others", rest)] if len(others) > TOP else []
+    for k, (_, count) in enumerate(bars):
+        axes.barh(k - 0.2, count.get("before", 0), height=0.38, color=BLUE)
+        axes.barh(k + 0.2, count.get("after", 0), height=0.38, color=ORANGE)
+    axes.set_yticks(range(len(bars)), [name for name, _ in bars])
+    axes.set_ylim(max(len(bars), 3) - 0.5, -0.5)
+    axes.grid(axis="y", visible=False)
+
+
+def _short(prediction: PredictionRow) -> str:
+    return prediction.name.split(",")[0][:26]

@@ -1,0 +1,166 @@
+"""Jobs of an experiment, each with a key that is the same at every run."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import Any, Final
+
+from trompe_client._plan import CLASSIFIER_SUFFIXES, PICTURE_SUFFIXES, AttackPlan, Upload, plan_attack, source_of
+from trompe_experiments.asset_objects import asset_objects
+from trompe_experiments.design import AssetsFolder, Experiment, expanded
+from trompe_experiments.table import RowId, job_key
+from trompe_shared.api import JobRequest
+from trompe_shared.errors import ObjectError, SpecError
+from trompe_shared.presets import PRESETS
+from trompe_shared.shipped import shipped_objects
+
+__all__ = ["CASE", "LABEL", "Plan", "Row", "plan_experiment"]
+
+LABEL, CASE = "experiment", "case"
+"""Labels of an experiment's jobs."""
+FILE_SUFFIXES: Final = {*CLASSIFIER_SUFFIXES, *PICTURE_SUFFIXES}
+
+Options = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One job. ``object`` is the object's name for people. Equal jobs of several series have the same key."""
+
+    place: RowId
+    object: str
+    attack: AttackPlan = field(repr=False)
+
+    @property
+    def key(self) -> str:
+        """Idempotency key; see ``job_key``."""
+        return self.place.key
+
+    @property
+    def request(self) -> JobRequest:
+        """The job, with file names in place of files."""
+        return self.attack.request({})
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All rows of an experiment, in the order of their jobs."""
+
+    experiment: Experiment
+    rows: tuple[Row, ...]
+
+    def jobs(self) -> dict[str, Row]:
+        """The first row of each distinct job, by key."""
+        found: dict[str, Row] = {}
+        for row in self.rows:
+            found.setdefault(row.key, row)
+        return found
+
+
+def plan_experiment(experiment: Experiment) -> Plan:
+    """Read the named files and check every job before any request.
+
+    Raises ``SpecError``, ``ObjectError`` or ``ClassifierError``.
+    """
+    files = _Files(experiment.folder)
+    objects = dict(_objects(experiment, files))
+    cases: dict[str, Options] = dict(experiment.cases) or {"": {}}
+    rows = []
+    for grid in experiment.grid:
+        series = " x ".join(grid) if len(experiment.grid) > 1 else ""
+        combinations = [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
+        for name, chosen, (case, variation) in product(objects, combinations, cases.items()):
+            configuration = ", ".join([*([case] if case else []), *(f"{k} {_word(v)}" for k, v in chosen.items())])
+            place = RowId(experiment=experiment.name, key="", series=series, case=case, configuration=configuration)
+            options = dict(experiment.base) | objects[name] | _with_preset(chosen) | dict(variation)
+            seeds = options.pop("seeds", experiment.seeds)
+            rows += [_row(place, name, options | {"seed": seed}, files) for seed in seeds]
+    return Plan(experiment, tuple(rows))
+
+
+def _with_preset(chosen: Options) -> dict[str, Any]:
+    """A combination with its preset replaced by options; the others override them."""
+    preset = chosen.get("preset")
+    if preset is not None and preset not in PRESETS:
+        raise SpecError(f"Unknown preset {preset!r}; presets: {', '.join(PRESETS)}.")
+    own = {name: value for name, value in chosen.items() if name != "preset"}
+    return (dict(PRESETS[preset].options) if preset else {}) | own
+
+
+def _word(value: Any) -> str:
+    """A value for legends."""
+    if value is None:
+        return "none"
+    if isinstance(value, list):
+        return " + ".join(map(_word, value))
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return Path(value).stem if isinstance(value, str) else str(value)
+
+
+def _row(place: RowId, name: str, options: Options, files: "_Files") -> Row:
+    labels = {LABEL: place.experiment} | ({CASE: place.case} if place.case else {})
+    try:
+        attack = plan_attack(**{"priority": "sweep", **options, "labels": labels}, read=files.read)
+    except SpecError as error:
+        raise SpecError(f"Job {name}, {place.configuration or 'base'}: {error}") from error
+    spec = attack.request({upload: files.sha256(upload) for upload in attack.uploads()}).spec()
+    key = job_key(place.experiment, spec, *([place.case] if place.case else []))
+    return Row(place.model_copy(update={"key": key}), name, attack)
+
+
+def _objects(experiment: Experiment, files: "_Files") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Name and options of each object."""
+    given = experiment.objects
+    if given == "shipped":
+        yield from ((name, {"object": name, "label": each.label}) for name, each in shipped_objects().items())
+    elif isinstance(given, AssetsFolder):
+        yield from _of_assets(given, files)
+    else:
+        assert isinstance(given, dict)
+        for name, options in given.items():
+            others = dict(options)
+            path = others.pop("file", None)
+            own = shipped_objects().get(name)
+            label = {"label": own.label} if own is not None else {}
+            yield name, {"object": files.path(path) if path else name} | label | others
+
+
+def _of_assets(given: AssetsFolder, files: "_Files") -> Iterator[tuple[str, dict[str, Any]]]:
+    folder = files.path(given.assets)
+    table = asset_objects(folder)
+    unknown = sorted(set(given.only) - set(table))
+    if unknown:
+        raise ObjectError(f"No {', '.join(unknown)} in {str(folder / 'objects')!r}; objects: {', '.join(table)}.")
+    for name in given.only or table:
+        each = table[name]
+        seen = {"label": each.label, "distance": each.distance, "elevation": each.elevation}
+        yield name, {"object": each.path, "background": each.background} | seen
+
+
+class _Files:
+    """Reads and hashes each named file once."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._read: dict[tuple[str, str], Upload | str] = {}
+        self._hashes: dict[Upload, str] = {}
+
+    def path(self, text: str) -> Path:
+        """A path of the experiment's file, relative to its folder."""
+        return self._folder / expanded(text)
+
+    def read(self, kind: str, source: str | Path) -> Upload | str:
+        """See ``trompe_client._plan.Read``. Objects are names unless they are paths."""
+        if (kind, str(source)) not in self._read:
+            is_file = isinstance(source, Path) or kind == "mask" or Path(source).suffix.lower() in FILE_SUFFIXES
+            found = source_of(kind, self.path(str(source))) if is_file else str(source)
+            self._read[kind, str(source)] = found
+        return self._read[kind, str(source)]
+
+    def sha256(self, upload: Upload) -> str:
+        """Hash of a file's bytes."""
+        if upload not in self._hashes:
+            self._hashes[upload] = upload.sha256()
+        return self._hashes[upload]

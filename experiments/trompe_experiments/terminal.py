@@ -1,0 +1,138 @@
+"""Results on the terminal: one experiment, or two compared."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import stdev
+from typing import Final
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from trompe_experiments.markdown import figure_words
+from trompe_experiments.table import RESULTS, ResultRow, read_table
+from trompe_shared.comparison import average, grouped
+from trompe_shared.errors import SpecError
+
+__all__ = ["Difference", "compared", "comparison_table", "differences", "failures", "read_results", "results_table"]
+
+FIGURES: Final = ("target_a_drop", "held_out_a_drop", "transfer_gap", "texels_altered", "seconds")
+CHANGED: Final = 0.1
+"""Smallest difference of ``a_drop`` that is counted."""
+Setting = tuple[str, ...]
+
+
+def read_results(folder: str | Path) -> list[ResultRow]:
+    """The rows of an experiment's folder, or of a CSV file. Raises ``SpecError``."""
+    path = Path(folder)
+    return read_table(path / RESULTS if path.is_dir() else path, ResultRow)
+
+
+def results_table(rows: Sequence[ResultRow]) -> RenderableType:
+    """A line for each setting (object, classifier, configuration) with means over seeds; then the mean of all rows."""
+    table = Table()
+    for name in ("object", "classifier", "configuration"):
+        table.add_column(name, overflow="fold")
+    for name in ("seeds", "surrogate", "target", "A_drop", "held-out A_drop", "N%", "s"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for group in grouped(rows, lambda row: (row.series, *_setting(row))).values():
+        first = group[0]
+        cells = [_pair(group, "surrogate"), _pair(group, "target"), _spread(group, "target_a_drop")]
+        cells += [_spread(group, "held_out_a_drop"), _mean(group, "texels_altered"), _mean(group, "seconds", ".0f")]
+        table.add_row(first.object, first.classifier, first.configuration, str(len(group)), *cells)
+    drop, held_out = _mean(rows, "target_a_drop"), _mean(rows, "held_out_a_drop")
+    return Group(table, Text(f"mean of {len(rows)} rows: target A_drop {drop}, held-out A_drop {held_out}"))
+
+
+def failures(rows: Iterable[ResultRow]) -> list[str]:
+    """A line for each failed row."""
+    failed = (row for row in rows if row.failed)
+    return [f"{row.object}  {row.configuration}  seed {row.seed}: {row.state}: {row.error}" for row in failed]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One setting in two experiments: means of the figures over seeds; n.a. is ``None``."""
+
+    object: str
+    classifier: str
+    configuration: str
+    before: Mapping[str, float | None]
+    after: Mapping[str, float | None]
+
+    def change(self, figure: str) -> float | None:
+        """After minus before."""
+        old, new = self.before[figure], self.after[figure]
+        return None if old is None or new is None else new - old
+
+
+def compared(first: str | Path, second: str | Path) -> list[Difference]:
+    """The settings that two experiments share. Raises ``SpecError`` if there are none."""
+    found = differences(read_results(first), read_results(second))
+    if not found:
+        raise SpecError(
+            f"Nothing to compare: {first} and {second} share no setting (object, classifier, epsilon, tau, "
+            "configuration)."
+        )
+    return found
+
+
+def differences(first: Sequence[ResultRow], second: Sequence[ResultRow]) -> list[Difference]:
+    """The settings in both, in the order of the first."""
+    old, new = grouped(first, _setting), grouped(second, _setting)
+    return [
+        Difference(
+            rows[0].object,
+            rows[0].classifier,
+            rows[0].configuration,
+            {figure: _average(rows, figure) for figure in FIGURES},
+            {figure: _average(new[setting], figure) for figure in FIGURES},
+        )
+        for setting, rows in old.items()
+        if setting in new
+    ]
+
+
+def comparison_table(found: Sequence[Difference]) -> RenderableType:
+    """A line for each shared setting with all figures before and after; then a summary."""
+    table = Table()
+    for name in ("object", "classifier", "configuration"):
+        table.add_column(name, overflow="fold")
+    for figure in FIGURES:
+        table.add_column(figure.replace("_a_drop", " A_drop").replace("_", " "), justify="right", no_wrap=True)
+    for each in found:
+        cells = [f"{figure_words(each.before[name])} > {figure_words(each.after[name])}" for name in FIGURES]
+        table.add_row(each.object, each.classifier, each.configuration, *cells)
+    changes = [change for each in found if (change := each.change("target_a_drop")) is not None]
+    larger, smaller = sum(c >= CHANGED for c in changes), sum(c <= -CHANGED for c in changes)
+    summary = f"target A_drop: {larger} of {len(changes)} larger by {CHANGED:g} or more, {smaller} smaller"
+    if changes:
+        summary += f"; on average {average(changes):+.3f}"
+    return Group(table, Text(summary))
+
+
+def _setting(row: ResultRow) -> Setting:
+    tau = "" if row.tau is None else f"{row.tau:g}"
+    return row.object, row.classifier, f"{row.epsilon:g}", tau, row.configuration
+
+
+def _average(rows: Sequence[ResultRow], figure: str) -> float | None:
+    return average(getattr(row, figure) for row in rows)
+
+
+def _mean(rows: Sequence[ResultRow], figure: str, form: str = ".2f") -> str:
+    return figure_words(_average(rows, figure), form)
+
+
+def _pair(rows: Sequence[ResultRow], views: str) -> str:
+    return f"{_mean(rows, f'{views}_a_before')} > {_mean(rows, f'{views}_a_after')}"
+
+
+def _spread(rows: Sequence[ResultRow], figure: str) -> str:
+    """The mean with the standard deviation over seeds, or with the interval of a single seed."""
+    known = [value for row in rows if (value := getattr(row, figure)) is not None]
+    if len(known) > 1:
+        return f"{_mean(rows, figure)} ± {stdev(known):.2f}"
+    low, high = getattr(rows[0], f"{figure}_low"), getattr(rows[0], f"{figure}_high")
+    return _mean(rows, figure) + (f" [{low:.2f}, {high:.2f}]" if low is not None and high is not None else "")

@@ -1,0 +1,62 @@
+"""What a check reports, and the remedy of each fault."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal
+
+__all__ = ["FINAL", "REMEDIES", "Finding"]
+
+REMEDIES: Final[Mapping[str, str]] = {
+    "not repeatable": "Reset what one picture leaves to the next (jitter, exposure, history), or declare "
+    "EngineInfo(deterministic=False) and draw the noise from noise_seed(world).",
+    "noise not numbered": "Seed the engine with noise_seed(world) before each picture, or fix what else differs.",
+    "noise number ignored": "Seed the engine with noise_seed(world), not with a constant; if its pictures are always "
+    "equal, declare deterministic=True.",
+    "invisible": "Place Snapshot.instances by their poses, use Snapshot.camera, and clip nothing between 0.1 and 10 m.",
+    "untextured": "Bind each part's albedo, obj.textures[obj.albedo_of(part)].",
+    "channel order": "Return the channels in the order red, green, blue: picture[..., ::-1] turns BGR into RGB.",
+    "background": "Fill the background with Snapshot.background, sRGB, after any tone mapping and dithering.",
+    "stale scene": "Remove the objects of the last picture that are not in Snapshot.instances.",
+    "stale object": "Find cached objects by HashedModel.key, not by name or number.",
+    "mirrored": "Flip the columns: picture[:, ::-1]. Trompe's world is right-handed.",
+    "upside down": "Flip the rows: picture[::-1]. OpenGL reads row 0 at the bottom.",
+    "axes": "Right is +x, up is +y, and the camera looks along its own -z; convert z-up engines at the root.",
+    "camera": "Take Snapshot.camera (camera to world) whole; the camera need not be upright nor look at the origin.",
+    "v flipped": "v = 0 is the bottom row of the texture: use 1 - v, or flip the rows of the texture.",
+    "u flipped": "u = 0 is the left column of the texture: use u as it is.",
+    "texture turned": "u runs along the rows of the texture, v up its columns; do not transpose it.",
+    "field of view": "60 degrees (FIELD_OF_VIEW) is the vertical field of view.",
+    "aspect": "Set the camera's aspect to width / height for each picture, and keep the vertical field of view.",
+    "sheared": "Read the rows without padding: in OpenGL glPixelStorei(GL_PACK_ALIGNMENT, 1).",
+    "shifted": "Centre the picture on the camera's axis; pixel (0, 0) covers [0, 1] x [0, 1].",
+    "gamma missing": "Encode the picture: linear light to sRGB.",
+    "gamma twice": "Encode the picture once: turn off either the engine's sRGB output or your own encoding.",
+    "texture not decoded": "Mark the albedo texture as sRGB, so that the engine decodes it to linear light.",
+    "texture decoded twice": "Decode the albedo texture once: mark it as sRGB or convert it yourself.",
+    "light on encoded colours": "Mark the albedo texture as sRGB and encode the picture, if the engine can.",
+    "light missing": "Apply Snapshot.lights; a directional light travels along its direction.",
+    "light follows camera": "Place the light in the world, not below the camera.",
+    "light reversed": "WorldLight.direction is the way the light travels; negate it if the engine wants the opposite.",
+    "light direction": "Turn WorldLight.direction into the engine's axes like positions.",
+    "light intensity": "Multiply the light by WorldLight.intensity (and by pi where the engine divides by it).",
+    "light colour": "Multiply the light by WorldLight.color / 255, linear.",
+    "ambient missing": "Add Snapshot.ambient, light from all sides, to the directional lights.",
+    "frozen texture": "Read obj.textures (obj.files keeps the old paint); find cached textures by HashedModel.albedos.",
+    "late texture": "Finish the upload of a texture before the picture is drawn.",
+    "slow": "A job takes about 1,000 pictures: use fewer samples, or several workers.",
+}
+FINAL: Final = {"invisible", "untextured", "stale scene", "stale object", "axes"}
+"""Faults after which other questions have no answer."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of a check. name: a key of ``REMEDIES``, or the question of which all is well; seen: with figures."""
+
+    level: Literal["ok", "warning", "fault"]
+    name: str
+    seen: str
+
+    def __str__(self) -> str:
+        word, remedy = ("ok", "") if self.level == "ok" else (self.level.upper(), REMEDIES.get(self.name, ""))
+        return f"{word:<8} {self.name}: {self.seen} {remedy}".rstrip()

@@ -1,0 +1,517 @@
+"""The questions of a check, in order: each takes a few small pictures; later ones use the answers of earlier ones."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trompe_renderer.check.findings import FINAL, Finding
+from trompe_renderer.check.measures import Blob, blob, border, level, median, patterns, positions
+from trompe_renderer.check.probes import COLOURS, FACES, RINGS, TEXTURE, ball, chart, cube, disc, plain, plate
+from trompe_shared.engine import EngineInfo
+from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View, spherical
+from trompe_shared.object3d import Object3D
+from trompe_shared.sailenv_client import SAILENV
+
+__all__ = ["Render", "check"]
+
+SQUARE: Final = (96, 96)
+LENS: Final = {"square": (160, 160), "wide": (161, 215), "tall": (213, 160)}
+"""Pictures by which the lens is measured; some sides are odd."""
+LIGHT: Final = Light(azimuth=30, elevation=50, intensity=0.6, ambient=0.5)
+"""Shows every side of a white object, and none of them white."""
+FRONT: Final = View(Camera(1.0, 0, 0), LIGHT, (0, 0, 0))
+SLOW: Final = 5.0
+"""Seconds a picture that are worth a warning."""
+ANGLE: Final = 0.5
+"""Degrees by which the field of view may be wrong."""
+RATIO: Final = 0.02
+"""Share by which a pixel may be wider than high."""
+SHIFT: Final = 0.25
+"""Pixels by which the picture may be off its middle."""
+EXPONENTS: Final = (0.62, 1.5)
+"""Slopes of encoded brightness over encoded albedo, both logarithmic, that pass as a tone curve. Encoding twice gives
+0.45, not encoding 2.2; the curves of ACES, AgX, Khronos and Reinhard lie between 0.7 and 1.35."""
+DIMMED: Final = 0.6
+"""sRGB level of the texture that looks in the first light of the question of gamma as white does in the second,
+whatever the tone curve. Without decoding it is 0.32, with two decodings 0.80."""
+TWICE: Final = 0.7
+"""Level above which textures are decoded twice."""
+
+Picture = NDArray[np.uint8]
+Size = tuple[int, int]
+Findings = Iterator[Finding]
+
+
+class Render(Protocol):
+    """Images of an object, (views, H, W, 3) uint8, sRGB, row 0 on top, not mirrored; ``size`` is (H, W)."""
+
+    def __call__(self, obj: Object3D, views: Sequence[View], /, *, size: Size) -> Picture: ...
+
+
+def check(render: Render, info: EngineInfo) -> Findings:
+    """Ask a renderer for about 25 pictures and say, question by question, whether it keeps Trompe's conventions.
+
+    ``info``: what it says of itself. After a fault that leaves other questions without an answer, these are not asked.
+    """
+    look = _Look(render)
+    for question in QUESTIONS:
+        for finding in question(look, info):
+            yield finding
+            if finding.name in FINAL:
+                yield Finding("warning", "stopped", "Other questions need this one answered; check again afterwards.")
+                return
+
+
+class _Look:
+    """Takes pictures, and undoes the faults found so far, so that each question sees its own fault alone."""
+
+    def __init__(self, render: Render) -> None:
+        self._render = render
+        self.seconds: list[float] = []
+        self.first = np.zeros((0, 0, 3), np.uint8)
+        self.repeats = True
+        """Whether the ``first`` picture is promised to come again, and did so far."""
+        self.channels: list[int] = [0, 1, 2]
+        self.flips: tuple[int, int] = FLIPS[0]
+        self.dims = True
+        """Whether the light's intensity has an effect."""
+        self.scale = (1.0, 1.0)
+        """Measured size of the disc over the expected one, across and down, in a square picture."""
+
+    def raw(self, obj: Object3D, view: View, *, size: Size = SQUARE) -> Picture:
+        """The picture as it comes."""
+        begun = time.perf_counter()
+        (picture,) = self._render(obj, [view], size=size)
+        self.seconds.append(time.perf_counter() - begun)
+        return np.asarray(picture)
+
+    def at(self, obj: Object3D, view: View = FRONT, *, size: Size = SQUARE) -> Picture:
+        """The picture with its channels in order, upright and not mirrored."""
+        return self.raw(obj, view, size=size)[:: self.flips[0], :: self.flips[1], self.channels]
+
+
+def _lit(light: Light, camera: Camera = FRONT.camera) -> View:
+    return View(camera, light, (0, 0, 0))
+
+
+def _pixels(metres: float, size: Size, distance: float = 1.0) -> float:
+    """Length on the picture, in pixels, of a length across the camera's axis."""
+    return metres / distance * size[0] / 2 / float(np.tan(np.radians(FIELD_OF_VIEW / 2)))
+
+
+ORANGE: Final = ball(0.15, plain(230, 130, 40), middle=-0.3)
+BESIDE: Final = ball(0.15, plain(240, 240, 240), middle=0.32)
+
+
+def repeats(look: _Look, info: EngineInfo) -> Findings:
+    """The same request twice. Later, with other pictures between, once more."""
+    look.first, again = look.raw(ORANGE, FRONT), look.raw(ORANGE, FRONT)
+    look.repeats = info != SAILENV and np.array_equal(look.first, again)
+    if info.deterministic:
+        yield from _difference("not repeatable", look.first, again, "equal requests give equal bytes")
+        return
+    if info == SAILENV:
+        yield Finding("ok", "repeats", f"equal requests differ by {_noise(look.first, again)}; no promise was made.")
+        return
+    yield from _difference("noise not numbered", look.first, again, "equal noise numbers give equal bytes")
+    other = look.raw(ORANGE, replace(FRONT, noise=1))
+    if np.array_equal(look.first, other):
+        yield Finding("fault", "noise number ignored", "Noise numbers 0 and 1 give equal pictures.")
+    else:
+        yield Finding("ok", "noise", f"{_noise(look.first, other)} on the object.")
+
+
+def _difference(fault: str, one: Picture, other: Picture, well: str) -> Findings:
+    changed = int((one != other).any(axis=-1).sum())
+    if changed:
+        most = int(np.abs(one.astype(int) - other).max())
+        yield Finding(
+            "fault",
+            fault,
+            f"Two equal requests differ in {changed} pixel{'s' * (changed > 1)}, by up to {most} levels.",
+        )
+    else:
+        yield Finding("ok", "repeats", f"{well}.")
+
+
+def _noise(one: Picture, other: Picture) -> str:
+    there = blob(one, border(one))
+    mask = np.ones(one.shape[:2], bool) if there is None else there.mask
+    return f"a noise of {np.std((one.astype(float) - other)[mask]) / np.sqrt(2):.1f} levels of 255"
+
+
+def channels(look: _Look, _: EngineInfo) -> Findings:
+    """An orange ball beside the middle."""
+    picture = look.raw(ORANGE, FRONT)
+    there = blob(picture, border(picture))
+    if there is None:
+        yield Finding("fault", "invisible", "The picture of a ball near the origin shows nothing.")
+        return
+    colour = median(picture, there.mask)
+    if np.ptp(colour) < 0.15 * colour.max():
+        yield Finding("fault", "untextured", f"An orange ball appears grey: {colour.round()}.")
+        return
+    look.channels = [int(k) for k in np.argsort(-colour, kind="stable")]
+    order = "".join("RGB"[look.channels.index(k)] for k in range(3))
+    if order == "RGB":
+        yield Finding("ok", "channels", "red, green, blue.")
+    else:
+        yield Finding("fault", "channel order", f"The channels come as {order}.")
+
+
+def background(look: _Look, _: EngineInfo) -> Findings:
+    """Three colours around the ball."""
+    worst, told = 0.0, "every level as asked"
+    for asked in ((0, 0, 0), (255, 255, 255), (200, 130, 50)):
+        got = border(look.at(ORANGE, replace(FRONT, background=asked)))
+        if (off := float(np.abs(got - asked).max())) > worst:
+            worst, told = off, f"{asked} comes as {tuple(got.round().astype(int).tolist())}"
+    if worst > 1:
+        yield Finding("fault", "background", f"A background of {told}.")
+    else:
+        yield Finding("ok", "background", f"{told}.")
+
+
+def objects(look: _Look, _: EngineInfo) -> Findings:
+    """The orange ball, and a white one somewhere else."""
+    masks = []
+    for obj in (ORANGE, BESIDE):
+        picture = look.raw(obj, FRONT)
+        there = blob(picture, border(picture))
+        masks.append(np.zeros(SQUARE, bool) if there is None else there.mask)
+    before, now = masks
+    kept = (before & now).sum() / max(int(before.sum()), 1)
+    if kept < 0.5:
+        yield Finding("ok", "objects", "nothing is left of an earlier request.")
+    elif (now & ~before).sum() < 0.5 * before.sum():
+        yield Finding("fault", "stale object", "A new object of the same name looks like the one before it.")
+    else:
+        yield Finding("fault", "stale scene", "The object of an earlier request is still in the picture.")
+
+
+CUBE: Final = cube(0.25)
+CUBE_VIEWS: Final = (
+    _lit(replace(LIGHT, azimuth=35, elevation=25), Camera(1.1, 35, 25)),
+    _lit(replace(LIGHT, azimuth=210, elevation=-35), Camera(1.2, 210, -35, roll=25.0, centre=(0.08, 0.1, 0.05))),
+)
+"""Each lit from the camera, so that no face needs ambient light."""
+FLIPS: Final = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+"""Steps along rows and columns; the first is right."""
+Seen = Mapping[int, tuple[float, float]]
+
+
+def orientation(look: _Look, _: EngineInfo) -> Findings:
+    """A cube of six colours from two sides: which faces are where?"""
+    first, second = CUBE_VIEWS
+    seen = _faces(look, first)
+    found = next((flips for flips in FLIPS if _distance(seen, _expected(first, flips)) < 6), None)
+    if found is None:
+        there = _named(_expected(first))
+        yield Finding("fault", "axes", f"From azimuth 35, elevation 25 one sees {_named(seen)}, not {there}.")
+        return
+    look.flips = found
+    if found[0] < 0:
+        yield Finding("fault", "upside down", "Top and bottom are exchanged.")
+    if found[1] < 0:
+        yield Finding("fault", "mirrored", "Left and right are exchanged.")
+    if _distance(_faces(look, second), _expected(second)) > 8:
+        yield Finding("fault", "camera", "A rolled camera that looks past the origin sees the object elsewhere.")
+    elif look.flips == (1, 1):
+        yield Finding("ok", "orientation", "upright, not mirrored, from where the camera is.")
+
+
+def _faces(look: _Look, view: View) -> Seen:
+    picture = look.at(CUBE, view)
+    there = blob(picture, border(picture))
+    return {} if there is None else positions(picture, there.mask)
+
+
+def _expected(view: View, flips: tuple[int, int] = FLIPS[0], half: float = 0.25) -> Seen:
+    """Middle, in pixels from the picture's, of each visible face of the cube, by its colour's pattern."""
+    matrix, grid = view.camera.world_to_camera(), np.linspace(-0.9, 0.9, 7)
+    a, b = (each.reshape(-1, 1) for each in np.meshgrid(grid, grid))
+    found = {}
+    for name, (normal, up) in FACES.items():
+        n, v = np.array(normal), np.array(up)
+        if n @ (view.camera.position() - half * n) <= 0:
+            continue
+        x, y, z = matrix[:3, :3] @ (half * (n + a * np.cross(v, n) + b * v)).T + matrix[:3, 3:]
+        right, down = _pixels(1.0, SQUARE) * np.array([(x / -z).mean(), (y / z).mean()])
+        found[int(patterns(np.array(COLOURS[name])))] = (flips[1] * float(right), flips[0] * float(down))
+    return found
+
+
+def _distance(seen: Seen, expected: Seen) -> float:
+    """Pixels between what is seen and what is expected at any scale; infinite if these are not the same colours."""
+    if seen.keys() != expected.keys():
+        return np.inf
+    here, there = (np.array([spots[kind] for kind in sorted(expected)]) for spots in (seen, expected))
+    scale = np.clip((here * there).sum() / (there * there).sum(), 0.4, 2.5)
+    return float(np.linalg.norm(here / scale - there, axis=1).max())
+
+
+def _named(seen: Seen) -> str:
+    names = {int(patterns(np.array(colour))): name for name, colour in COLOURS.items()}
+    from_left = sorted(seen, key=lambda kind: seen[kind])
+    return ", ".join(names[kind] for kind in from_left) or "no face"
+
+
+QUARTERS: Final = np.array([[(230, 25, 25), (25, 230, 25)], [(25, 25, 230), (230, 230, 25)]], np.uint8)
+"""Colours of the texture's quarters, top row first."""
+QUARTERED: Final = plate(0.3, QUARTERS.repeat(16, axis=0).repeat(16, axis=1))
+
+
+def texture(look: _Look, _: EngineInfo) -> Findings:
+    """A square with four colours."""
+    picture = look.at(QUARTERED)
+    if blob(picture, border(picture)) is None:
+        yield Finding("fault", "invisible", "A square at the origin, seen from the front, is missing.")
+        return
+    middle, off = SQUARE[0] // 2, round(_pixels(0.15, SQUARE))
+    spots = [
+        [picture[middle + y - 3 : middle + y + 4, middle + x - 3 : middle + x + 4] for x in (-off, off)]
+        for y in (-off, off)
+    ]
+    seen = patterns(np.array([[np.median(spot, axis=(0, 1)) for spot in row] for row in spots]))
+    right = patterns(QUARTERS)
+    turns = {
+        (): right,
+        ("v flipped",): right[::-1],
+        ("u flipped",): right[:, ::-1],
+        ("v flipped", "u flipped"): right[::-1, ::-1],
+    }
+    found = next((faults for faults, turned in turns.items() if (seen == turned).all()), ("texture turned",))
+    said = {
+        "v flipped": "The texture's top row appears at the bottom.",
+        "u flipped": "The texture's left column appears at the right.",
+        "texture turned": "The quarters of the texture are not where they belong.",
+    }
+    for fault in found:
+        yield Finding("fault", fault, said[fault])
+    if not found:
+        yield Finding("ok", "texture", "its lower left corner is u = 0, v = 0.")
+
+
+RADIUS: Final = 0.28
+"""Of the disc by which the lens is measured, and of the chart, metres."""
+DISC: Final = disc(RADIUS, plain(190, 190, 190))
+CHART: Final = chart(RADIUS)
+
+
+def lens(look: _Look, _: EngineInfo) -> Findings:
+    """A disc in pictures of three shapes; in the square one before black and white, whose edges bias oppositely."""
+    black = {name: _ellipse(look, FRONT, size) for name, size in LENS.items()}
+    white = _ellipse(look, replace(FRONT, background=(255, 255, 255)), LENS["square"])
+    if white is None or None in black.values():
+        yield Finding("fault", "invisible", "A disc at the origin is missing in some of the pictures.")
+        return
+    shots = {name: shot for name, shot in black.items() if shot}
+    square = shots["square"]
+    look.scale = (square.across, square.down)
+    yield from _field_of_view((square.down + white.down) / 2)
+    yield from _aspect(shots)
+    x, y = np.mean([square.centre, white.centre], axis=0)
+    ways = [(x, "right" if x > 0 else "left"), (y, "down" if y > 0 else "up")]
+    if off := [f"{abs(pixels):.2f} pixels too far {way}" for pixels, way in ways if abs(pixels) > SHIFT]:
+        yield Finding("fault", "shifted", f"The picture lies {' and '.join(off)}.")
+    else:
+        yield Finding("ok", "centre", f"off by {np.hypot(x, y):.2f} pixels.")
+
+
+def _ellipse(look: _Look, view: View, size: Size) -> "_Ellipse | None":
+    picture = look.at(DISC, view, size=size)
+    shape = blob(picture, border(picture))
+    return None if shape is None else _Ellipse(shape, size)
+
+
+class _Ellipse:
+    """A disc's picture: its size over the expected one, and the rest of its ``Blob``."""
+
+    def __init__(self, shape: Blob, size: Size) -> None:
+        expected = _pixels(RADIUS, size) / 2
+        self.across, self.down = shape.spread[0] / expected, shape.spread[1] / expected
+        self.centre, self.shear = shape.centre, shape.shear
+
+
+def _field_of_view(size: float) -> Findings:
+    found = 2 * float(np.degrees(np.arctan(np.tan(np.radians(FIELD_OF_VIEW / 2)) / size)))
+    if abs(found - FIELD_OF_VIEW) > ANGLE:
+        yield Finding(
+            "fault", "field of view", f"The vertical field of view is {found:.1f} degrees, not {FIELD_OF_VIEW:g}."
+        )
+    else:
+        yield Finding("ok", "field of view", f"{found:.1f} degrees.")
+
+
+def _aspect(shots: Mapping[str, _Ellipse]) -> Findings:
+    down = shots["square"].down
+    sheared = [name for name, shot in shots.items() if abs(shot.shear) > 0.05]
+    if sheared:
+        yield Finding("fault", "sheared", f"The rows of {' and '.join(sheared)} pictures lean.")
+    wrong = [
+        f"{shot.across / down:.2f} x {shot.down / down:.2f} in a {name} picture"
+        for name, shot in shots.items()
+        if name not in sheared and max(abs(shot.across / shot.down - 1), abs(shot.down / down - 1)) > RATIO
+    ]
+    if wrong:
+        yield Finding("fault", "aspect", f"A disc is stretched, width x height, {', '.join(wrong)}.")
+    elif not sheared:
+        yield Finding("ok", "aspect", "pixels are square in square, wide and tall pictures.")
+
+
+def gamma(look: _Look, info: EngineInfo) -> Findings:
+    """Greys in one light, and in another one that is as much weaker as the texture level ``DIMMED`` is darker."""
+    weaker = float(((DIMMED + 0.055) / 1.055) ** 2.4)
+    dim = replace(LIGHT, intensity=weaker * LIGHT.intensity, ambient=weaker * LIGHT.ambient)
+    bright, dark = (_rings(look, look.at(CHART, _lit(light))) for light in (LIGHT, dim))
+    slope = float(np.polyfit(np.log(RINGS[1:]), np.log(bright[1:]), 1)[0])
+    same = DIMMED if info == SAILENV or not look.dims else float(np.interp(dark[0], bright[::-1], RINGS[::-1]))
+    told = f"A texture's greys come with the exponent {slope:.2f}, expected about 1."
+    decoded = 0 if same < (DIMMED + weaker) / 2 else 2 if same > TWICE else 1
+    encoding = slope / 2.2 ** (decoded - 1)
+    if decoded == 0 and encoding > EXPONENTS[1]:
+        yield Finding("warning", "light on encoded colours", "Light multiplies encoded colours.")
+        return
+    if decoded != 1:
+        yield Finding("fault", "texture decoded twice" if decoded else "texture not decoded", told)
+    if not EXPONENTS[0] <= encoding <= EXPONENTS[1]:
+        yield Finding("fault", "gamma twice" if encoding < 1 else "gamma missing", told)
+    elif decoded == 1:
+        yield Finding("ok", "gamma", f"greys keep their order and distance (exponent {slope:.2f}).")
+
+
+def _rings(look: _Look, picture: Picture) -> list[float]:
+    """Brightness of each of the chart's rings."""
+    rows, columns = np.indices(picture.shape[:2]) + 0.5
+    x, y = (columns - SQUARE[1] / 2) / look.scale[0], (rows - SQUARE[0] / 2) / look.scale[1]
+    ring = np.hypot(x, y) / _pixels(RADIUS, SQUARE) * len(RINGS)
+    return [max(level(picture, np.abs(ring - k - 0.5) < 0.25), 1.0) for k in range(len(RINGS))]
+
+
+SUN: Final = Light(azimuth=60, elevation=35, intensity=1.0, ambient=0.0)
+SIDES: Final = (Camera(2.0, 0, 0), Camera(2.0, 110, 10))
+BALL_RADIUS: Final = 0.38
+BALL: Final = ball(BALL_RADIUS, plain(230, 230, 230))
+TOLERANCE: Final = 30.0
+"""Degrees by which the brightest direction may differ from the light's."""
+
+
+def light(look: _Look, _: EngineInfo) -> Findings:
+    """A white ball in ambient light alone, and in directional light alone from two sides."""
+    soft = look.at(BALL, _lit(Light(intensity=0.0, ambient=0.6), SIDES[0]))
+    rows, columns = np.indices(SQUARE) + 0.5 - SQUARE[0] / 2
+    x, y = (places / _pixels(BALL_RADIUS, SQUARE, 2.0) for places in (columns, -rows))
+    inside = np.hypot(x, y) < 0.95
+    normals = np.stack([x, y, np.sqrt(np.clip(1 - x**2 - y**2, 0, None))], axis=-1)[inside]
+    if level(soft, inside) < 20:
+        yield Finding("fault", "ambient missing", "A white ball in ambient light alone is dark.")
+    hard = [look.at(BALL, _lit(SUN, side)) for side in SIDES]
+    if max(float(np.percentile(picture[inside], 95)) for picture in hard) < 20:
+        yield Finding("fault", "light missing", "A white ball in directional light alone is dark.")
+        return
+    guesses = [_brightest(normals, picture[inside].mean(axis=1)) for picture in hard]
+    yield from _direction(guesses)
+    yield from _colour(look, hard[0], inside)
+
+
+def _brightest(normals: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Direction (3,) to the light, in camera coordinates, under which a matt ball looks most like ``seen``."""
+    heights = 1 - (2 * np.arange(1500) + 1) / 1500
+    turns, widths = np.arange(1500) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - heights**2)
+    ways = np.stack([widths * np.cos(turns), heights, widths * np.sin(turns)], axis=1)
+    shaded = np.clip(normals @ ways.T, 0, None) ** 0.45
+    shaded -= shaded.mean(axis=0)
+    likeness = (seen - seen.mean()) @ shaded / (np.linalg.norm(shaded, axis=0) + 1e-3)
+    return np.asarray(ways[likeness.argmax()])
+
+
+def _angle(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    return float(np.degrees(np.arccos(np.clip(one @ other, -1, 1))))
+
+
+def _direction(guesses: Sequence[NDArray[np.float64]]) -> Findings:
+    """Judge the directions to the light, in camera coordinates, seen from ``SIDES``."""
+    true = spherical(SUN.azimuth, SUN.elevation)
+    world = [side.world_to_camera()[:3, :3].T @ guess for side, guess in zip(SIDES, guesses, strict=True)]
+    off = max(_angle(each, true) for each in world)
+    asked = f"azimuth {SUN.azimuth:g}, elevation {SUN.elevation:g}"
+    places = " and ".join(
+        f"azimuth {np.degrees(np.arctan2(w[0], w[2])):.0f}, elevation {np.degrees(np.arcsin(w[1])):.0f}" for w in world
+    )
+    said = f"Light from {asked} seems to come from {places} (cameras at azimuth 0 and 110)."
+    if off <= TOLERANCE:
+        yield Finding("ok", "light", f"comes from where it should, to {off:.0f} degrees.")
+    elif _angle(*guesses) < TOLERANCE:
+        yield Finding("fault", "light follows camera", said)
+    elif max(_angle(each, -true) for each in world) <= TOLERANCE:
+        yield Finding("fault", "light reversed", said)
+    else:
+        yield Finding("fault", "light direction", said)
+
+
+def _colour(look: _Look, white: Picture, inside: NDArray[np.bool_]) -> Findings:
+    """A weaker, redder light: red falls by the intensity, green and blue by the colour as well."""
+    weak = look.at(BALL, _lit(replace(SUN, intensity=0.15, colour=(255, 40, 40)), SIDES[0]))
+    bright = inside & (white.mean(axis=-1) > np.percentile(white[inside].mean(axis=1), 60))
+    before, after = median(white, bright) + 1, median(weak, bright) + 1
+    if after[0] > 0.9 * before[0]:
+        look.dims = False
+        yield Finding("fault", "light intensity", "0.15 of the light's intensity looks as bright as 1.")
+    if after[1] / after[0] > 0.85 * before[1] / before[0]:
+        yield Finding("fault", "light colour", "A red light looks white.")
+
+
+GREY: Final = plate(0.25, plain(110, 110, 110))
+
+
+def repaint(look: _Look, _: EngineInfo) -> Findings:
+    """A slightly brighter paint on the same object."""
+    old = look.at(GREY)
+    there = blob(old, border(old))
+    if there is None:
+        yield Finding("fault", "invisible", "A grey square at the origin is missing.")
+        return
+    painted = GREY.with_textures({TEXTURE: plain(140, 140, 140)})
+    first, second = (level(look.at(painted), there.mask) - level(old, there.mask) for _ in range(2))
+    if first > 4:
+        yield Finding("ok", "repaint", f"a texture 30 levels brighter shows, by {first:.0f}.")
+    elif second > 4:
+        yield Finding("fault", "late texture", "A new texture shows in the second picture only.")
+    else:
+        yield Finding("fault", "frozen texture", "A new texture on the same mesh does not show.")
+
+
+def once_more(look: _Look, info: EngineInfo) -> Findings:
+    """The first picture again, after all others."""
+    if look.repeats and not np.array_equal(look.first, last := look.raw(ORANGE, FRONT)):
+        yield from _difference("not repeatable" if info.deterministic else "noise not numbered", look.first, last, "")
+
+
+def speed(look: _Look, _: EngineInfo) -> Findings:
+    """The time of all pictures so far."""
+    seconds = float(np.median(look.seconds))
+    told = f"{seconds:.2g} s a picture, the median of {len(look.seconds)} small ones."
+    if seconds > SLOW:
+        yield Finding("warning", "slow", told)
+    else:
+        yield Finding("ok", "speed", told)
+
+
+QUESTIONS: Final[tuple[Callable[[_Look, EngineInfo], Findings], ...]] = (
+    repeats,
+    channels,
+    background,
+    objects,
+    orientation,
+    light,
+    texture,
+    lens,
+    gamma,
+    repaint,
+    once_more,
+    speed,
+)

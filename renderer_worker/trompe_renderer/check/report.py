@@ -1,0 +1,41 @@
+"""``trompe render --check``: the findings line by line."""
+
+import contextlib
+import re
+from collections.abc import Mapping
+
+import click
+
+from trompe_renderer.check.engine_render import EngineRender
+from trompe_renderer.check.questions import Render, check
+from trompe_renderer.engines.loading import engine_maker
+from trompe_shared.engine import EngineInfo
+from trompe_shared.errors import RendererError
+from trompe_shared.sailenv_client import SailenvTarget
+
+__all__ = ["check_at", "check_engine"]
+
+
+def check_engine(name: str, settings: Mapping[str, str]) -> bool:
+    """Check an engine in this process, print what is found and return whether there is no fault."""
+    engine = engine_maker(name, settings)()
+    return _report(EngineRender(engine), engine.info)
+
+
+def check_at(address: str) -> bool:
+    """Check the renderer at HOST:PORT likewise. Raises ``RendererError`` if there is none."""
+    found = re.fullmatch(r"(.+):(\d{1,5})", address)
+    if found is None:
+        raise RendererError(f"--check {address}: expected HOST:PORT of a running renderer, or nothing for --engine.")
+    with contextlib.closing(SailenvTarget(found[1].strip("[]"), int(found[2]))) as target:
+        return _report(target.render, target.engine)
+
+
+def _report(render: Render, info: EngineInfo) -> bool:
+    click.echo(str(info))
+    faults = 0
+    for finding in check(render, info):
+        click.echo(str(finding))
+        faults += finding.level == "fault"
+    click.echo("No fault." if not faults else f"{faults} fault{'s' * (faults > 1)}.")
+    return not faults

@@ -1,0 +1,1 @@
+"""Engines turn a snapshot of the world into images."""

@@ -1,0 +1,250 @@
+"""A snapshot as most engines take it: surfaces with meshes and textures, found by content, and a background."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Final, Generic, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trompe_renderer.world.lights import WorldLight
+from trompe_renderer.world.model import HashedModel, content_key
+from trompe_renderer.world.snapshot import Matrix, Sky, Snapshot
+from trompe_shared.geometry import FIELD_OF_VIEW
+from trompe_shared.object3d import Material, Part, decode_rgb, open_image
+from trompe_shared.opacity import opacity_of
+
+__all__ = [
+    "PLAIN_ROUGHNESS",
+    "ContentCache",
+    "Pixels",
+    "Surface",
+    "TextureImage",
+    "Use",
+    "background_pixels",
+    "clipping_planes",
+    "composited",
+    "encoded_light",
+    "linear_light",
+    "rgba_of",
+    "sphere_around",
+    "surfaces_of",
+    "towards",
+    "without_backs",
+]
+
+NEAR: Final = 0.005
+FAR: Final = 1000.0
+"""Clipping planes, metres, for all but tiny and huge objects."""
+PLAIN_ROUGHNESS: Final = 0.9
+"""Roughness of a material without a roughness map."""
+MAX_ENTRIES: Final = 256
+MAX_BYTES: Final = 512 * 2**20
+
+Pixels = NDArray[np.uint8]
+Use = Literal["albedo", "normal", "metallic"]
+Ball = tuple[Matrix, NDArray[np.floating[Any]], float]
+"""Pose (4, 4) of an object, its middle in object coordinates, and its size."""
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class TextureImage:
+    """A texture of a model by its use; a repainted model's albedo is that of ``obj.textures``."""
+
+    use: Use
+    name: str
+    model: HashedModel
+
+    @property
+    def key(self) -> str:
+        """Equal for equal pixels."""
+        name, model = self.name, self.model
+        key = model.albedos.get(name) or f"{model.shape} {self.use} {name}"
+        return key + (_opacity(model.obj.files[name], name in model.obj.blended)[0] if self.use == "albedo" else "")
+
+    @property
+    def transparent(self) -> bool:
+        """Whether the pixels of an albedo have alpha."""
+        return _opacity(self.model.obj.files[self.name], self.name in self.model.obj.blended)[1] is not None
+
+    def pixels(self) -> Pixels:
+        """(H, W, channels) uint8, row 0 on top: sRGB, with alpha if transparent; a normal map; (roughness, metallic).
+
+        Of an alpha-tested material alpha below one half cuts holes.
+        """
+        name, obj = self.name, self.model.obj
+        if self.use == "albedo":
+            texture, opacity = obj.textures[name], _opacity(obj.files[name], name in obj.blended)[1]
+            alike = opacity is not None and opacity.shape == texture.shape[:2]
+            return np.dstack([texture, opacity]) if alike else texture  # type: ignore[list-item]
+        data = obj.files[name]
+        return decode_rgb(data, name) if self.use == "normal" else _roughness_metallic(data, name)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A part of an instance. ``key`` is equal for equal ``part``; ``pose`` (4, 4) is object-to-world.
+
+    ``opacity``: of a blended surface, otherwise ``None``.
+    """
+
+    key: str
+    part: Part
+    pose: Matrix
+    albedo: TextureImage
+    normal: TextureImage | None
+    metallic: TextureImage | None
+    opacity: float | None
+
+    @property
+    def ball(self) -> "Ball":
+        """Its bounding box's middle and diagonal."""
+        low, high = self.part.vertices.min(0), self.part.vertices.max(0)
+        return self.pose, (low + high) / 2, float(np.linalg.norm(high - low))
+
+
+def without_backs(part: Part) -> Part:
+    """``part`` without faces that are the back of another one, for engines that draw both sides of all."""
+    places = np.unique(part.vertices, axis=0, return_inverse=True)[1].reshape(-1)
+    _, first = np.unique(np.sort(places[part.faces], axis=1), axis=0, return_index=True)
+    return replace(part, faces=part.faces[np.sort(first)])
+
+
+def surfaces_of(world: Snapshot) -> Iterator[Surface]:
+    """The parts of all instances."""
+    for instance in world.instances:
+        model = instance.model
+        for number, part in enumerate(model.obj.parts):
+            look: Material = model.obj.materials[part.material]
+            yield Surface(
+                f"{model.shape} {number}",
+                part,
+                instance.pose,
+                TextureImage("albedo", look.albedo, model),
+                TextureImage("normal", look.normal, model) if look.normal else None,
+                TextureImage("metallic", look.metallic, model) if look.metallic else None,
+                look.opacity,
+            )
+
+
+class ContentCache(Generic[T]):
+    """Values by content key; ``trim`` forgets those unused for longest. ``drop`` is called with forgotten ones."""
+
+    def __init__(self, drop: Callable[[T], None] = lambda _: None) -> None:
+        self._entries: OrderedDict[str, tuple[T, int]] = OrderedDict()
+        self._drop = drop
+
+    def get(self, key: str, make: Callable[[], tuple[T, int]]) -> T:
+        """The value of ``key``; ``make`` makes it, and its size in bytes, on first use."""
+        if key not in self._entries:
+            self._entries[key] = make()
+        self._entries.move_to_end(key)
+        return self._entries[key][0]
+
+    def trim(self) -> None:
+        """Keep to the limits. Call it when no picture is being drawn."""
+        size = sum(count for _, count in self._entries.values())
+        while len(self._entries) > MAX_ENTRIES or size > MAX_BYTES:
+            _, (value, count) = self._entries.popitem(last=False)
+            size -= count
+            self._drop(value)
+
+
+def clipping_planes(camera: Matrix, balls: Iterable[Ball]) -> tuple[float, float]:
+    """Distances (near, far), metres: nearer for a tiny object close to the camera, farther for a distant one."""
+    near, far = NEAR, FAR
+    for pose, centroid, scale in balls:
+        centre = pose[:3, :3] @ centroid + pose[:3, 3]
+        away = float(np.linalg.norm(centre - camera[:3, 3]))
+        size = float(np.linalg.norm(pose[:3, 0])) * scale
+        near = min(near, 0.1 * max(size, away - size)) or near
+        far = max(far, away + size)
+    return near, far
+
+
+def sphere_around(surfaces: Iterable[Surface]) -> tuple[NDArray[np.float64], float]:
+    """Centre (3,) and radius, metres, of a sphere around all surfaces; around the origin without any."""
+    balls = [surface.ball for surface in surfaces]
+    if not balls:
+        return np.zeros(3), 1.0
+    centres = np.array([pose[:3, :3] @ middle + pose[:3, 3] for pose, middle, _ in balls])
+    radii = np.array([np.linalg.norm(pose[:3, :3], 2) * size / 2 for pose, _, size in balls])[:, None]
+    centre = ((centres - radii).min(0) + (centres + radii).max(0)) / 2
+    return centre, float((np.linalg.norm(centres - centre, axis=1) + radii[:, 0]).max())
+
+
+def towards(light: WorldLight) -> list[float]:
+    """Unit vector (3,) to where a directional light comes from."""
+    direction = np.asarray(light.direction, dtype=np.float64)
+    found: list[float] = (-direction / np.linalg.norm(direction)).tolist()
+    return found
+
+
+def background_pixels(world: Snapshot, *, width: int, height: int) -> Pixels:
+    """The background alone, (height, width, 3) uint8, sRGB, row 0 on top."""
+    if not isinstance(world.background, Sky):
+        return np.full((height, width, 3), np.round(255 * np.array(world.background)), np.uint8)
+    slope = np.tan(np.radians(FIELD_OF_VIEW / 2))
+    y = slope * (1 - (2 * np.arange(height)[:, None] + 1) / height)
+    x = slope * ((2 * np.arange(width) + 1) / width - 1) * width / height
+    rays = np.stack(np.broadcast_arrays(x, y, -1.0), axis=-1) @ world.camera[:3, :3].T  # (H, W, 3)
+    return _sky(rays[..., 1] / np.linalg.norm(rays, axis=-1))
+
+
+def _sky(height: NDArray[np.float64]) -> Pixels:
+    """Colours (..., 3) uint8 by the sine of the elevation, as pyrender's ``SkyPass``."""
+    horizon, zenith, ground = np.array([[0.84, 0.89, 0.93], [0.30, 0.52, 0.78], [0.47, 0.49, 0.43]])
+    up, edge = np.sqrt(np.clip(height, 0, 1))[..., None], np.clip((height + 0.01) / 0.02, 0, 1)[..., None]
+    edge = edge**2 * (3 - 2 * edge)
+    found: Pixels = np.round(255 * (ground + edge * (horizon + up * (zenith - horizon) - ground))).astype(np.uint8)
+    return found
+
+
+def composited(color: NDArray[np.floating[Any]], alpha: NDArray[np.floating[Any]], world: Snapshot) -> Pixels:
+    """A picture (H, W, 3) uint8 over the background, blended by encoded values as image editors do.
+
+    color (H, W, 3): sRGB in [0, 1], not premultiplied. alpha (H, W, 1).
+    """
+    height, width = color.shape[:2]
+    behind = background_pixels(world, width=width, height=height) / 255.0
+    blend: Pixels = np.round(255 * (behind + np.clip(alpha, 0, 1) * (np.clip(color, 0, 1) - behind))).astype(np.uint8)
+    return blend
+
+
+def rgba_of(pixels: Pixels) -> Pixels:
+    """(H, W, 4) uint8, bottom row first, of a texture's pixels; roughness in green, metallic in blue, as in glTF."""
+    height, width, channels = pixels.shape
+    rgba = np.full((height, width, 4), 255, np.uint8)
+    rgba[..., slice(1, 3) if channels == 2 else slice(channels)] = pixels[::-1]
+    return rgba
+
+
+def linear_light(color: NDArray[np.float64]) -> NDArray[np.float64]:
+    """sRGB in [0, 1] to linear light."""
+    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+
+
+def encoded_light(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Linear light to sRGB, clipped to [0, 1]."""
+    clipped = np.clip(linear, 0, 1)
+    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+
+
+@lru_cache(maxsize=32)
+def _opacity(data: bytes, blended: bool) -> tuple[str, Pixels | None]:
+    """A cache key of an albedo file's alpha, and the alpha (H, W); "" and ``None`` if all of it is opaque."""
+    opacity = opacity_of(data, blended=blended)
+    return ("", None) if opacity is None else (f" opacity {content_key(opacity)}", opacity)
+
+
+def _roughness_metallic(data: bytes, name: str) -> Pixels:
+    """(H, W, 2) uint8 from a MetallicSmoothness file: 1 - alpha (smoothness), red."""
+    with open_image(data, name) as image:
+        smoothness = image.getchannel("A") if "A" in image.getbands() else None
+        metallic = np.array(image.convert("RGB"))[..., 0]
+    plain = np.full(metallic.shape, round(255 * PLAIN_ROUGHNESS), np.uint8)
+    roughness = plain if smoothness is None else 255 - np.array(smoothness)
+    return np.stack([roughness, metallic], axis=-1)

@@ -1,0 +1,1 @@
+"""SAILenv's socket protocol: connections, the state of each agent, uploads."""

@@ -1,0 +1,77 @@
+"""3D models with hashes of their content, by which caches find meshes and textures."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trompe_shared.errors import ObjectError
+from trompe_shared.object3d import Object3D
+
+__all__ = ["HashedModel", "content_key", "model_of", "repainted"]
+
+Texture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class HashedModel:
+    """An object and hashes of its content.
+
+    ``albedos`` holds the hash of each texture that serves as albedo only, by file name; ``shape`` covers everything
+    else, ``key`` covers all. In a repainted model ``obj.textures`` is up to date and ``obj.files`` is not.
+    """
+
+    shape: str
+    albedos: Mapping[str, str]
+    obj: Object3D = field(compare=False, repr=False)
+
+    @cached_property
+    def key(self) -> str:
+        """Equal for equal content."""
+        return content_key(repr((self.shape, sorted(self.albedos.items()))).encode())
+
+    @property
+    def nbytes(self) -> int:
+        """Approximate size in memory."""
+        parts = sum(p.vertices.nbytes + p.normals.nbytes + p.uvs.nbytes + p.faces.nbytes for p in self.obj.parts)
+        textures = sum(texture.nbytes for texture in self.obj.textures.values())
+        return parts + textures + sum(map(len, self.obj.files.values()))
+
+
+def content_key(*data: bytes | Texture) -> str:
+    """SHA-256 of ``data`` as hex digits."""
+    digest = hashlib.sha256()
+    for part in data:
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part if isinstance(part, bytes) else np.ascontiguousarray(part).data)
+    return digest.hexdigest()
+
+
+def model_of(obj: Object3D) -> HashedModel:
+    """Hash the content of ``obj``."""
+    maps = {name for material in obj.materials.values() for name in (material.normal, material.metallic)}
+    albedos = {name: _texture_key(texture) for name, texture in obj.textures.items() if name not in maps}
+    kept = [(name.encode(), data) for name, data in sorted(obj.files.items()) if name not in albedos]
+    blended = (name.encode() for name, look in sorted(obj.materials.items()) if look.opacity is not None)
+    return HashedModel(content_key(*(part for item in kept for part in item), *blended), albedos, obj)
+
+
+def repainted(model: HashedModel, textures: Mapping[str, Texture]) -> HashedModel:
+    """``model`` with some of its albedo textures replaced: (H, W, 3) uint8, row 0 on top.
+
+    Raises ``ObjectError`` for a name outside ``albedos`` and for a texture without texels.
+    """
+    unknown = sorted(set(textures) - set(model.albedos))
+    if unknown:
+        raise ObjectError(f"{unknown} cannot be repainted; choose from {sorted(model.albedos)}.")
+    if not all(texture.size for texture in textures.values()):
+        raise ObjectError("A texture must have at least one texel.")
+    obj = replace(model.obj, textures={**model.obj.textures, **textures})
+    return HashedModel(model.shape, {**model.albedos, **{name: _texture_key(t) for name, t in textures.items()}}, obj)
+
+
+def _texture_key(texture: Texture) -> str:
+    return content_key(repr(texture.shape).encode(), texture)

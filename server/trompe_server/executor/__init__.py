@@ -1,0 +1,1 @@
+"""Processes that run attempts of jobs: worker, runner, heartbeat, supervisor."""

@@ -1,0 +1,109 @@
+"""Opens a job in this process: its phases, its files and its connection to the renderers."""
+
+import importlib
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import Any, Final
+
+from trompe_server.executor.runner import OpenedJob
+from trompe_server.library import Library
+from trompe_server.queue.claims import Claim
+from trompe_server.renderers.choice import JobEngines, listed
+from trompe_server.renderers.discovery import Address, DiscoveredRenderers, RendererAddresses, engines_at
+from trompe_server.renderers.protocol import TargetRenderer
+from trompe_server.settings import Settings
+from trompe_server.storage.folders import Folder, JobArtifacts, job_artifacts
+from trompe_shared.api import JobSpec
+from trompe_shared.engine import EngineInfo
+from trompe_shared.errors import RendererError, RendererLostError
+
+__all__ = ["JobOpener", "load"]
+
+ENGINES: Final = "engines.json"
+"""File with the engines of a job's renderers: later attempts use the same ones."""
+
+
+class JobOpener:
+    """Opens jobs with their files in ``files`` and their targets at ``renderers``."""
+
+    def __init__(self, settings: Settings, files: Folder, renderers: RendererAddresses) -> None:
+        self._settings, self._files, self._renderers = settings, files, renderers
+        self._library = Library(files.within("library"), cache=settings.data / "cache")
+
+    def open(self, claim: Claim) -> OpenedJob:
+        """Open the job of ``claim``. Raises ``TrompeError`` for errors the user can fix."""
+        artifacts = job_artifacts(self._files, claim.job.id, attempt=claim.attempt)
+        engines = self._engines(claim.job.spec, artifacts)
+        with ExitStack() as opened:
+            targets = []
+            for engine in engines.all:
+                targets.append(DiscoveredRenderers(self._renderers, engine, _target))
+                opened.callback(targets[-1].close)
+            attacked = len(engines.attacked)
+            job = load(self._settings.pipeline)(
+                claim.job.spec,
+                library=self._library,
+                artifacts=artifacts,
+                target=targets[0],
+                more_targets=targets[1:attacked],
+                judge_targets=targets[attacked:],
+                device=self._settings.device,
+            )
+            return OpenedJob(job, opened.pop_all().close)
+        raise AssertionError("the block returns or raises")
+
+    def _engines(self, spec: JobSpec, artifacts: JobArtifacts) -> JobEngines:
+        """The engines of the job's renderers, recorded at its first opening, once they answer."""
+        known = JobEngines.from_text(artifacts.read(ENGINES)) if artifacts.exists(ENGINES) else None
+        deadline = time.monotonic() + self._settings.renderer_patience
+        while True:
+            late = time.monotonic() > deadline
+            try:
+                engines = self._engines_now(spec, known, late=late)
+                break
+            except RendererError:
+                if late:
+                    raise
+            time.sleep(0.3)
+        if known is None:
+            artifacts.write(ENGINES, engines.to_text().encode())
+        return engines
+
+    def _engines_now(self, spec: JobSpec, known: JobEngines | None, *, late: bool) -> JobEngines:
+        """The same by those that answer now. The first renderer is the default: unless ``late``, wait for it."""
+        found = engines_at(self._renderers.addresses())
+        there = list(dict.fromkeys(engine for engine in found.values() if engine))
+        if not there:
+            where = ", ".join(f"{host}:{port}" for host, port in (*self._renderers.listed, *self._renderers.dns))
+            raise RendererError(
+                f"No renderer answers at {where}. Start one with: trompe render --host HOST --port PORT; "
+                "`trompe doctor` tells whether this machine can render."
+            )
+        if known is None:
+            if next(iter(found.values())) is None and not late:
+                raise RendererError("The first renderer does not answer yet.")
+            return JobEngines.of(spec, there)
+        if missing := set(known.all) - set(there):
+            raise RendererLostError(
+                f"The job began with {listed(missing)}, and no renderer with it answers. There are: {listed(there)}."
+            )
+        return known
+
+    def tidy(self, claim: Claim, kept: list[str]) -> None:
+        """Delete all files of an ended job except ``kept``; its checkpoints take most of its space."""
+        job_artifacts(self._files, claim.job.id).keep(kept)
+
+
+def load(path: str) -> Any:
+    """Import ``module:name``. Late, because it imports torch."""
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _target(addresses: Sequence[Address], engine: EngineInfo) -> TargetRenderer:
+    from trompe_server.renderers import RendererPool, SailenvTarget
+
+    if len(addresses) == 1:
+        return SailenvTarget(*addresses[0], engine=engine)
+    return RendererPool(addresses, engine=engine)

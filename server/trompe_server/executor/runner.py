@@ -1,0 +1,206 @@
+"""Runs one job phase by phase. Each finished phase is recorded, so that another worker can continue after it."""
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final, TypeVar
+
+from trompe_server.errors import NotFoundError
+from trompe_server.executor.metrics import count_phase
+from trompe_server.job.protocol import DamagedFileError, PhasedJob, PhaseReport
+from trompe_server.queue.claims import Claim, Claims, Ending, LostJobError
+from trompe_server.storage.database import RETRY_WAITS, DatabaseDownError, patiently
+from trompe_shared.api import JobState, Progress
+from trompe_shared.errors import RendererError, TrompeError
+
+__all__ = ["JobRunner", "OpenedJob"]
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+MAX_DAMAGES: Final = 2
+"""Times a phase may find its input damaged and have it made again."""
+
+
+@dataclass(frozen=True)
+class OpenedJob:
+    """A job ready to run. ``close`` releases the connection to the renderers."""
+
+    job: PhasedJob
+    close: Callable[[], None]
+
+
+OpenJob = Callable[[Claim], OpenedJob]
+"""Opens a job. Raises ``TrompeError`` for errors the user can fix."""
+TidyJob = Callable[[Claim, list[str]], None]
+"""Deletes all files of an ended job except the named ones."""
+
+
+class _Stop(BaseException):
+    """Unwinds a phase. Not an ``Exception``, so that no phase catches it."""
+
+
+class _Cancelled(_Stop):
+    """The job was cancelled."""
+
+
+class _Lost(_Stop):
+    """Another worker has the job."""
+
+
+@dataclass
+class JobRunner:
+    """Runs jobs one at a time. ``current`` is the running one, ``touched`` the time of its last progress (monotonic).
+
+    Setting ``lost`` unwinds the running job at its next step. Setting ``stopped`` ends the wait for an unreachable
+    database. Progress is written every ``progress_interval`` seconds at most.
+    """
+
+    claims: Claims
+    open_job: OpenJob
+    tidy_job: TidyJob = lambda _claim, _kept: None
+    progress_interval: float = 1.0
+    retry_waits: tuple[float, float] = RETRY_WAITS
+    current: Claim | None = None
+    touched: float = field(default_factory=time.monotonic)
+    lost: threading.Event = field(default_factory=threading.Event)
+    stopped: threading.Event = field(default_factory=threading.Event)
+
+    def run(self, claim: Claim) -> JobState | None:
+        """Run a job, or continue it. Returns its final state, or ``None`` if another worker took it.
+
+        Never raises for errors of the job.
+        """
+        self.lost.clear()
+        self.current, self.touched = claim, time.monotonic()
+        try:
+            ending = self._ending(claim)
+            kept = self.patiently(lambda: self.claims.finish(claim, ending))
+            self._tidy(claim, kept)
+            return ending.state
+        except (_Lost, LostJobError, NotFoundError) as error:
+            logger.warning("job %s was lost: %s", claim.job.id, error)
+            self._tidy_after(claim)
+            return None
+        finally:
+            self.current = None
+
+    def patiently(self, action: Callable[[], T]) -> T:
+        """Repeat ``action`` while the database cannot be reached."""
+        return patiently(action, stopped=self.stopped.is_set, waits=self.retry_waits)
+
+    def _tidy_after(self, claim: Claim) -> None:
+        """Delete the files this attempt wrote after another attempt had ended the job and tidied."""
+        kept = self.patiently(lambda: self.claims.ended_artifacts(claim))
+        if kept is not None:
+            self._tidy(claim, kept)
+
+    def _tidy(self, claim: Claim, kept: list[str]) -> None:
+        try:
+            self.tidy_job(claim, kept)
+        except Exception:
+            logger.warning("cannot delete the working files of job %s", claim.job.id, exc_info=True)
+
+    def _ending(self, claim: Claim) -> Ending:
+        phases = _Phases(claim, self)
+        try:
+            return phases.run_all()
+        except _Cancelled:
+            return Ending(JobState.cancelled, note="cancelled")
+        except (LostJobError, DatabaseDownError):
+            raise
+        except TrompeError as error:
+            return Ending(JobState.failed, error=str(error))
+        except Exception as error:
+            logger.exception("job %s failed", claim.job.id)
+            message = f"{type(error).__name__}: {error}".strip().splitlines()[0][:500]
+            return Ending(JobState.failed, error=f"An unexpected error ended the job: {message}")
+        finally:
+            phases.close()
+
+
+class _Phases:
+    """The phases of one job in this process. The job is reopened after the renderer was lost."""
+
+    def __init__(self, claim: Claim, runner: JobRunner) -> None:
+        self._claim, self._runner = claim, runner
+        self._opened: OpenedJob | None = None
+        self._written = 0.0
+
+    def run_all(self) -> Ending:
+        """Run the remaining phases. After a phase finds damaged files, the phase before runs again."""
+        names, number = self._open().phases(), self._claim.done
+        damages: Counter[int] = Counter()
+        while number < len(names):
+            try:
+                report = self._run(names[number])
+            except DamagedFileError as error:
+                damages[number] += 1
+                if number == 0 or damages[number] > MAX_DAMAGES:
+                    raise
+                logger.warning("job %s repeats the previous phase: %s", self._claim.job.id, error)
+                number -= 1
+                continue
+            if report.state is not None:
+                return Ending(report.state, note=report.note, progress=report.progress, public=report.public)
+            number += 1
+            self._record(report, done=number)
+        return Ending(JobState.succeeded)
+
+    def close(self) -> None:
+        """Release the connection to the renderers."""
+        if self._opened is not None:
+            self._opened.close()
+            self._opened = None
+
+    def _run(self, phase: str) -> PhaseReport:
+        """Run a phase, once more if the renderer was lost: its supervisor restarts it."""
+        try:
+            return self._run_once(phase)
+        except RendererError:
+            logger.warning("phase %s of job %s lost the renderer and runs again", phase, self._claim.job.id)
+            self.close()
+            return self._run_once(phase)
+
+    def _run_once(self, phase: str) -> PhaseReport:
+        job, started = self._open(), time.perf_counter()
+        report = job.run(phase, self._on_progress)
+        count_phase(phase, time.perf_counter() - started, report.counts)
+        return report
+
+    def _record(self, report: PhaseReport, *, done: int) -> None:
+        """Record a finished phase. The next one starts only after that."""
+        claims = self._runner.claims
+        cancelled = self._runner.patiently(
+            lambda: claims.advance(self._claim, report.progress, done=done, public=report.public)
+        )
+        self._runner.touched = self._written = time.monotonic()
+        if cancelled:
+            raise _Cancelled
+
+    def _on_progress(self, progress: Progress) -> None:
+        """Write progress, and unwind the phase if the job was cancelled or lost."""
+        self._runner.touched = time.monotonic()
+        if self._runner.lost.is_set():
+            raise _Lost("another worker has it")
+        if self._runner.touched - self._written < self._runner.progress_interval:
+            return
+        self._written = self._runner.touched
+        try:
+            cancelled = self._runner.claims.advance(self._claim, progress)
+        except DatabaseDownError as error:
+            logger.warning("cannot write the progress of job %s, which continues: %s", self._claim.job.id, error)
+            return
+        except LostJobError as error:
+            raise _Lost(str(error)) from error
+        if cancelled:
+            raise _Cancelled
+
+    def _open(self) -> PhasedJob:
+        if self._opened is None:
+            self._opened = self._runner.open_job(self._claim)
+        return self._opened.job

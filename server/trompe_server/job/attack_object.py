@@ -1,0 +1,98 @@
+"""One attack without a service: for notebooks and scripts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from trompe_server.attack import Budget, Goal, ViewDistribution, attack, start
+from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
+from trompe_server.image_pipelines import ImagePipeline
+from trompe_server.job.setup import HELD_OUT_STREAM, POOL_STREAM, PROBE_STREAM
+from trompe_server.judging.metrics import accuracy
+from trompe_server.renderers import TargetRenderer
+from trompe_server.spec.framing import framing_of
+from trompe_server.spec.labels import resolve_labels
+from trompe_server.surrogate import textures_of
+from trompe_server.surrogate.calibration import build_surrogate, calibrate
+from trompe_shared.api import Accuracy, ViewOptions
+from trompe_shared.errors import ClassifierError
+from trompe_shared.geometry import View
+from trompe_shared.object3d import Object3D, load_object
+from trompe_shared.shipped import shipped_objects
+
+__all__ = ["AttackedObject", "attack_object"]
+
+VIEWS: Final = 40
+"""Default number of attacked views, and of held-out ones."""
+
+
+@dataclass(frozen=True)
+class AttackedObject:
+    """A repainted object, and its accuracies in the surrogate, in the target and on held-out views of the target."""
+
+    painted: Object3D
+    surrogate: Accuracy
+    target: Accuracy
+    held_out: Accuracy
+
+
+def attack_object(
+    obj: Object3D | str | Path,
+    classifier: WhiteBoxClassifier | str | Path,
+    *,
+    label: str | int | Sequence[str | int],
+    target: TargetRenderer,
+    views: Sequence[View] | None = None,
+    held_out: Sequence[View] | None = None,
+    budget: Budget | None = None,
+    steps: int = 30,
+    seed: int = 0,
+    pipeline: ImagePipeline | None = None,
+) -> AttackedObject:
+    """Repaint ``obj`` so that ``classifier`` no longer recognises ``label`` in the images of ``target``.
+
+    Each of several labels counts as the object. ``obj`` and ``classifier`` can be paths or names of shipped ones, such
+    as ``mug`` and ``tiny``. ``views`` and ``held_out`` default to random cameras and lights that frame the object.
+    ``budget`` defaults to epsilon 0.05, alpha 0.01. ``pipeline``: what happens to the images of the attack
+    before the classifier. The same arguments give the same bytes. Raises ``TrompeError`` for
+    inputs that cannot be read or do not fit together.
+    """
+    obj = obj if isinstance(obj, Object3D) else _load(obj)
+    network = load_classifier(classifier) if isinstance(classifier, str | Path) else classifier
+    if not isinstance(network, WhiteBoxClassifier):
+        raise ClassifierError(f"{network.name!r} gives scores but no gradients (.onnx); use a .pt2 file.")
+    goal = Goal(resolve_labels(label, network.classes, network.n_classes, network.name))
+    framing = framing_of(obj, ViewOptions())
+    cameras = ViewDistribution(framing.distance, framing.elevation, centre=framing.centre)
+    own = cameras.sample(VIEWS, generator=np.random.default_rng([seed, POOL_STREAM])) if views is None else views
+    unseen = (
+        cameras.sample(VIEWS, generator=np.random.default_rng([seed, HELD_OUT_STREAM]))
+        if held_out is None
+        else held_out
+    )
+    budget = budget or Budget(epsilon=0.05, alpha=0.01)
+
+    ask = partial(target.render, size=network.image_size)
+    clean = ask(obj, own)
+    calibration = calibrate(obj, own, clean, ask, wanted="auto", generator=np.random.default_rng([seed, PROBE_STREAM]))
+    surrogate, textures = build_surrogate(calibration, obj, own, clean), textures_of(obj)
+    run = partial(attack, goal=goal, budget=budget, steps=steps, seed=seed, pipeline=pipeline)
+    state = run(start(textures), textures, surrogate, network)
+    painted = budget.repaint(obj, state.deltas)
+
+    images = [
+        [surrogate.images(each) for each in (obj, painted)],
+        [clean, ask(painted, own)],
+        [ask(each, unseen) for each in (obj, painted)],
+    ]
+    judged = [accuracy(network.predict(before), network.predict(after), goal.labels) for before, after in images]
+    return AttackedObject(painted, *judged)
+
+
+def _load(source: str | Path) -> Object3D:
+    shipped = shipped_objects().get(str(source))
+    return load_object(source if shipped is None else shipped.path)

@@ -1,0 +1,141 @@
+"""The surrogates of a job: each attacked renderer has its calibration; equal sampling models share their geometry."""
+
+import hashlib
+import logging
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from typing import Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trompe_server.job.files import JobFiles
+from trompe_server.job.setup import PROBE_STREAM, JobSetup
+from trompe_server.storage.arrays import pack_arrays, unpack_arrays
+from trompe_server.storage.folders import Folder
+from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry
+from trompe_server.surrogate.calibration import Ask, Calibration, build_surrogate, calibrate
+from trompe_server.surrogate.calibration_file import calibration_key, pack_calibration, unpack_calibration
+from trompe_server.surrogate.tone import ToneMap, measure_tone_map
+from trompe_shared.api import SearchOptions
+from trompe_shared.engine import EngineInfo
+
+__all__ = ["JobCalibrations"]
+
+logger = logging.getLogger(__name__)
+
+TONE_VERSION: Final = 1
+"""To be raised whenever the same images can give another tone curve."""
+
+Image8 = NDArray[np.uint8]
+T = TypeVar("T")
+
+
+class JobCalibrations:
+    """Calibrations of a job's attacked renderers in its ``files``; ``shared`` ones serve later jobs too."""
+
+    def __init__(self, setup: JobSetup, search: SearchOptions, files: JobFiles, shared: Folder) -> None:
+        self._setup, self._search, self._files, self._shared = setup, search, files, shared
+        self._geometries: dict[SamplingModel, Future[Geometry]] = {}
+
+    def make(self, number: int, clean: Image8, ask: Ask) -> None:
+        """Calibrate the attacked renderer ``number`` by its images of the unpainted object, unless that is done."""
+        if self._files.has_calibration(number):
+            return
+        name = f"{self._key(number, clean)}.npz"
+        found = self._known(name)
+        if found is None:
+            found = self._probe(number, clean, ask)
+        packed = pack_calibration(found)
+        self._files.save_calibration(number, packed)
+        if found.renders:
+            self._shared.write(name, packed)
+
+    def all(self) -> list[Calibration]:
+        """The calibrations of all attacked renderers. Raises ``DamagedFileError``."""
+        return [self._files.load_calibration(number) for number in range(len(self._setup.attacked))]
+
+    def surrogate(self, number: int, calibration: Calibration, clean: Image8) -> Surrogate:
+        """The surrogate of an attacked renderer."""
+        setup, known = self._setup, self._geometries.get(calibration.sampling)
+        surrogate = build_surrogate(
+            calibration,
+            setup.obj,
+            setup.attacked[number].shown(setup.views, judging=False),
+            clean,
+            geometry=known.result() if known is not None else None,
+            backdrops=setup.backdrops,
+            device=setup.device,
+        )
+        if known is None:
+            self._geometries[calibration.sampling] = Future()
+            self._geometries[calibration.sampling].set_result(surrogate.geometry)
+        return surrogate
+
+    def _key(self, number: int, clean: Image8) -> str:
+        setup, search, renderer = self._setup, self._search, self._setup.attacked[number]
+        return calibration_key(
+            setup.obj,
+            renderer.shown(setup.views, judging=False),
+            clean,
+            engine=renderer.engine,
+            wanted=search.surrogate,
+            seed=search.seed,
+        )
+
+    def _known(self, name: str) -> Calibration | None:
+        """The stored calibration of an earlier job with the same probes, if any."""
+        if (known := self._stored(name, unpack_calibration)) is None:
+            return None
+        return replace(known, renders=0, reason=f"{known.reason} (known from an earlier job)")
+
+    def _stored(self, name: str, unpack: Callable[[bytes], T]) -> T | None:
+        """A shared file, marked as used; ``None`` if there is none or it is damaged."""
+        if not self._shared.exists(name):
+            return None
+        try:
+            found = unpack(self._shared.read(name))
+        except (ValueError, OSError):
+            logger.warning("the stored calibration %s is damaged; probing the target again", name)
+            return None
+        self._shared.touch(name)
+        return found
+
+    def _probe(self, number: int, clean: Image8, ask: Ask) -> Calibration:
+        setup, search = self._setup, self._search
+        return calibrate(
+            setup.obj,
+            setup.attacked[number].shown(setup.views, judging=False),
+            clean,
+            ask,
+            wanted=search.surrogate,
+            generator=np.random.default_rng([search.seed, PROBE_STREAM]),
+            backdrops=setup.backdrops,
+            on_sampling=self._prepare_geometry,
+            deterministic=setup.attacked[number].engine.deterministic,
+            tone_map=partial(self._tone_map, setup.attacked[number].engine),
+        )
+
+    def _tone_map(self, engine: EngineInfo, ask: Ask, size: tuple[int, int]) -> ToneMap:
+        """The engine's tone curve, measured once for all jobs."""
+        key = hashlib.sha256(repr((TONE_VERSION, engine, size)).encode()).hexdigest()
+        name = f"tone-{key}.npz"
+        found = self._stored(name, lambda data: ToneMap.of(unpack_arrays(data)))
+        if found is None:
+            found = measure_tone_map(ask, size)
+            self._shared.write(name, pack_arrays(found.arrays()))
+        return found
+
+    def _prepare_geometry(self, sampling: SamplingModel) -> None:
+        """Rasterise all views in a thread while the renderer is busy with the probes."""
+        if sampling in self._geometries:
+            return
+        setup = self._setup
+        executor = ThreadPoolExecutor(1, thread_name_prefix="rasterise")
+        prepare = partial(
+            prepare_geometry, setup.obj, setup.views, size=setup.size, sampling=sampling, device=setup.device
+        )
+        self._geometries[sampling] = executor.submit(prepare)
+        executor.shutdown(wait=False)

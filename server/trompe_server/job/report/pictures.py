@@ -1,0 +1,136 @@
+"""Pictures of the report."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from trompe_server.job.report.data import Images, ReportData, distinct_views
+from trompe_server.job.setup import JobSetup
+from trompe_server.judging.metrics import predicted_classes, softmax
+from trompe_server.pictures import (
+    Verdict,
+    contact_sheet,
+    difference_strip,
+    extremes,
+    prediction_histogram,
+    representative,
+    saliency_object_sheet,
+    saliency_sheet,
+    saliency_texture_sheet,
+    texture_sheet,
+)
+from trompe_shared.engine import DEFAULT_ENGINE
+from trompe_shared.geometry import spherical
+from trompe_shared.object3d import encode_png
+
+__all__ = ["picture_files", "saliency_views"]
+
+SHEET_VIEWS: Final = 12
+SALIENCY_VIEWS: Final = 6
+DIFFERENCE_VIEWS: Final = 4
+
+
+def picture_files(data: ReportData) -> dict[str, bytes]:
+    """All pictures as PNG, by file name."""
+    setup = data.setup
+    names = " or ".join(repr(_short_name(setup, label)) for label in setup.labels)
+    engine = data.renderer.engine.name
+    where = f" in {engine}" if engine != DEFAULT_ENGINE or len(setup.renderers) > 1 else ""
+    title = f"{setup.object_name} as {names}, {setup.classifier.name}{where}"
+    sheets = _saliency(data, f"Saliency of {title}")
+    if data.after is not None:
+        sheets |= _before_and_after(data, data.after, title)
+    return {name: encode_png(picture) for name, picture in sheets.items()}
+
+
+def saliency_views(setup: JobSetup) -> NDArray[np.int64]:
+    """The views of the saliency sheets."""
+    distinct = distinct_views(setup)
+    return distinct[representative(len(distinct), SALIENCY_VIEWS)]
+
+
+def _saliency(data: ReportData, title: str) -> dict[str, Image.Image]:
+    setup, maps = data.setup, data.maps
+    if maps is None:
+        return {}
+    some = saliency_views(setup)
+    own = data.before["own"][some]
+    sheets = {"saliency.png": saliency_sheet(own, maps[some], tau=data.spec.paint.tau, title=title, columns=3)}
+    if data.scores is not None and data.heated is not None:
+        sheets["saliency_textures.png"] = saliency_texture_sheet(setup.obj.textures, data.scores, title=title)
+        sheets["saliency_object.png"] = saliency_object_sheet(own, maps[some], data.heated, title=title)
+    return sheets
+
+
+def _before_and_after(data: ReportData, after: Images, title: str) -> dict[str, Image.Image]:
+    setup, own = data.setup, data.before["own"]
+    logits_before, logits_after = data.logits_before["own"], (data.logits_after or {})["own"]
+    distinct = distinct_views(setup)
+    verdicts_before, verdicts_after = _verdicts(logits_before, setup), _verdicts(logits_after, setup)
+    recognised = [index for index in distinct if verdicts_before[index].correct]
+    shown = _shown(recognised, verdicts_after, setup)
+    few = distinct[representative(len(distinct), DIFFERENCE_VIEWS)]
+    sheets = {
+        "contact_sheet.png": contact_sheet(
+            own[shown],
+            after["own"][shown],
+            [verdicts_before[index] for index in shown],
+            [verdicts_after[index] for index in shown],
+            title=f"{title}, epsilon {data.spec.paint.epsilon:g}",
+            facts=_facts([verdicts_after[index].correct for index in recognised], setup),
+        ),
+        "difference.png": difference_strip(own[few], after["own"][few], title=title),
+        "predictions.png": prediction_histogram(
+            _counts(logits_before, setup),
+            _counts(logits_after, setup),
+            labels=[_short_name(setup, label) for label in setup.labels],
+            title=f"Predictions for {title}: {len(own)} target views",
+        ),
+    }
+    if data.painted is not None:
+        sheets["textures.png"] = texture_sheet(setup.obj.textures, data.painted.textures, title=title)
+    return sheets
+
+
+def _shown(recognised: Sequence[int], after: Sequence[Verdict], setup: JobSetup) -> list[int]:
+    """The views of the contact sheet: of the recognised ones the hardest to fool and the easiest, from all sides."""
+    confidences = [after[index].confidence * (1 if after[index].correct else -1) for index in recognised]
+    cameras = [setup.views[index].camera for index in recognised]
+    directions = np.array([spherical(camera.azimuth, camera.elevation) for camera in cameras])
+    return [recognised[index] for index in extremes(np.array(confidences), directions, SHEET_VIEWS)]
+
+
+def _facts(kept: Sequence[bool], setup: JobSetup) -> str:
+    """Counts for the contact sheet. kept: whether each view that was recognised before still is."""
+    number = len(distinct_views(setup))
+    views = f"{number} views" if number == len(setup.views) else f"{number} distinct views"
+    some = "all" if len(kept) <= SHEET_VIEWS else f"{SHEET_VIEWS}"
+    return (
+        f"Recognised before in {len(kept)} of {views}; {len(kept) - sum(kept)} of these are fooled. "
+        f"Below: {some} of the recognised ones, from the hardest to fool to the easiest."
+    )
+
+
+def _counts(logits: NDArray[np.float32], setup: JobSetup) -> Counter[str]:
+    """Number of views by the name of the predicted class."""
+    counts: Counter[str] = Counter()
+    for index, number in predicted_classes(logits).items():
+        counts[_short_name(setup, index)] += number
+    return counts
+
+
+def _short_name(setup: JobSetup, index: int) -> str:
+    """The first of a class's names."""
+    return setup.class_name(index).split(",")[0]
+
+
+def _verdicts(logits: NDArray[np.float32], setup: JobSetup) -> list[Verdict]:
+    best, probability = logits.argmax(axis=1), softmax(logits).max(axis=1)
+    return [
+        Verdict(setup.class_name(int(index)), float(share), index in setup.labels)
+        for index, share in zip(best, probability, strict=True)
+    ]

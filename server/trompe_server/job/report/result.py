@@ -1,0 +1,201 @@
+"""``result.json``."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+import torch
+
+from trompe_server.classifiers import Classifier
+from trompe_server.image_pipelines import SUITE, ImagePipeline
+from trompe_server.job.report.data import ReportData
+from trompe_server.job.report.outcome import classes_of_fooled, neighbour_warning
+from trompe_server.job.report.warnings import warnings_of
+from trompe_server.judging.metrics import (
+    accuracy,
+    max_view_change,
+    mean_texel_change,
+    share_beyond,
+    texels_altered,
+    transfer_gap,
+    view_predictions,
+)
+from trompe_server.judging.perceptual import object_pixels, perceived_change, total_variation
+from trompe_server.spec.labels import resolve_labels
+from trompe_server.spec.neighbours import neighbours
+from trompe_server.surrogate import behind
+from trompe_server.surrogate.fidelity import ViewFit
+from trompe_shared.api import (
+    Accuracy,
+    Judgement,
+    PipelineJudgement,
+    RendererResult,
+    Result,
+    ViewFidelity,
+    ViewPrediction,
+)
+
+__all__ = ["result_of", "worst"]
+
+
+def worst(seen: Sequence[ReportData]) -> ReportData:
+    """The attacked renderer with the smallest ``a_drop``, on held-out views if there are any; the first of equals."""
+
+    def drop(data: ReportData) -> float:
+        judged = (data.held_out or data.target).a_drop
+        return math.inf if judged is None else judged
+
+    return min((data for data in seen if data.renderer.attacked), key=drop)
+
+
+def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
+    """The result, with ``warnings`` before its own, but without its ``seconds``. ``seen``: one for each renderer."""
+    data = worst(seen)
+    spec, setup = data.spec, data.setup
+    became = classes_of_fooled(data)
+    synonyms = neighbour_warning(became, data.target, data.held_out)
+    names = [setup.class_name(label) for label in setup.labels] if setup.classifier.classes else None
+    return Result(
+        spec=spec,
+        object=setup.object_name,
+        label=setup.labels[0],
+        label_name=names[0] if names else None,
+        labels=list(setup.labels),
+        label_names=names,
+        classifier=setup.classifier.name,
+        ensemble=[member.name for member in setup.members[1:]],
+        epsilon=spec.paint.epsilon,
+        alpha=spec.alpha,
+        tau=spec.paint.tau,
+        seed=spec.search.seed,
+        steps=data.spent.steps,
+        image_size=setup.size,
+        renderer=data.renderer.engine,
+        renderers=[_in_renderer(each) for each in seen] if len(seen) > 1 else [],
+        surrogate=data.predicted,
+        target=data.target,
+        held_out=data.held_out,
+        fooled_as=became,
+        transfer_gap=transfer_gap(data.predicted, data.target),
+        **_agreement(data),
+        judges=[_judgement(judge, data) for judge in setup.judges],
+        image_pipelines=[
+            PipelineJudgement(pipeline=name, held_out=_through(pipeline, data))
+            for name, pipeline in (SUITE if setup.held_out and data.after is not None else {}).items()
+        ],
+        **_calibration_fields(data),
+        probe_renders=sum(each.calibration.renders for each in seen if each.calibration is not None),
+        **_changes(data),
+        goal_reached=_goal_reached(data),
+        evaluations=data.spent.evaluations,
+        queries=data.spent.queries,
+        warnings=[*warnings, *warnings_of(data, seen), *([synonyms] if synonyms else [])],
+        seconds={},
+        versions={name: version(name) for name in ("trompe", "torch", "numpy", "pyrender", "onnxruntime")},
+        **_views(data),
+    )
+
+
+def _in_renderer(data: ReportData) -> RendererResult:
+    return RendererResult(
+        renderer=data.renderer.engine,
+        attacked=data.renderer.attacked,
+        surrogate=data.predicted,
+        target=data.target,
+        held_out=data.held_out,
+        transfer_gap=transfer_gap(data.predicted, data.target),
+        **_agreement(data),
+        **(_calibration_fields(data) if data.calibration is not None else {}),
+        **_views(data),
+    )
+
+
+def _agreement(data: ReportData) -> dict[str, Any]:
+    return {} if data.agreement is None else data.agreement._asdict()
+
+
+def _views(data: ReportData) -> dict[str, Any]:
+    """Predictions of all views."""
+    setup, before, after = data.setup, data.logits_before, data.logits_after or {}
+    own = view_predictions(setup.views, before["own"], after.get("own"), setup.labels)
+    unseen = view_predictions(setup.held_out, before["held_out"], after.get("held_out"), setup.labels)
+    return {"views": _with_fits(own, data.fits), "held_out_views": unseen}
+
+
+def _with_fits(views: Sequence[ViewPrediction], fits: Sequence[ViewFit | None]) -> list[ViewPrediction]:
+    told = [None if fit is None else ViewFidelity(**_rounded(fit._asdict())) for fit in fits or [None] * len(views)]
+    return [view.model_copy(update={"fidelity": fit}) for view, fit in zip(views, told, strict=True)]
+
+
+def _goal_reached(data: ReportData) -> float | None:
+    """Share of the own target views on which the goal is reached."""
+    if data.logits_after is None:
+        return None
+    return float(data.setup.goal.reached(torch.from_numpy(data.logits_after["own"])).float().mean())
+
+
+def _judgement(judge: Classifier, data: ReportData) -> Judgement:
+    classes = judge.classes or data.setup.classifier.classes
+    labels = resolve_labels(data.spec.goal.label, classes, judge.n_classes, judge.name)
+    near = None if judge.classes is None else neighbours(labels, judge.classes)
+
+    def judged(views: str) -> Accuracy:
+        after = None if data.after is None else judge.predict(data.after[views])
+        return accuracy(judge.predict(data.before[views]), after, labels, near=near, distinct=data.distinct(views))
+
+    held_out = judged("held_out") if data.setup.held_out else None
+    return Judgement(classifier=judge.name, target=judged("own"), held_out=held_out)
+
+
+def _through(pipeline: ImagePipeline, data: ReportData) -> Accuracy:
+    """Accuracy through ``pipeline`` on every second held-out view: all of them would take a fifth of a job's time."""
+    assert data.after is not None
+    before, after = (
+        data.setup.classifier.predict(pipeline.shown(each["held_out"][::2])) for each in (data.before, data.after)
+    )
+    return accuracy(before, after, data.setup.labels, near=data.near)
+
+
+def _calibration_fields(data: ReportData) -> dict[str, Any]:
+    calibration = data.calibration
+    if calibration is None:
+        return {"surrogate_model": data.spec.search.surrogate, "surrogate_reason": "not built"}
+    return {
+        "surrogate_model": calibration.model,
+        "surrogate_reason": calibration.reason,
+        "fidelity": _rounded(calibration.fidelity.mean()),
+    }
+
+
+def _rounded(figures: Mapping[str, float]) -> dict[str, float]:
+    return {name: round(value, 5) for name, value in figures.items()}
+
+
+def _changes(data: ReportData) -> dict[str, Any]:
+    """Change of the textures, and of the target's images over all views: by the paper's constraint and as perceived.
+
+    Own views of a random renderer are left out if there are others: their noise differs before and after.
+    """
+    if data.after is None or data.painted is None:
+        return {"texels_altered": None, "mean_texel_change": None, "max_view_change": None}
+    setup, clean, painted = data.setup, data.setup.obj.textures, data.painted.textures
+    sets = {"own": setup.views, "held_out": setup.held_out}
+    if not data.renderer.engine.deterministic and setup.held_out:
+        del sets["own"]
+    before, after = (np.concatenate([each[name] for name in sets]) for each in (data.before, data.after))
+    views = [view for some in sets.values() for view in some]
+    pixels = object_pixels(before, after, behind(views, setup.backdrops, setup.size))
+    pixels_beyond, views_beyond = share_beyond(before, after, pixels, epsilon=data.spec.paint.epsilon)
+    seen = perceived_change(before, after, pixels)
+    return {
+        "texels_altered": texels_altered(clean, painted),
+        "mean_texel_change": mean_texel_change(clean, painted),
+        "max_view_change": max_view_change(before, after),
+        "pixels_beyond_epsilon": pixels_beyond,
+        "views_beyond_epsilon": views_beyond,
+        "texture_variation": total_variation(clean, painted),
+        **({} if seen is None else asdict(seen)),
+    }

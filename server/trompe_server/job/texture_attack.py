@@ -1,0 +1,417 @@
+"""A job: one attack on an object's texture, judged in the target renderer.
+
+prepare     target images of the unpainted object, their classes and saliency
+calibrate   probes; sampling model of the target; the cheapest sufficient colour model
+attack-NNN  some steps of the attack in the surrogate
+judge       target images of the saved 8-bit texture; report
+"""
+
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from trompe_server.attack import (
+    AttackState,
+    Backgrounds,
+    Budget,
+    Step,
+    TexelMasks,
+    attack,
+    few_texels,
+    image_gradients,
+    movable,
+    rank_texels,
+    saliency,
+    saliency_masks,
+    start,
+)
+from trompe_server.attack.search import SHOWN, SKIPPED
+from trompe_server.job.calibrations import JobCalibrations
+from trompe_server.job.files import OPEN, JobFiles
+from trompe_server.job.protocol import VIEWS_AFTER, VIEWS_BEFORE, Artifacts, OnProgress, PhaseReport, numbered
+from trompe_server.job.report import ReportData, saliency_views, worst, write_report
+from trompe_server.job.setup import JobRenderer, JobSetup, open_setup
+from trompe_server.judging.metrics import recognised
+from trompe_server.library import Library
+from trompe_server.pictures import heat_textures
+from trompe_server.renderers import TargetRenderer
+from trompe_server.storage.folders import Folder
+from trompe_server.surrogate import AnySurrogate, Surrogate, joined, textures_of
+from trompe_server.surrogate.calibration import Calibration
+from trompe_shared.api import JobSpec, JobState, Progress
+from trompe_shared.geometry import View
+from trompe_shared.object3d import Object3D, encode_png
+
+__all__ = ["CHUNK", "TextureAttack", "open_job"]
+
+logger = logging.getLogger(__name__)
+
+CHUNK: Final = 5
+"""Attack steps per phase: the most that is lost when a worker dies."""
+
+FEW: Final = "few_texels"
+"""Name of the file with the texels chosen by ``keep``: one mask per texture, in their order."""
+
+SHARES: Final = {"prepare": 0.15, "calibrate": 0.25, "attack": 0.45, "judge": 0.15}
+"""Parts of the progress bar by kind of phase."""
+
+DONE: Final = Progress(phase="judge", fraction=1.0)
+
+RECENT: Final = 10
+"""Number of the latest steps that tell how long one takes."""
+
+AS_PREPARED: Final = 1.5
+"""The last phase takes this many times as long as the first; measured: 0.8 to 1.9."""
+
+Image8 = NDArray[np.uint8]
+Ask = Callable[[JobRenderer, Object3D, Sequence[View]], Image8]
+
+
+def open_job(
+    spec: JobSpec, *, library: Library, artifacts: Artifacts, target: TargetRenderer, **options: Any
+) -> "TextureAttack":
+    """The phases of the job ``spec``; other arguments as for ``open_setup``.
+
+    Raises ``TrompeError`` for errors the user can fix.
+    """
+    began = time.perf_counter()
+    setup = open_setup(spec, library=library, target=target, **options)
+    return TextureAttack(spec, setup, artifacts, library.calibrations, began=began)
+
+
+class TextureAttack:
+    """One job; see the module's docstring. All that a phase leaves for later ones is in ``artifacts``.
+
+    ``calibrations`` are shared with other jobs: a job with the same probes renders none. ``began``: when the opening of
+    the job began, by ``time.perf_counter``; default: now.
+    """
+
+    def __init__(
+        self,
+        spec: JobSpec,
+        setup: JobSetup,
+        artifacts: Artifacts,
+        calibrations: Folder,
+        *,
+        began: float | None = None,
+    ) -> None:
+        self.spec, self.setup, self.artifacts = spec, setup, artifacts
+        self.files = JobFiles(artifacts, chunks=-(-spec.search.steps // CHUNK))
+        paint = spec.paint
+        self.budget = Budget(paint.epsilon, spec.alpha, paint.epsilon_view, paint.perceptual)
+        self._calibrations = JobCalibrations(setup, spec.search, self.files, calibrations)
+        self._counts: Counter[str] = Counter()
+        self._between = time.perf_counter() if began is None else began
+        self._stepped: deque[float] = deque(maxlen=RECENT)
+
+    def phases(self) -> list[str]:
+        """See ``PhasedJob.phases``."""
+        return self.files.phases
+
+    def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
+        """See ``PhasedJob.run``."""
+        kind, _, number = phase.partition("-")
+        self._counts.clear()
+        self._running = kind, time.perf_counter()
+        self.files.note_seconds(f"{OPEN}-{phase}", self._running[1] - self._between)
+        if kind == "attack":
+            report = self._attack(int(number), on_progress)
+        else:
+            work = {"prepare": self._prepare, "calibrate": self._calibrate, "judge": self._judge}[kind]
+            report = work(on_progress)
+        self._between = time.perf_counter()
+        self.files.note_seconds(phase, self._between - self._running[1])
+        return replace(report, counts=dict(self._counts))
+
+    def _seconds(self) -> dict[str, float]:
+        """Seconds by kind of phase, up to now."""
+        kind, began = self._running
+        return self.files.seconds() | {kind: time.perf_counter() - began}
+
+    def _prepare(self, on_progress: OnProgress) -> PhaseReport:
+        setup = self.setup
+        count = len(setup.views) + len(setup.held_out)
+        ask = self._asker("prepare", count * len(setup.renderers), on_progress)
+        for number, renderer in enumerate(setup.renderers):
+            own = ask(renderer, setup.obj, renderer.shown(setup.views, judging=False))
+            held_out = ask(renderer, setup.obj, renderer.shown(setup.held_out, judging=True))
+            self.files.save(numbered(VIEWS_BEFORE, number), own=own, held_out=held_out)
+        clean = self._clean
+        if setup.white_box:
+            maps = saliency(clean, setup.members, goal=setup.goal)
+            self.files.save("saliency", maps=maps.numpy().astype(np.float16))
+        if not recognised(setup.classifier.predict(clean), setup.labels).any():
+            return self._end_without_attack()
+        _ = self._masks  # raises for a tau that leaves no pixel, before more images are rendered
+        return PhaseReport(self._progress("prepare", 1.0))
+
+    def _end_without_attack(self) -> PhaseReport:
+        names = " or ".join(repr(self.setup.class_name(label)) for label in self.setup.labels)
+        note = (
+            f"{self.setup.classifier.name!r} recognises {names} in none of the {len(self._clean)} target views "
+            "of the unpainted object, so nothing can drop. Check `label`, `distance`, `elevation` and `background`."
+        )
+        public = write_report(self._seen(), self.artifacts, seconds=self._seconds, warnings=(note,))
+        return PhaseReport(DONE, JobState.not_applicable, note, public)
+
+    def _calibrate(self, on_progress: OnProgress) -> PhaseReport:
+        attacked = self.setup.attacked
+        # Five greys on every view and some trials; fewer if a cheaper model is good enough.
+        ask = self._asker("calibrate", len(attacked) * (5 * len(self.setup.views) + 4), on_progress)
+        for number, renderer in enumerate(attacked):
+            self._calibrations.make(number, self._before(number)["own"], partial(ask, renderer))
+        return PhaseReport(self._progress("calibrate", 1.0))
+
+    def _attack(self, chunk: int, on_progress: OnProgress) -> PhaseReport:
+        before = self.files.load_state(chunk, step=chunk * CHUNK) if chunk else start(self._textures)
+        if not chunk:
+            self._choose(on_progress)
+        total, asked = self.spec.search.steps, self.setup.queries or 0
+        steps = min(CHUNK, total - before.step)
+        taken: list[Step] = []
+        last = self._progress("attack", (before.step + steps) / total)
+
+        def on_step(step: Step) -> None:
+            nonlocal last
+            taken.append(step)
+            told = {"step": step.step + 1, "steps": total, "loss": step.loss, "fooled": step.fooled}
+            left = self._left(total - step.step - 1, step.least_left)
+            last = self._progress("attack", (step.step + 1) / total).model_copy(update=told | left)
+            on_progress(last)
+
+        after = self._ascend(before, steps, on_step)
+        self.files.save_state(chunk + 1, after)
+        if taken:
+            self._preview(after)
+            queries = (self.setup.queries or 0) - asked
+            self._counts["attack_steps"] += len(taken)
+            self._counts["classifier_images"] += taken[-1].evaluations - int(before.memory.get(SHOWN, 0))
+            self.files.note_spent(chunk, steps=len(taken), evaluations=taken[-1].evaluations, queries=queries)
+        return PhaseReport(last)
+
+    def _left(self, most: int, least: int) -> dict[str, float]:
+        """Estimated seconds left, from the time of the latest steps: with ``most`` and with ``least`` further ones.
+
+        The least ones skip safely won views.
+        """
+        self._stepped.append(time.perf_counter())
+        if len(self._stepped) == 1:
+            return {}
+        each = (self._stepped[-1] - self._stepped[0]) / (len(self._stepped) - 1)
+        work = most, least if least == most else least / (1 + SKIPPED)
+        eta, least_eta = (round(steps * each + self._judge_seconds, 1) for steps in work)
+        return {"eta_seconds": eta, "eta_least_seconds": least_eta}
+
+    def _preview(self, state: AttackState) -> None:
+        """Save a picture for spectators: the first view of the current texture, in surrogate and target."""
+        setup, painted = self.setup, self.budget.repaint(self.setup.obj, state.deltas)
+        first, surrogate = setup.renderers[0], self._surrogates[0]
+        texels = surrogate.texels(textures_of(painted, device=setup.device))
+        with torch.no_grad():
+            expected = surrogate.render(texels, 0)[0].permute(1, 2, 0).cpu().numpy()
+        shown = first.target.render(painted, first.shown(setup.views[:1], judging=False), size=setup.size)[0]
+        self._counts["target_renders"] += 1
+        picture = np.concatenate([(255 * expected).round().astype(np.uint8), shown], 1)
+        self.artifacts.write("preview.png", encode_png(picture))
+
+    def _ascend(self, state: AttackState, steps: int, on_step: Callable[[Step], None]) -> AttackState:
+        setup, search = self.setup, self.spec.search
+        return attack(
+            state,
+            self._textures,
+            self._surrogate,
+            setup.members,
+            goal=setup.goal,
+            budget=self.budget,
+            steps=steps,
+            total_steps=search.steps,
+            optimiser=search.optimiser,
+            masks=self._masks,
+            texels=self._movable,
+            views_per_step=self.spec.views_per_step * len(setup.attacked),
+            backgrounds=self._backgrounds,
+            pipeline=setup.pipeline,
+            seed=search.seed,
+            on_step=on_step,
+        )
+
+    def _judge(self, on_progress: OnProgress) -> PhaseReport:
+        setup = self.setup
+        deltas = self.files.load_state(self.files.chunks, step=self.spec.search.steps).deltas
+        painted = self.budget.repaint(setup.obj, deltas)
+        # The figures and the report take about as long as the images.
+        count = len(setup.views) + len(setup.held_out)
+        ask = self._asker("judge", 2 * count * len(setup.renderers), on_progress)
+        for number, renderer in enumerate(setup.renderers):
+            views = {"own": setup.views, "held_out": setup.held_out}
+            after = {name: ask(renderer, painted, renderer.shown(some, judging=True)) for name, some in views.items()}
+            self.files.save(numbered(VIEWS_AFTER, number), **after)
+        scores = None if self._scores is None else _numpy(self._scores)
+        seen = [replace(each, painted=painted, scores=scores, **self._attacked(each)) for each in self._seen()]
+        headline = worst(seen)
+        if scores is not None:
+            hot, views_shown = setup.obj.with_textures(heat_textures(setup.obj.textures, scores)), saliency_views(setup)
+            renderer = headline.renderer
+            heated = ask(renderer, hot, renderer.shown([setup.views[k] for k in views_shown], judging=True))
+            seen[headline.number] = replace(headline, heated=heated)
+        public = write_report(seen, self.artifacts, seconds=self._seconds)
+        return PhaseReport(DONE, JobState.succeeded, None, public)
+
+    def _attacked(self, seen: ReportData) -> dict[str, Any]:
+        """The report's data of a renderer after the attack."""
+        found: dict[str, Any] = {"after": self.files.load(numbered(VIEWS_AFTER, seen.number))}
+        if seen.renderer.attacked:
+            found |= {"surrogate": self._surrogates[seen.number], "calibration": self._found[seen.number]}
+        return found
+
+    def _seen(self) -> list[ReportData]:
+        """The report's data of each renderer before the attack."""
+        count = len(self.setup.views)
+        return [
+            ReportData(
+                spec=self.spec,
+                setup=self.setup,
+                number=number,
+                before=self._before(number),
+                maps=self._maps[number * count :][:count].numpy()
+                if renderer.attacked and self._maps is not None
+                else None,
+                spent=self.files.spent(),
+            )
+            for number, renderer in enumerate(self.setup.renderers)
+        ]
+
+    def _before(self, number: int) -> dict[str, Image8]:
+        """Images of the unpainted object in the renderer ``number``."""
+        return self.files.load(numbered(VIEWS_BEFORE, number))
+
+    @property
+    def _clean(self) -> Image8:
+        """Images of the unpainted object's own views in all attacked renderers."""
+        shown = [self._before(number)["own"] for number in range(len(self.setup.attacked))]
+        return shown[0] if len(shown) == 1 else np.concatenate(shown)
+
+    def _asker(self, phase: str, total: int, on_progress: OnProgress) -> Ask:
+        """Renders in a renderer and reports progress; ``total`` images complete the phase."""
+        done = 0
+
+        def on_frame() -> None:
+            nonlocal done
+            done += 1
+            self._counts["target_renders"] += 1
+            on_progress(self._progress(phase, min(1.0, done / total)))
+
+        def ask(renderer: JobRenderer, obj: Object3D, views: Sequence[View]) -> Image8:
+            return renderer.target.render(obj, views, size=self.setup.size, on_frame=on_frame)
+
+        return ask
+
+    def _progress(self, phase: str, share: float) -> Progress:
+        """Progress of the whole job at ``share`` of ``phase``."""
+        kinds = list(SHARES)
+        done = sum(SHARES[kind] for kind in kinds[: kinds.index(phase)])
+        left = round(self._judge_seconds - time.perf_counter() + self._running[1], 1) if phase == "judge" else 0.0
+        return Progress(phase=phase, fraction=done + share * SHARES[phase], eta_seconds=left if left > 0 else None)
+
+    @cached_property
+    def _judge_seconds(self) -> float:
+        """Estimated seconds of the last phase, from those of the first, which renders the same views."""
+        return AS_PREPARED * self.files.seconds().get("prepare", 0.0)
+
+    @cached_property
+    def _textures(self) -> dict[str, torch.Tensor]:
+        return textures_of(self.setup.obj, device=self.setup.device)
+
+    @cached_property
+    def _found(self) -> list[Calibration]:
+        return self._calibrations.all()
+
+    @cached_property
+    def _surrogates(self) -> list[Surrogate]:
+        """One for each attacked renderer."""
+        return [
+            self._calibrations.surrogate(number, calibration, self._before(number)["own"])
+            for number, calibration in enumerate(self._found)
+        ]
+
+    @cached_property
+    def _surrogate(self) -> AnySurrogate:
+        return joined(self._surrogates)
+
+    @cached_property
+    def _maps(self) -> torch.Tensor | None:
+        """Saliency of the attacked renderers' images (views, H, W); ``None`` for a classifier without gradients."""
+        if not self.setup.white_box:
+            return None
+        return torch.from_numpy(self.files.load("saliency")["maps"].astype(np.float32))
+
+    @cached_property
+    def _masks(self) -> torch.Tensor | None:
+        if self.spec.paint.tau is None or self._maps is None:
+            return None
+        return saliency_masks(self._maps, self.spec.paint.tau).to(self.setup.device)
+
+    @cached_property
+    def _scores(self) -> Mapping[str, torch.Tensor] | None:
+        """Saliency accumulated per texel."""
+        return None if self._maps is None else rank_texels(self._surrogate, self._textures, self._maps)
+
+    @cached_property
+    def _backgrounds(self) -> Backgrounds | None:
+        """Backgrounds of a pool's views, drawn more often where the object is recognised better."""
+        backgrounds = None if self.spec.views.grid else self.setup.backgrounds
+        if backgrounds is None:
+            return None
+        logits = self.setup.classifier.predict(self._clean)
+        backgrounds = replace(backgrounds, own=[*backgrounds.own] * len(self.setup.attacked))
+        return backgrounds.weighted(recognised(logits, self.setup.labels).tolist())
+
+    @cached_property
+    def _movable(self) -> TexelMasks:
+        within = list(self.setup.within)
+        if self.spec.paint.keep is not None:
+            known = self.files.load(FEW)
+            within.append({name: torch.from_numpy(known[str(k)]) for k, name in enumerate(self._textures)})
+        return movable(self._surrogate, self.budget, self._masks, within=within)
+
+    def _choose(self, on_progress: OnProgress) -> None:
+        """Choose the few texels of ``keep``, and count the images shown before the first step: each view once for its
+        saliency, and once for its class in front of its own background.
+        """
+        keep = self.spec.paint.keep
+        looks = (self.spec.paint.tau is not None) + (self._backgrounds is not None)
+        few = 0 if keep is None else self._choose_texels(keep, on_progress)
+        shown = looks * len(self.setup.attacked) * len(self.setup.views) + few
+        self._counts["classifier_images"] += shown
+        self.files.note_shown_before(shown)
+
+    def _choose_texels(self, keep: float, on_progress: OnProgress) -> int:
+        """Find and save the share ``keep`` of all texels; returns the number of images shown."""
+        setup = self.setup
+        gradients = image_gradients(self._clean, setup.members, goal=setup.goal)
+        few = few_texels(
+            *(keep, self._textures, self._surrogate, setup.members, gradients),
+            goal=setup.goal,
+            budget=self.budget,
+            within=setup.within,
+            masks=self._masks,
+            views_per_step=self.spec.views_per_step * len(setup.attacked),
+            backgrounds=self._backgrounds,
+            pipeline=setup.pipeline,
+            seed=self.spec.search.seed,
+            on_step=lambda _: on_progress(self._progress("attack", 0.0)),
+        )
+        self.files.save(FEW, **{str(k): few.masks[name].cpu().numpy() for k, name in enumerate(self._textures)})
+        return len(gradients) + few.evaluations
+
+
+def _numpy(scores: Mapping[str, torch.Tensor]) -> dict[str, NDArray[np.float32]]:
+    return {name: score.detach().cpu().numpy() for name, score in scores.items()}

@@ -1,0 +1,1 @@
+"""Results of an attack: accuracies with confidence intervals, and the visibility of the change."""

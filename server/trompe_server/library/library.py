@@ -1,0 +1,182 @@
+"""The library: objects, classifiers and backgrounds that jobs can name, uploaded or shipped."""
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from trompe_server.formats import import_file
+from trompe_server.library.catalogue import Catalogue
+from trompe_server.library.inspection import (
+    CLASSIFIER_ENDINGS,
+    TORCHVISION,
+    Inspect,
+    check_classes,
+    inspect_classifier,
+    torchvision_classifier,
+)
+from trompe_server.library.intake import copy, identity_of, intake
+from trompe_server.library.shipped import list_shipped_classifiers, list_shipped_objects
+from trompe_server.storage.folders import Folder, LocalArtifacts
+from trompe_server.system.files import write_whole
+from trompe_shared.api import BackgroundInfo, ClassifierInfo, ObjectInfo
+from trompe_shared.errors import ClassifierError, ObjectError, SpecError
+from trompe_shared.object3d import decode_rgb
+from trompe_shared.shipped import shipped_objects
+
+__all__ = ["Library"]
+
+_UPLOAD: Final = "upload"
+"""File of an object as uploaded, beside ``data.zip``."""
+
+
+class Library:
+    """Uploads in ``folder``, and shipped things. References are ids, unique beginnings of ids, or names.
+
+    ``cache``: local folder for files of a remote store that need a path; default: a temporary one.
+    ``inspect`` describes an uploaded classifier.
+    """
+
+    def __init__(
+        self, folder: Folder | Path, *, cache: Path | None = None, inspect: Inspect = inspect_classifier
+    ) -> None:
+        folder = LocalArtifacts(folder) if isinstance(folder, Path) else folder
+        self._objects = Catalogue("object", folder.within("objects"), ObjectInfo, list_shipped_objects)
+        self._classifiers = Catalogue(
+            "classifier", folder.within("classifiers"), ClassifierInfo, list_shipped_classifiers
+        )
+        self._backgrounds = Catalogue("background", folder.within("backgrounds"), BackgroundInfo, list)
+        self.calibrations = folder.within("calibrations")
+        """Calibrations of the target, shared by jobs."""
+        self._cache = cache or Path(tempfile.gettempdir(), f"trompe-cache-{os.getuid()}")
+        self._inspect = inspect
+
+    def objects(self) -> list[ObjectInfo]:
+        """All objects."""
+        return self._objects.all()
+
+    def object(self, reference: str) -> ObjectInfo:
+        """One object. Raises ``NotFoundError`` or ``AmbiguousError``."""
+        return self._objects.find(reference)
+
+    def object_bytes(self, reference: str) -> bytes:
+        """SAILenv's zip of an object. Raises ``NotFoundError`` or ``AmbiguousError``."""
+        info = self.object(reference)
+        return shipped_objects()[info.name].read() if info.shipped else self._objects.read(info)
+
+    def original(self, reference: str) -> tuple[bytes, str] | None:
+        """The uploaded file of an object and its name; ``None`` for a shipped object."""
+        info = self.object(reference)
+        if info.shipped:
+            return None
+        return self._objects.folder.within(info.id).read(_UPLOAD), info.filename or "object.zip"
+
+    def add_object(
+        self, file: BinaryIO, filename: str, *, name: str | None = None, max_texture: int | None = None
+    ) -> ObjectInfo:
+        """Store an object of any supported format, as uploaded and as SAILenv's zip.
+
+        Textures are shrunk to at most ``max_texture`` texels a side. Raises ``ObjectError`` for an unreadable file and
+        stores nothing then.
+        """
+        with intake() as folder:
+            upload = folder / _UPLOAD
+            identity = copy(file, upload)
+            made = import_file(upload, name=filename, max_texture=max_texture)
+            info = ObjectInfo(
+                id=identity if max_texture is None else identity_of(f"{identity} at most {max_texture}".encode()),
+                name=Path(name or filename).stem or "object",
+                materials=made.materials,
+                textures=dict(made.textures),
+                triangles=made.triangles,
+                radius=made.radius,
+                format=made.format,
+                filename=filename,
+            )
+            payload = folder / "data.zip"
+            write_whole(payload, made.archive)
+            self._objects.folder.within(info.id).write_file(_UPLOAD, upload)
+            return self._objects.put(info, payload)
+
+    def classifiers(self) -> list[ClassifierInfo]:
+        """All classifiers."""
+        return self._classifiers.all()
+
+    def classifier(self, reference: str) -> ClassifierInfo:
+        """One classifier, or ``torchvision:NAME`` with its weights from the local cache.
+
+        Raises ``NotFoundError``, ``AmbiguousError``, or ``ClassifierError`` if torchvision has no such one.
+        """
+        if reference.startswith(TORCHVISION):
+            return torchvision_classifier(reference)
+        return self._classifiers.find(reference)
+
+    def classifier_path(self, reference: str) -> str:
+        """Argument for ``load_classifier``: the path of an upload, or the name of any other classifier."""
+        if reference.startswith(TORCHVISION):
+            return reference
+        info = self.classifier(reference)
+        if info.shipped:
+            return info.name
+        folder, name = self._classifiers.place(info)
+        return str(folder.path(name) if isinstance(folder, LocalArtifacts) else self._local(info.id, folder, name))
+
+    def _local(self, identity: str, folder: Folder, name: str) -> Path:
+        """Local copy of a remote file, checked against its id."""
+        path = self._cache / identity / name
+        if not path.exists():
+            with folder.open(name) as source, tempfile.NamedTemporaryFile() as target:
+                if copy(source, Path(target.name)) != identity:
+                    raise ClassifierError(f"The stored file {identity[:12]} is damaged. Upload the classifier again.")
+                write_whole(path, Path(target.name))
+        return path
+
+    def add_classifier(
+        self, file: BinaryIO, filename: str, *, classes: Sequence[str] | None = None, name: str | None = None
+    ) -> ClassifierInfo:
+        """Store a .pt2 or .onnx file.
+
+        ``classes`` default to the names given with an earlier upload of the same file, or to the names in the file.
+        Raises ``ClassifierError`` for an invalid file and stores nothing then.
+        """
+        suffix = Path(filename).suffix.lower()
+        if suffix not in CLASSIFIER_ENDINGS:
+            raise ClassifierError(
+                f"{filename!r} is not a supported classifier: upload a .pt2 (torch.export) or .onnx file."
+            )
+        with intake() as folder:
+            payload = folder / f"data{suffix}"
+            identity = copy(file, payload)
+            before = self._classifiers.stored(identity)
+            found = self._inspect(str(payload)) if before is None else before.model_dump()
+            check_classes(classes, found["n_classes"])
+            if classes is None:
+                classes = found.get("classes")  # type: ignore[assignment]
+            info = ClassifierInfo.model_validate(
+                found | {"id": identity, "name": name or Path(filename).stem, "classes": classes}
+            )
+            return self._classifiers.put(info, payload)
+
+    def backgrounds(self) -> list[BackgroundInfo]:
+        """All uploaded backgrounds."""
+        return self._backgrounds.all()
+
+    def background(self, reference: str) -> BackgroundInfo:
+        """One background. Raises ``NotFoundError`` or ``AmbiguousError``."""
+        return self._backgrounds.find(reference)
+
+    def background_bytes(self, reference: str) -> bytes:
+        """Image file of a background. Raises ``NotFoundError`` or ``AmbiguousError``."""
+        return self._backgrounds.read(self.background(reference))
+
+    def add_background(self, data: bytes, name: str) -> BackgroundInfo:
+        """Store an image file. Raises ``SpecError`` for anything else and stores nothing then."""
+        try:
+            decode_rgb(data, name)
+        except ObjectError as error:
+            raise SpecError(f"The background {name!r} is not a readable image. Send a PNG or a JPEG.") from error
+        with intake() as folder:
+            payload = folder / f"data{Path(name).suffix.lower()}"
+            write_whole(payload, data)
+            return self._backgrounds.put(BackgroundInfo(id=identity_of(data), name=Path(name).stem), payload)

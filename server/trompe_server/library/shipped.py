@@ -1,0 +1,46 @@
+"""The objects and the classifier of the package, as the library lists them."""
+
+from functools import cache
+
+from trompe_server.library.intake import identity_of
+from trompe_shared.api import ClassifierInfo, ObjectInfo
+from trompe_shared.object3d import load_object
+from trompe_shared.shipped import ShippedObject, shipped_objects
+
+__all__ = ["list_shipped_classifiers", "list_shipped_objects"]
+
+
+@cache
+def list_shipped_objects() -> list[ObjectInfo]:
+    """The shipped objects. Reads them at the first call."""
+    return [_describe(shipped) for shipped in shipped_objects().values()]
+
+
+def _describe(shipped: ShippedObject) -> ObjectInfo:
+    data = shipped.read()
+    obj = load_object(data)
+    return ObjectInfo(
+        id=identity_of(data),
+        name=shipped.name,
+        materials=sorted(obj.materials),
+        textures={file: (image.shape[0], image.shape[1]) for file, image in obj.textures.items()},
+        triangles=sum(len(part.faces) for part in obj.parts),
+        radius=obj.radius,
+        shipped=True,
+    )
+
+
+@cache
+def list_shipped_classifiers() -> list[ClassifierInfo]:
+    """The shipped classifier. A constant, because inspecting it takes a process that imports torch."""
+    classes = sorted({shipped.label for shipped in shipped_objects().values()})
+    tiny = ClassifierInfo(
+        id="tiny",
+        name="tiny",
+        white_box=True,
+        image_size=(128, 128),
+        n_classes=len(classes),
+        classes=classes,
+        shipped=True,
+    )
+    return [tiny]

@@ -1,0 +1,102 @@
+"""The contact sheet: the target's images before and after with the classifier's predictions, view by view."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+from PIL import Image
+
+from trompe_server.pictures.layout import (
+    CAPTION,
+    GREEN,
+    RED,
+    Images,
+    beside,
+    captioned,
+    framed,
+    line,
+    sheet,
+    shortened,
+    text_width,
+    tile,
+)
+
+__all__ = ["FRAME", "TILE", "Verdict", "contact_sheet", "extremes", "representative"]
+
+TILE: Final = 168
+"""Width of an image on the sheet, without its frame."""
+FRAME: Final = 4
+CONFIDENCE: Final = 44
+"""Width kept free for the confidence, `` 100%`` at most."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Prediction for one image: class name, probability in [0, 1], whether it is the object's class."""
+
+    label: str
+    confidence: float
+    correct: bool
+
+
+def representative(n: int, k: int) -> list[int]:
+    """At most ``k`` of the indices 0..n-1, evenly spaced from the first to the last."""
+    if k >= n:
+        return list(range(n))
+    return [round(i * (n - 1) / max(k - 1, 1)) for i in range(k)]
+
+
+def extremes(hardness: Float[np.ndarray, " n"], directions: Float[np.ndarray, "n 3"], k: int) -> list[int]:
+    """At most ``k`` indices, the hardest first: half from the hardest third, half from the easiest.
+
+    Each half begins with the most extreme one and is spread over the ``directions`` (unit vectors).
+    """
+    order = np.argsort(-hardness, kind="stable")
+    if len(order) <= k:
+        return [int(index) for index in order]
+    third = max(-(-k // 2), len(order) // 3)
+    hard, easy = _spread(order[:third], directions, k - k // 2), _spread(order[::-1][:third], directions, k // 2)
+    return [int(index) for index in order if index in {*hard, *easy}]
+
+
+def _spread(ranked: NDArray[np.int64], directions: Float[np.ndarray, "n 3"], k: int) -> list[int]:
+    """The first of ``ranked``, then each time the one farthest from those chosen."""
+    nearness = np.full(len(ranked), -np.inf)
+    chosen: list[int] = []
+    for _ in range(k):
+        best = int(nearness.argmin())
+        chosen.append(int(ranked[best]))
+        nearness = np.maximum(nearness, directions[ranked] @ directions[ranked[best]])
+        nearness[best] = np.inf
+    return chosen
+
+
+def contact_sheet(
+    before: Images,
+    after: Images,
+    verdicts_before: Sequence[Verdict],
+    verdicts_after: Sequence[Verdict],
+    *,
+    title: str,
+    facts: str,
+    columns: int = 3,
+) -> Image.Image:
+    """Images (N, H, W, 3) of the same views in pairs, framed green if classified as the object and red if not.
+
+    facts: a line below the title. Raises ``ValueError`` if the four sequences differ in length.
+    """
+    pairs = zip(before, after, verdicts_before, verdicts_after, strict=True)
+    cards = [beside([_judged(old, was), _judged(new, now)], gap=2) for old, new, was, now in pairs]
+    legend = line(facts, text_width(facts, size=CAPTION))
+    return sheet(cards, columns=columns, title=f"{title} - left before, right after", legend=legend)
+
+
+def _judged(image: Images, verdict: Verdict) -> Image.Image:
+    """One framed image; below it the first name of the class, shortened, and the confidence."""
+    colour = GREEN if verdict.correct else RED
+    picture = framed(tile(image, TILE), colour, thickness=FRAME)
+    name = shortened(verdict.label.split(",")[0], TILE - CONFIDENCE, size=CAPTION)
+    return captioned(picture, f"{name} {verdict.confidence:.0%}", colour=colour)

@@ -1,0 +1,81 @@
+"""Saliency on the object: sensitivity of the classifier's loss to each texel, over all views."""
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+from PIL import Image
+
+from trompe_server.pictures.heat import heat_legend, heat_over
+from trompe_server.pictures.layout import INK, Images, beside, captioned, framed, sheet, tile
+
+__all__ = ["heat_textures", "saliency_object_sheet", "saliency_texture_sheet"]
+
+TILE: Final = 336
+OBJECT_TILE: Final = 224
+TOP: Final = 0.005
+"""Share of the salient texels drawn in the lightest colour: a few extreme ones would darken all others."""
+
+Textures = Mapping[str, Images]
+Scores = Mapping[str, Float[np.ndarray, "H W"]]
+
+
+def heat_textures(textures: Textures, scores: Scores) -> dict[str, Images]:
+    """Albedo textures (H, W, 3) with the scores of their texels as heat, to be put on the object.
+
+    scores: saliency accumulated per texel, in any unit; all textures share one scale.
+    """
+    return {name: heat_over(textures[name], heat) for name, heat in _scaled(scores).items()}
+
+
+def saliency_texture_sheet(textures: Textures, scores: Scores, *, title: str) -> Image.Image:
+    """One row for each albedo texture, sorted by name: unchanged, and with the scores of its texels as heat."""
+    painted = heat_textures(textures, scores)
+    cards = [_row(name, textures[name], painted[name], scores) for name in sorted(textures)]
+    legend = heat_legend(f"accumulated saliency of a texel, 1 is that of the top {TOP:.1%}")
+    return sheet(cards, columns=1, title=title, legend=legend)
+
+
+def _row(name: str, texture: Images, painted: Images, scores: Scores) -> Image.Image:
+    texels = scores[name].size
+    half = _texels_with_half(scores[name])
+    facts = f"{name}: half of its saliency is on {half / texels:.1%} of its texels" if half else f"{name}: never seen"
+    return captioned(beside([_framed(texture, TILE), _framed(painted, TILE)]), facts)
+
+
+def saliency_object_sheet(
+    images: Images, saliency: Float[np.ndarray, "n H W"], rendered: Images, *, title: str, columns: int = 2
+) -> Image.Image:
+    """For each view: the target's image (N, H, W, 3), the saliency of the view over it, and the object in its heat.
+
+    rendered: the target's images (N, H, W, 3) of the object painted with ``heat_textures``.
+    """
+    cards = [_triple(*view) for view in zip(images, saliency, rendered, strict=True)]
+    legend = heat_legend(f"saliency, 1 is that of the top {TOP:.1%} of a view's pixels, or of the texels")
+    return sheet(cards, columns=columns, title=title, legend=legend)
+
+
+def _triple(image: Images, saliency: Float[np.ndarray, "H W"], rendered: Images) -> Image.Image:
+    hot = heat_over(image, _scaled({"view": saliency})["view"])
+    pictures = {"as it is": image, "saliency of this view": hot, "of all views, on the object": rendered}
+    return beside([captioned(_framed(picture, OBJECT_TILE), text) for text, picture in pictures.items()])
+
+
+def _scaled(scores: Scores) -> dict[str, NDArray[np.float32]]:
+    """Scores scaled to [0, 1]: the share ``TOP`` of the nonzero ones reaches 1."""
+    everything = np.concatenate([score.ravel() for score in scores.values()])
+    some = everything[everything > 0]
+    top = float(np.quantile(some, 1 - TOP)) if len(some) else 1.0
+    return {name: np.clip(score / top, 0, 1).astype(np.float32) for name, score in scores.items()}
+
+
+def _texels_with_half(score: Float[np.ndarray, "H W"]) -> int:
+    """Smallest number of texels with half of the sum; 0 for an empty map."""
+    ranked = np.cumsum(np.sort(score.ravel().astype(np.float64))[::-1])
+    return int(np.searchsorted(ranked, ranked[-1] / 2)) + 1 if ranked[-1] > 0 else 0
+
+
+def _framed(image: Images, width: int) -> Image.Image:
+    return framed(tile(image, width), INK, thickness=1)

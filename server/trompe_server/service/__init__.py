@@ -1,0 +1,1 @@
+"""The whole service: application, commands, checks of the machine."""

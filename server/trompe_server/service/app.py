@@ -1,0 +1,55 @@
+"""The web application: routes, errors and documentation."""
+
+import asyncio
+from importlib.metadata import version
+from typing import Final
+
+from fastapi import FastAPI
+
+from trompe_server.api import experiments, fleet, health, jobs, library, metrics
+from trompe_server.api.contract import contract
+from trompe_server.api.downloads import Digests
+from trompe_server.api.guard import Guard
+from trompe_server.api.metrics import HttpMetrics
+from trompe_server.api.middleware import BodyLimit, Envelope, Failures
+from trompe_server.api.problems import answer_with_problems
+from trompe_server.api.services import Services
+from trompe_server.pages import add_pages
+
+__all__ = ["create_app"]
+
+DESCRIPTION: Final = """Crafts adversarial 3D objects. Upload an object and a classifier (or use the shipped ones),
+submit a job, follow its events, fetch its result. Errors are problem details (RFC 9457);
+each response carries `X-Request-ID`. If the server has tokens, send `Authorization: Bearer trompe_...`."""
+
+ROUTERS: Final = (
+    library.router,
+    jobs.router,
+    experiments.router,
+    fleet.router,
+    health.router,
+    metrics.router,
+)
+
+
+def create_app(services: Services) -> FastAPI:
+    """Build the application on ``services``."""
+    app = FastAPI(title="Trompe", version=version("trompe"), description=DESCRIPTION, docs_url=None, redoc_url=None)
+    app.state.services, app.state.metrics, app.state.digests = services, HttpMetrics(), Digests()
+    app.state.uploads = asyncio.Semaphore(library.UPLOADS)
+    _wrap(app, services)
+    answer_with_problems(app)
+    for router in ROUTERS:
+        app.include_router(router)
+    add_pages(app)
+    app.openapi = lambda: contract(app)  # type: ignore[method-assign]
+    return app
+
+
+def _wrap(app: FastAPI, services: Services) -> None:
+    """Add the middleware; the last one is the outermost."""
+    settings = services.settings
+    app.add_middleware(BodyLimit, limit=settings.max_upload)
+    app.add_middleware(Guard, tokens=services.tokens, rate=settings.rate_limit)
+    app.add_middleware(Failures)
+    app.add_middleware(Envelope, metrics=app.state.metrics)

@@ -1,0 +1,210 @@
+"""Commands of this package for ``trompe``: serve, worker, migrate, demo, doctor."""
+
+import functools
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
+
+import click
+
+from trompe_server.service.doctor import check_all, in_json, in_words
+from trompe_server.settings import Settings
+from trompe_server.system.log import log_to_stderr
+from trompe_shared.errors import TrompeError
+
+if TYPE_CHECKING:
+    from trompe_server.renderers.discovery import RendererAddresses
+
+__all__ = [
+    "data_option",
+    "database_option",
+    "demo",
+    "doctor",
+    "for_people",
+    "migrate",
+    "serve",
+    "settings_of",
+    "worker",
+]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+data_option = click.option(
+    "--data", type=click.Path(path_type=Path, file_okay=False), help="Folder of data (or TROMPE_DATA)."
+)
+database_option = click.option(
+    "--database",
+    metavar="URL",
+    help="sqlite:///FILE or postgresql://... (or TROMPE_DATABASE). Default: in the data folder.",
+)
+_store = click.option(
+    "--store",
+    metavar="URL",
+    help="Folder or URL of the files, e.g. s3://bucket (or TROMPE_STORE). Default: the data folder.",
+)
+_renderer = click.option(
+    "--renderer",
+    "listed",
+    multiple=True,
+    metavar="HOST:PORT",
+    help="Address of a renderer worker. Several share the work.",
+)
+_renderers_dns = click.option(
+    "--renderers-dns",
+    "names",
+    multiple=True,
+    metavar="NAME:PORT",
+    help="DNS name of all renderer workers, resolved repeatedly.",
+)
+_device = click.option("--device", metavar="DEVICE", help="cpu, cuda or cuda:1 (or TROMPE_DEVICE). Default: cpu.")
+
+
+def for_people(command: Callable[P, R]) -> Callable[P, R]:
+    """Print errors as one sentence instead of a traceback."""
+
+    @functools.wraps(command)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return command(*args, **kwargs)
+        except TrompeError as error:
+            raise click.ClickException(str(error)) from error
+
+    return run
+
+
+def settings_of(data: Path | None, **others: object) -> Settings:
+    """Settings from the environment, overridden by the given options."""
+    given = {"data": data and data.absolute(), **others}
+    return Settings.model_validate(
+        Settings().model_dump() | {k: value for k, value in given.items() if value is not None}
+    )
+
+
+def _announce(line: str) -> None:
+    click.echo(line)
+    sys.stdout.flush()
+
+
+@click.command()
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
+@click.option("--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="Port; 0: a free one.")
+@click.option(
+    "--workers",
+    type=click.IntRange(0, 64),
+    help="Attack workers, which share the cores (or TROMPE_WORKERS); 0: all run elsewhere. Default: 1.",
+)
+@click.option(
+    "--renderers",
+    type=click.IntRange(0, 64),
+    help="Renderer workers, which share the images of each job (or TROMPE_RENDERERS). Default: 1.",
+)
+@click.option(
+    "--engine",
+    metavar="NAME",
+    help="Engine of these renderer workers, as in `trompe render --engine` (or TROMPE_ENGINE). Default: pyrender.",
+)
+@click.option("--set", "engine_options", multiple=True, metavar="NAME=VALUE", help="Option of the engine.")
+@_renderer
+@_renderers_dns
+@_device
+@data_option
+@database_option
+@_store
+@for_people
+def serve(
+    host: str,
+    port: int,
+    data: Path | None,
+    listed: tuple[str, ...],
+    names: tuple[str, ...],
+    engine_options: tuple[str, ...],
+    **options: str | int | None,
+) -> None:
+    """Run the service: REST API, attack workers and renderer workers, with one data folder.
+
+    Name renderer workers elsewhere by --renderer or --renderers-dns; --renderers 0 starts none here. They may have
+    other engines: jobs name theirs, and those that name none use the first renderer's.
+    """
+    from trompe_server.service.serve import run_service
+
+    log_to_stderr()
+    settings = settings_of(data, engine_options=engine_options or None, **options)
+    run_service(settings, _renderers_at(listed, names), host=host, port=port, announce=_announce)
+
+
+@click.command()
+@data_option
+@database_option
+@_store
+@_renderer
+@_renderers_dns
+@_device
+@for_people
+def worker(data: Path | None, listed: tuple[str, ...], names: tuple[str, ...], **options: str | None) -> None:
+    """Run an attack worker for the jobs of a shared database and store.
+
+    TROMPE_METRICS_PORT serves its Prometheus metrics at that port.
+    """
+    from trompe_server.executor.worker import run_worker
+
+    if not listed and not names:
+        raise click.UsageError("Name the renderer workers by --renderer HOST:PORT or --renderers-dns NAME:PORT.")
+    log_to_stderr()
+    run_worker(settings_of(data, **options), _renderers_at(listed, names), announce=_announce)
+
+
+@click.command()
+@data_option
+@database_option
+@for_people
+def migrate(data: Path | None, database: str | None) -> None:
+    """Create or upgrade the tables in the database."""
+    from trompe_server.executor.worker import prepare_data
+
+    log_to_stderr()
+    prepare_data(settings_of(data, database=database))
+    _announce("the database is up to date")
+
+
+def _renderers_at(listed: tuple[str, ...], names: tuple[str, ...]) -> "RendererAddresses":
+    from trompe_server.renderers.discovery import RendererAddresses
+
+    return RendererAddresses(tuple(_address(each) for each in listed), tuple(_address(each) for each in names))
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal():
+        raise click.BadParameter(
+            f"{text!r} is not HOST:PORT, e.g. 127.0.0.1:8085", param_hint="--renderer or --renderers-dns"
+        )
+    return host, int(port)
+
+
+@click.command()
+@click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder for the result.")
+def demo(out: Path) -> None:
+    """Attack the shipped classifier with the shipped mug."""
+    attack = ["attack", "mug", "--label", "mug", "--classifier", "tiny", "--steps", "100", "--out", str(out)]
+    sys.exit(subprocess.run([sys.executable, "-m", "trompe_client.cli", *attack], check=False).returncode)
+
+
+@click.command()
+@data_option
+@database_option
+@_store
+@_device
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def doctor(data: Path | None, as_json: bool, **options: str | None) -> None:
+    """Check this machine and print remedies."""
+    findings = []
+    for finding in check_all(settings_of(data, **options)):
+        findings.append(finding)
+        if not as_json:
+            _announce(in_words(finding))
+    if as_json:
+        _announce(in_json(findings))
+    sys.exit(0 if all(finding.ok for finding in findings) else 1)

@@ -1,0 +1,108 @@
+"""The command ``trompe token``: creates, lists and revokes tokens directly in the database, without a server."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import click
+
+from trompe_server.service.commands import data_option, database_option, for_people, settings_of
+from trompe_server.settings import Settings
+from trompe_server.storage.tokens import Right, Token, Tokens
+
+__all__ = ["token"]
+
+_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+
+
+def _where(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that locate the database."""
+    return data_option(database_option(command))
+
+
+@click.group()
+def token() -> None:
+    """Create, list and revoke access tokens of the service."""
+
+
+@token.command()
+@click.argument("name")
+@click.option(
+    "--right",
+    type=click.Choice([right.value for right in Right]),
+    default=Right.write.value,
+    show_default=True,
+    help="read: look only; write: also submit, cancel, delete and upload.",
+)
+@_json
+@_where
+@for_people
+def create(name: str, right: str, as_json: bool, data: Path | None, database: str | None) -> None:
+    """Create a token called NAME. Its secret is printed once and not stored."""
+    with _tokens(settings_of(data, database=database)) as tokens:
+        secret = tokens.create(name, Right(right))
+    if as_json:
+        click.echo(json.dumps({"name": name, "right": right, "secret": secret}))
+        return
+    click.echo(secret)
+    click.echo("Save it now: it is not shown again. Clients read it from TROMPE_TOKEN or token=.", err=True)
+
+
+@token.command("list")
+@_json
+@_where
+@for_people
+def show(as_json: bool, data: Path | None, database: str | None) -> None:
+    """List all tokens, revoked ones included."""
+    with _tokens(settings_of(data, database=database)) as tokens:
+        rows = [_row(each) for each in tokens.all()]
+    if as_json:
+        click.echo(json.dumps(rows))
+        return
+    if not rows:
+        click.echo("There are no tokens: the service is open and listens on this machine only.", err=True)
+    for row in rows:
+        state = f"revoked {row['revoked']}" if row["revoked"] else f"last used {row['last_used'] or 'never'}"
+        click.echo(f"{row['name']:24} {row['right']:6} created {row['created']}  {state}")
+
+
+@token.command()
+@click.argument("name")
+@_where
+@for_people
+def revoke(name: str, data: Path | None, database: str | None) -> None:
+    """Revoke the token NAME; running servers refuse it within a second."""
+    with _tokens(settings_of(data, database=database)) as tokens:
+        tokens.revoke(name)
+    click.echo(f"revoked {name}", err=True)
+
+
+@contextmanager
+def _tokens(settings: Settings) -> Iterator[Tokens]:
+    """Open the tokens in the database of ``settings``; create the database if it is missing."""
+    from trompe_server.executor.worker import prepare_data
+    from trompe_server.queue.store import JobStore
+
+    prepare_data(settings)
+    store = JobStore(settings.database_url)
+    try:
+        yield Tokens(store.engine)
+    finally:
+        store.close()
+
+
+def _row(each: Token) -> dict[str, str | None]:
+    return {
+        "name": each.name,
+        "right": each.right.value,
+        "created": _when(each.created),
+        "last_used": _when(each.last_used),
+        "revoked": _when(each.revoked),
+    }
+
+
+def _when(time: datetime | None) -> str | None:
+    return None if time is None else time.isoformat(timespec="seconds")

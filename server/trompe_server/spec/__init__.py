@@ -1,0 +1,1 @@
+"""Rules of a job: options that fit together, class labels."""

@@ -1,0 +1,1 @@
+"""Folders of bytes, arrays as files, the database, access tokens."""

@@ -1,0 +1,148 @@
+"""The database, SQLite or PostgreSQL, with the same code for both.
+
+SQLite serves one machine: WAL, and write transactions that lock the whole database. PostgreSQL serves many machines:
+it locks rows, and a process frozen within a transaction loses its locks. Every call raises ``DatabaseDownError`` if the
+database cannot be reached.
+"""
+
+import logging
+import random
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Final, TypeVar
+
+import sqlalchemy as sa
+from sqlalchemy.engine.interfaces import ExceptionContext
+from sqlalchemy.exc import ArgumentError, InterfaceError, NoSuchModuleError, OperationalError
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.functions import FunctionElement
+
+from trompe_server.errors import ServiceError
+
+__all__ = ["DatabaseDownError", "clock", "connect", "patiently", "write"]
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+BUSY_TIMEOUT: Final = 30_000
+"""Milliseconds a writer of SQLite waits for the writer before it."""
+POSTGRES: Final = {
+    "connect_timeout": 5,
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 15_000,
+    "options": "-c statement_timeout=30000 -c lock_timeout=15000 -c idle_in_transaction_session_timeout=15000",
+}
+"""No call takes longer than half a minute, whatever happens to the server. Timeouts in ``options`` are in ms."""
+RETRY_WAITS: Final = (0.1, 2.0)
+"""Shortest and longest wait before a call is repeated, seconds."""
+
+
+class DatabaseDownError(ServiceError):
+    """The database cannot be reached or does not answer in time."""
+
+    code = "database-down"
+
+
+class clock(FunctionElement[float]):  # noqa: N801
+    """Seconds since 1970 by the clock of the database, which all processes share."""
+
+    type = sa.Float()
+    inherit_cache = True
+
+
+@compiles(clock, "sqlite")
+def _sqlite_clock(_element: clock, _compiler: Any, **_: Any) -> str:
+    return "((julianday('now') - 2440587.5) * 86400.0)"
+
+
+@compiles(clock, "postgresql")
+def _postgres_clock(_element: clock, _compiler: Any, **_: Any) -> str:
+    return "CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS DOUBLE PRECISION)"
+
+
+def connect(url: str) -> sa.Engine:
+    """Engine for ``url``: ``sqlite:///FILE`` or ``postgresql://USER:PASSWORD@HOST:PORT/NAME``. Does not connect yet.
+
+    Raises ``ServiceError`` for any other URL.
+    """
+    try:
+        parsed = sa.make_url(url)
+    except ArgumentError as error:
+        raise ServiceError(_invalid_url(url)) from error
+    kind = parsed.drivername.partition("+")[0]
+    if kind == "sqlite" and parsed.database:
+        engine = sa.create_engine(parsed, pool_size=20, max_overflow=30)
+        sa.event.listen(engine, "connect", _prepare_sqlite)
+    elif kind in {"postgresql", "postgres"}:
+        engine = _postgres(parsed.set(drivername="postgresql+psycopg"))
+    else:
+        raise ServiceError(_invalid_url(url))
+    sa.event.listen(engine, "handle_error", _translate_outage, retval=True)
+    return engine
+
+
+def _postgres(url: sa.URL) -> sa.Engine:
+    try:
+        return sa.create_engine(url, pool_pre_ping=True, pool_size=10, max_overflow=40, connect_args=POSTGRES)
+    except (ImportError, NoSuchModuleError) as error:
+        raise ServiceError("PostgreSQL needs psycopg: pip install 'trompe[server]'") from error
+
+
+@contextmanager
+def write(engine: sa.Engine) -> Iterator[sa.Connection]:
+    """A write transaction. Locks the whole database on SQLite, the rows read ``with_for_update`` on PostgreSQL."""
+    with engine.begin() as connection:
+        if connection.dialect.name == "sqlite":
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
+        yield connection
+
+
+def patiently(
+    action: Callable[[], T],
+    *,
+    stopped: Callable[[], bool] = lambda: False,
+    waits: tuple[float, float] = RETRY_WAITS,
+) -> T:
+    """Call ``action`` until the database can be reached, or raise ``DatabaseDownError`` once ``stopped``.
+
+    ``action`` must be idempotent: its answer can be lost after the database has committed it.
+    """
+    wait, longest = waits
+    while True:
+        try:
+            return action()
+        except DatabaseDownError as error:
+            if stopped():
+                raise
+            logger.warning("%s Retrying.", error)
+        time.sleep(wait * random.uniform(0.5, 1.0))
+        wait = min(wait * 2, longest)
+
+
+def _prepare_sqlite(connection: Any, _record: Any) -> None:
+    connection.isolation_level = "IMMEDIATE"
+    connection.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT}")
+    connection.execute("PRAGMA synchronous=NORMAL")
+
+
+def _translate_outage(context: ExceptionContext) -> BaseException | None:
+    error = context.sqlalchemy_exception
+    if context.is_pre_ping:
+        return None  # the pool replaces a broken connection
+    if context.is_disconnect or isinstance(error, (OperationalError, InterfaceError)):
+        words = str(context.original_exception).strip().splitlines() or [type(context.original_exception).__name__]
+        return DatabaseDownError(f"The database is not available ({words[0]}).")
+    return None
+
+
+def _invalid_url(url: str) -> str:
+    shown = re.sub(r"(://[^:/@]*:).*@", r"\1***@", url)
+    return (
+        f"{shown!r} is not a supported database URL: give sqlite:////absolute/path.sqlite or "
+        "postgresql://user:password@host:5432/name (--database or TROMPE_DATABASE)."
+    )

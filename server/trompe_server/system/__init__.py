@@ -1,0 +1,1 @@
+"""The operating system: files, processes with limits, memory, threads, logging."""

@@ -1,0 +1,129 @@
+"""The record of jobs, and the state of the service."""
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+from trompe_shared.api.jobs import JobSpec, Labels, Needs, Priority
+from trompe_shared.api.schema import Schema
+from trompe_shared.engine import EngineInfo
+
+
+class JobState(StrEnum):
+    """State of a job. ``not_applicable`` (n.a.): no view was recognised before the attack, so nothing could drop."""
+
+    queued = "queued"
+    running = "running"
+    succeeded = "succeeded"
+    failed = "failed"
+    cancelled = "cancelled"
+    not_applicable = "n.a."
+
+    @property
+    def final(self) -> bool:
+        """Whether the state is final."""
+        return self not in {JobState.queued, JobState.running}
+
+
+class Progress(Schema):
+    """Progress of a job. ``fraction`` in [0, 1] is of the whole job, ``fooled`` a share of the surrogate's views."""
+
+    phase: str = "queued"
+    fraction: float = 0.0
+    step: int | None = None
+    steps: int | None = None
+    loss: float | None = None
+    fooled: float | None = None
+    eta_seconds: float | None = Field(
+        default=None, description="estimated seconds until the job's end, if the attack takes all its steps"
+    )
+    eta_least_seconds: float | None = Field(
+        default=None, description="the same if the attack ends as early as it can: all views are safely won from now on"
+    )
+
+
+class Job(Schema):
+    """A job on the server. ``error`` and ``note`` are for people."""
+
+    id: str
+    state: JobState
+    spec: JobSpec
+    names: dict[str, str] = Field(default_factory=dict, description="names of stored things in ``spec``, by id")
+    priority: Priority = "normal"
+    labels: Labels = Field(default_factory=dict)
+    needs: Needs = "any"
+    worker: str | None = Field(None, description="worker of the latest attempt")
+    created: datetime
+    started: datetime | None = None
+    finished: datetime | None = None
+    progress: Progress = Field(default_factory=Progress)
+    attempts: int = 0
+    error: str | None = None
+    note: str | None = None
+    artifacts: list[str] = Field(default_factory=list)
+
+
+class JobList(Schema):
+    """One page of jobs, newest first; ``next_cursor`` gets the next page."""
+
+    jobs: list[Job]
+    next_cursor: str | None = None
+
+
+class WorkerInfo(Schema):
+    """An attack worker by its latest heartbeat. ``job`` is its running job."""
+
+    id: str
+    host: str
+    device: str
+    alive: bool
+    started: datetime
+    seen: datetime
+    job: str | None = None
+
+
+class RendererInfo(Schema):
+    """A renderer worker. ``alive``: it accepts connections. Its engine's fields are null where it does not answer."""
+
+    address: str = Field(description="host:port")
+    alive: bool
+    engine: str | None = Field(default=None, description="name of the engine, as in a job's option ``renderers``")
+    version: str | None = Field(default=None, description="of the engine")
+    settings: str | None = Field(default=None, description="of the engine, where they change pictures")
+
+    @property
+    def identity(self) -> str | None:
+        """The engine with version and settings, as a job's option ``renderers`` takes it."""
+        return str(EngineInfo(self.engine, self.version or "", self.settings or "")) if self.engine else None
+
+
+class ExperimentInfo(Schema):
+    """Number of jobs by state with the label ``experiment=<name>``. ``created`` is the time of the first one."""
+
+    name: str
+    jobs: dict[JobState, int]
+    created: datetime
+
+
+class Event(Schema):
+    """One line of a job's history; ``id`` grows by one, and SSE clients resume from it."""
+
+    id: int
+    time: datetime
+    state: JobState
+    progress: Progress
+    message: str | None = None
+
+
+class Problem(BaseModel):
+    """Problem details (RFC 9457). ``errors`` lists the faults field by field, if any."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str | None = None
+    instance: str | None = None
+    request_id: str | None = None
+    errors: list[dict[str, Any]] | None = None

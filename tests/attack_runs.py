@@ -1,0 +1,103 @@
+"""Small attacks on the ``square`` of the fixtures, 32 x 32 pixels, with the fake classifier."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import torch
+from hypothesis import settings
+
+from tests.fakes import fake_classifier
+from trompe_server.attack import AttackState, Budget, Goal, Step, attack, start
+from trompe_server.attack.objective import Objective
+from trompe_server.classifiers import NetworkClassifier, WhiteBoxClassifier
+from trompe_server.surrogate import (
+    AnySurrogate,
+    SamplingModel,
+    Surrogate,
+    diffuse_surrogate,
+    prepare_geometry,
+    textures_of,
+)
+from trompe_shared.geometry import View
+from trompe_shared.object3d import Object3D
+
+SIZE: Final = (32, 32)
+LABEL: Final = 6
+"""Class of the square for the fake classifier in all views of ``square_surrogate``."""
+
+EPS: Final = 1e-6
+SMALL: Final = settings(max_examples=6)
+
+
+def surrogate_of(
+    obj: Object3D,
+    views: Sequence[View],
+    *,
+    sampling: SamplingModel | None = None,
+    size: tuple[int, int] = SIZE,
+    **options: Any,
+) -> Surrogate:
+    geometry = prepare_geometry(obj, views, size=size, sampling=sampling or SamplingModel())
+    return diffuse_surrogate(geometry, views, **options)
+
+
+def run(
+    obj: Object3D,
+    surrogate: AnySurrogate,
+    *,
+    steps: int = 6,
+    state: AttackState | None = None,
+    classifier: WhiteBoxClassifier | Sequence[WhiteBoxClassifier] | None = None,
+    **options: Any,
+) -> AttackState:
+    """An attack from ``state``, by default the unpainted object, on ``classifier``, by default the fake one."""
+    textures = textures_of(obj)
+    asked: dict[str, Any] = {"goal": Goal(LABEL), "budget": Budget(0.06, 0.02)} | options
+    victim = fake_classifier() if classifier is None else classifier
+    return attack(state or start(textures), textures, surrogate, victim, steps=steps, **asked)
+
+
+def random_state(obj: Object3D, budget: Budget, seed: int) -> AttackState:
+    """A random change within the budget, to begin at."""
+    generator, textures = torch.Generator().manual_seed(seed), textures_of(obj)
+    wishes = {
+        name: torch.empty_like(texture).uniform_(-1, 1, generator=generator) for name, texture in textures.items()
+    }
+    return AttackState(0, {name: budget.project(wish, textures[name]) for name, wish in wishes.items()})
+
+
+def steps_of(obj: Object3D, surrogate: Surrogate, **options: Any) -> list[Step]:
+    """The steps that ``run`` reports."""
+    seen: list[Step] = []
+    run(obj, surrogate, on_step=seen.append, **options)
+    return seen
+
+
+def same(one: AttackState, other: AttackState) -> bool:
+    tables = ((one.deltas, other.deltas), (one.memory, other.memory))
+    return one.step == other.step and all(
+        mine.keys() == theirs.keys() and all(torch.equal(mine[name], theirs[name]) for name in mine)
+        for mine, theirs in tables
+    )
+
+
+def objective_of(
+    obj: Object3D, surrogate: Surrogate, *members: WhiteBoxClassifier, goal: Goal | None = None
+) -> Objective:
+    return Objective(textures_of(obj), surrogate, members or (fake_classifier(),), goal or Goal(LABEL), None)
+
+
+def mean_loss(obj: Object3D, surrogate: Surrogate, state: AttackState, goal: Goal | None = None) -> float:
+    """Mean loss of a state over all views."""
+    objective = objective_of(obj, surrogate, goal=goal)
+    return objective.score(objective.join(state.deltas)).loss
+
+
+def fooled_classifier() -> NetworkClassifier:
+    """A classifier that any image fools, safely."""
+    last = torch.nn.Linear(3, 10)
+    with torch.no_grad():
+        last.bias.fill_(50.0)[LABEL] = -50.0
+    network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), last)
+    return replace(fake_classifier(), network=network)

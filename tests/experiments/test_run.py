@@ -1,0 +1,461 @@
+"""Runner of an experiment: every job is submitted once, results are kept, and a stopped run continues."""
+
+import csv
+import json
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from io import StringIO
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from rich.console import Console
+
+from trompe_client import ServerUnreachable
+from trompe_client._errors import BadRequest
+from trompe_client._plan import Upload
+from trompe_experiments import Experiment, Plan, cli, plan_experiment, run, run_experiment, shipped_experiments
+from trompe_experiments.about import ABOUT, estimated_seconds, write_about
+from trompe_experiments.cli import experiment
+from trompe_experiments.plan import Row
+from trompe_experiments.progress import experiment_display
+from trompe_experiments.service import Service
+from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, RowId, read_table
+from trompe_experiments.terminal import compared, differences, failures, read_results
+from trompe_server.api.examples import RESULT
+from trompe_shared.api import Job, JobRequest, JobState, Problem, Progress, Result
+from trompe_shared.errors import SpecError
+
+EXAMPLE = RESULT["content"]["application/json"]["example"]
+
+
+def result_of(request: JobRequest) -> Result:
+    """The API's example, with an ``A_drop`` of ten times epsilon."""
+    drop = min(1.0, 10 * request.paint.epsilon)
+    shares = {"views": 2, "a_before": 1.0, "a_after": 1 - drop, "a_drop": drop, "a_drop_interval": (drop / 2, 1.0)}
+    accuracies = dict.fromkeys(("surrogate", "target", "held_out"), EXAMPLE["target"] | shares)
+    paint, search = request.paint, request.search
+    found = {
+        "spec": request.spec(),
+        "object": request.object,
+        "epsilon": paint.epsilon,
+        "alpha": request.alpha,
+        "tau": paint.tau,
+        "steps": search.steps,
+        "views": 2 * EXAMPLE["views"],
+        "warnings": ["one", "two"],
+        "seconds": {"prepare": 1.0, "attack-000": 2.0, "attack-001": 3.0, "judge": 0.5},
+    }
+    return Result.model_validate(EXAMPLE | accuracies | found)
+
+
+class FakeService(Service):
+    """Runs a job when it is polled. Jobs on ``failing`` objects fail, those on ``refused`` ones are refused, jobs in
+    ``waiting`` stay queued."""
+
+    def __init__(self) -> None:
+        self.by_key: dict[str, Job] = {}
+        self.requests: dict[str, JobRequest] = {}
+        self.uploads: list[Upload] = []
+        self.failing: set[str] = set()
+        self.refused: set[str] = set()
+        self.waiting: set[str] = set()
+        self.goes_away_after: int | None = None
+        self.looks = 0
+        self.ids = count(1)
+
+    def store(self, upload: Upload) -> str:
+        self.uploads.append(upload)
+        return f"stored-{len(self.uploads)}"
+
+    def submit(self, request: JobRequest, key: str) -> Job:
+        if request.object in self.refused:
+            raise BadRequest(Problem(title="No such class", status=422))
+        if key not in self.by_key:
+            name, now = f"job-{next(self.ids)}", datetime.now(UTC)
+            job = Job(id=name, state=JobState.queued, spec=request.spec(), created=now, worker=None)
+            self.by_key[key], self.requests[job.id] = job, request
+        return self.by_key[key]
+
+    def job(self, job: str) -> Job:
+        self.looks += 1
+        if self.goes_away_after is not None and self.looks > self.goes_away_after:
+            raise ServerUnreachable("gone")
+        found = next(each for each in self.by_key.values() if each.id == job)
+        if job in self.waiting:
+            return found
+        bad = found.spec.object in self.failing
+        state, error = (JobState.failed, "the renderer said no") if bad else (JobState.succeeded, None)
+        return found.model_copy(
+            update={
+                "state": state,
+                "error": error,
+                "progress": Progress(phase="judge", fraction=1),
+                "artifacts": [] if bad else ["contact_sheet.png", "result.json", "textures.png"],
+            }
+        )
+
+    def jobs(self, experiment: str) -> Iterator[Job]:
+        found = [self.job(job.id) for job in self.by_key.values()]
+        return (job for job in reversed(found) if self.requests[job.id].labels["experiment"] == experiment)
+
+    def result(self, job: str) -> Result:
+        return result_of(self.requests[job])
+
+    def artifact(self, job: str, name: str) -> bytes | None:
+        return b"picture" if name.endswith(".png") else None
+
+    def classes(self, classifier: str) -> list[str] | None:
+        return ["ball", "chair", "mug"]
+
+
+class Silent:
+    """Counts calls."""
+
+    def __init__(self) -> None:
+        self.began: dict[str, int] = {}
+        self.ended: list[str] = []
+
+    def begin(self, *, total: int, done: int) -> None:
+        self.began = {"total": total, "done": done}
+
+    def look(self, row: Row, job: Job) -> None:
+        """Nothing to count."""
+
+    def end(self, row: Row, finished: Any) -> None:
+        self.ended.append(finished.state)
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "PAUSE", 0.0)
+
+
+@pytest.fixture
+def service() -> FakeService:
+    return FakeService()
+
+
+def plan_of(**file: Any) -> Plan:
+    small: dict[str, Any] = {
+        "name": "small",
+        "objects": {"mug": {}, "chair": {}},
+        "grid": {"epsilon": [0.02, 0.05]},
+        "artifacts": ["contact_*.png", "missing.png"],
+    }
+    return plan_experiment(Experiment.model_validate(small | file))
+
+
+def invoked(*words: object, status: int = 0) -> str:
+    """Output of ``trompe experiment``."""
+    told = CliRunner().invoke(experiment, [str(word) for word in words])
+    assert told.exit_code == status, told.output
+    return told.output
+
+
+def ran(plan: Plan, service: FakeService, folder: Path, **options: Any) -> tuple[Sequence[ResultRow], Silent]:
+    show = Silent()
+    return run_experiment(plan, service, folder, show=show, **options), show
+
+
+def test_each_job_is_submitted_and_its_row_written(service: FakeService, tmp_path: Path) -> None:
+    ended, show = ran(plan_of(), service, tmp_path)
+    assert show.began == {"total": 4, "done": 0}
+    assert show.ended == ["succeeded"] * 4
+    rows = read_table(tmp_path / RESULTS, ResultRow)
+    assert rows == list(ended)
+    assert [(row.object, row.epsilon, row.target_a_drop) for row in rows] == [
+        ("mug", 0.02, 0.2),
+        ("mug", 0.05, 0.5),
+        ("chair", 0.02, 0.2),
+        ("chair", 0.05, 0.5),
+    ]
+    first = rows[0]
+    assert (first.attack_s, first.prepare_s, first.seconds) == (5.0, 1.0, 6.5)
+    assert (first.warnings, first.image_size, first.configuration) == ("one | two", "128x128", "epsilon 0.02")
+    assert (first.target_a_drop_low, first.target_a_drop_high) == (0.1, 1.0)
+    assert not any(row.failed for row in rows)
+
+
+def test_what_the_server_has_done_before_is_fetched_before_anything_is_waited_for(
+    service: FakeService, tmp_path: Path
+) -> None:
+    ran(plan_of(grid={"epsilon": [0.05]}), service, tmp_path / "before")
+    service.by_key = {key: service.job(job.id) for key, job in service.by_key.items()}
+    service.goes_away_after = service.looks
+    with pytest.raises(ServerUnreachable):
+        ran(plan_of(), service, tmp_path / "now")
+    rows = read_table(tmp_path / "now" / RESULTS, ResultRow)
+    assert [(row.object, row.epsilon) for row in rows] == [("mug", 0.05), ("chair", 0.05)]
+
+
+def test_a_job_is_fetched_when_it_is_done_however_many_submitted_before_it_still_wait(
+    service: FakeService, tmp_path: Path
+) -> None:
+    plan = plan_of(objects={"mug": {}}, grid={"epsilon": [k / 100 for k in range(1, 3 * run.POLLED + 1)]})
+    service.waiting = {f"job-{number}" for number in range(1, len(plan.rows))}  # all but the last
+    service.goes_away_after = 10 * len(plan.rows)
+    with pytest.raises(ServerUnreachable):
+        ran(plan, service, tmp_path)
+    assert [row.epsilon for row in read_table(tmp_path / RESULTS, ResultRow)] == [plan.rows[-1].request.paint.epsilon]
+
+
+def test_rows_hold_the_resolved_views_per_step_and_image_pipeline(service: FakeService, tmp_path: Path) -> None:
+    cases = {"plain": {}, "many": {"ensemble": ["tiny"]}, "few": {"views_per_step": 7}, "grid": {"grid": True}}
+    ran(plan_of(objects={"mug": {}}, grid={}, cases=cases), service, tmp_path)
+    rows = read_table(tmp_path / RESULTS, ResultRow)
+    assert [(row.case, row.image_pipeline, row.views_per_step, row.alpha) for row in rows] == [
+        ("plain", "none", 40, 0.01),
+        ("many", "transfer", 40, 0.01),
+        ("few", "none", 7, 0.01),
+        ("grid", "none", 60, 0.01),
+    ]
+
+
+def test_predictions_and_the_named_artifacts_are_kept(service: FakeService, tmp_path: Path) -> None:
+    ran(plan_of(), service, tmp_path)
+    key = next(iter(plan_of().jobs()))
+    assert (tmp_path / "jobs" / key / "contact_sheet.png").read_bytes() == b"picture"
+    assert {file.name for file in (tmp_path / "jobs" / key).glob("*.png")} == {"contact_sheet.png"}
+    predictions = [row for row in read_table(tmp_path / PREDICTIONS, PredictionRow) if row.key == key]
+    told = [(row.views, row.moment, row.name, row.true_class, row.count) for row in predictions]
+    assert told == [
+        ("target", "before", "mug", True, 2),
+        ("target", "after", "chair", False, 2),
+        ("held_out", "before", "mug", True, 1),
+        ("held_out", "after", "chair", False, 1),
+    ]
+
+
+def test_another_run_submits_what_is_new_or_was_kept_by_another_version_and_no_more(
+    service: FakeService, tmp_path: Path
+) -> None:
+    ran(plan_of(), service, tmp_path)
+    before = (tmp_path / RESULTS).read_bytes()
+    other = FakeService()
+    _, show = ran(plan_of(), other, tmp_path)
+    assert show.began == {"total": 4, "done": 4}
+    assert not other.by_key
+    assert (tmp_path / RESULTS).read_bytes() == before
+    _, show = ran(plan_of(grid={"epsilon": [0.02, 0.05, 0.1]}), service, tmp_path)
+    assert show.began == {"total": 6, "done": 4}
+    assert len(service.by_key) == 6
+    key = next(iter(plan_of().jobs()))
+    (tmp_path / "jobs" / key / "job.json").write_text(json.dumps({"other": "version"}))
+    assert ran(plan_of(), service, tmp_path)[1].began == {"total": 4, "done": 3}
+
+
+def test_a_run_that_was_cut_off_goes_on_where_it_was(service: FakeService, tmp_path: Path) -> None:
+    service.goes_away_after = 2
+    with pytest.raises(ServerUnreachable):
+        ran(plan_of(), service, tmp_path)
+    assert len(read_table(tmp_path / RESULTS, ResultRow)) == 2
+    service.goes_away_after = None
+    rows, show = ran(plan_of(), service, tmp_path)
+    assert show.began == {"total": 4, "done": 2}
+    assert len(service.by_key) == len(rows) == 4
+
+
+def test_a_second_run_in_a_folder_where_one_is_at_work_is_refused(service: FakeService, tmp_path: Path) -> None:
+    refused = []
+
+    class Impatient(Silent):
+        def end(self, row: Row, finished: Any) -> None:
+            with pytest.raises(SpecError) as caught:
+                ran(plan_of(), FakeService(), tmp_path)
+            refused.append(str(caught.value))
+
+    assert len(run_experiment(plan_of(), service, tmp_path, show=Impatient())) == len(refused) == 4
+    assert f"Another run uses {str(tmp_path)!r}: wait for its end, or choose another --out" in refused[0]
+    ran(plan_of(), service, tmp_path)
+
+
+def test_failures_stay_and_are_listed_until_they_are_to_be_tried_again(service: FakeService, tmp_path: Path) -> None:
+    service.failing = {"chair"}
+    rows, _ = ran(plan_of(), service, tmp_path)
+    assert failures(rows) == [f"chair  epsilon {e}  seed 0: failed: the renderer said no" for e in (0.02, 0.05)]
+    service.failing = set()
+    again, show = ran(plan_of(), service, tmp_path)
+    assert (show.began["done"], len(failures(again))) == (4, 2)
+    mended, show = ran(plan_of(), service, tmp_path, retry_failed=True)
+    assert (show.began["done"], len(failures(mended))) == (2, 0)
+    assert sum("-after-job-" in key for key in service.by_key) == 2
+
+
+def test_a_row_that_the_server_refuses_does_not_stop_the_others(service: FakeService, tmp_path: Path) -> None:
+    service.refused = {"mug"}
+    rows, _ = ran(plan_of(), service, tmp_path)
+    assert [row.state for row in rows] == ["refused", "refused", "succeeded", "succeeded"]
+    assert "No such class" in rows[0].error
+
+
+def test_a_file_is_uploaded_once_for_all_jobs(service: FakeService, tmp_path: Path) -> None:
+    (tmp_path / "net.onnx").write_bytes(b"network")
+    plan = plan_of(base={"classifier": str(tmp_path / "net.onnx"), "queries": 4})
+    ran(plan, service, tmp_path / "out")
+    assert [each.filename for each in service.uploads] == ["net.onnx"]
+    assert {request.victim.classifier for request in service.requests.values()} == {"stored-1"}
+
+
+def test_a_shared_job_fills_the_rows_of_all_its_series(service: FakeService, tmp_path: Path) -> None:
+    plan = plan_of(grid=[{"steps": [10, 30]}, {"pool": [240]}], base={"steps": 30, "pool": 240})
+    rows, show = ran(plan, service, tmp_path)
+    assert (show.began["total"], len(rows)) == (4, 6)
+    assert {row.series for row in rows} == {"steps", "pool"}
+
+
+def row_of(**columns: Any) -> ResultRow:
+    spec = JobRequest.of("mug", label="mug").spec()
+    return ResultRow.of_spec(RowId(experiment="x", key="k"), spec, state="succeeded", **columns)
+
+
+def test_two_experiments_are_compared_on_what_they_share() -> None:
+    old = [row_of(target_a_drop=drop, seed=k) for k, drop in enumerate((0.4, 0.6))] + [row_of(object="chair")]
+    new = [row_of(target_a_drop=0.8), row_of(object="lamp", target_a_drop=1.0)]
+    (found,) = differences(old, new)
+    assert found.object == "mug"
+    assert found.change("target_a_drop") == pytest.approx(0.3)
+    assert found.change("held_out_a_drop") is None
+
+
+def test_experiments_that_share_nothing_are_not_compared(service: FakeService, tmp_path: Path) -> None:
+    ran(plan_of(objects={"mug": {}}), service, tmp_path / "a")
+    ran(plan_of(objects={"chair": {}}), service, tmp_path / "b")
+    with pytest.raises(SpecError, match="share no setting"):
+        compared(tmp_path / "a", tmp_path / "b")
+    assert compared(tmp_path / "a", tmp_path / "a")
+
+
+def test_folders_are_shown_and_compared_even_without_the_columns_of_later_versions(
+    service: FakeService, tmp_path: Path
+) -> None:
+    new, old = tmp_path / "new", tmp_path / "old"
+    ran(plan_of(), service, new)
+    old.mkdir()
+    with (new / RESULTS).open(newline="") as source, (old / RESULTS).open("w", newline="") as copy:
+        rows = csv.DictReader(source)
+        columns = [name for name in rows.fieldnames or [] if name not in {"image_pipeline", "target", "views_per_step"}]
+        writer = csv.DictWriter(copy, columns, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    first = read_results(old)[0]
+    assert (first.target_a_drop, first.image_pipeline, first.target, first.views_per_step) == (0.2, "", "", None)
+    for folder, other in ((new, new / RESULTS), (old, new)):
+        assert "0.50 [0.25, 1.00]" in invoked("show", folder)
+        told = invoked("compare", folder, other)
+        assert "0 of 4 larger by 0.1 or more, 0 smaller; on average +0.000" in told
+
+
+def test_a_dry_run_says_how_many_jobs_there_are_and_asks_nobody() -> None:
+    told = invoked("run", "quick", "--dry-run", "--server", "http://127.0.0.1:1")
+    assert told.startswith("quick: 32 jobs, about ")
+
+
+def test_the_shipped_files_are_listed() -> None:
+    assert [line.split()[0] for line in invoked("list").splitlines()] == list(shipped_experiments())
+
+
+def test_a_table_of_another_kind_is_refused(tmp_path: Path) -> None:
+    (tmp_path / RESULTS).write_text("a,b\n1,2\n")
+    with pytest.raises(SpecError, match="is not a ResultRow table of this version"):
+        read_results(tmp_path)
+    with pytest.raises(SpecError, match="No table"):
+        read_results(tmp_path / "nowhere.csv")
+
+
+def test_where_only_the_tables_were_kept_their_rows_stay_and_count_as_done(
+    service: FakeService, tmp_path: Path
+) -> None:
+    """As in a checkout of published results: the same command must not wipe them out."""
+    service.failing = {"chair"}
+    ran(plan_of(), service, tmp_path)
+    shutil.rmtree(tmp_path / "jobs")
+    tables = {name: (tmp_path / name).read_bytes() for name in (RESULTS, PREDICTIONS)}
+    rows, show = ran(plan_of(), service, tmp_path)
+    assert show.began == {"total": 4, "done": 4}
+    assert {name: (tmp_path / name).read_bytes() for name in tables} == tables
+    assert len(failures(rows)) == 2
+
+    service.failing = set()
+    wider, show = ran(plan_of(grid={"epsilon": [0.02, 0.05, 0.1]}), service, tmp_path, retry_failed=True)
+    assert show.began == {"total": 6, "done": 2}
+    assert [row.state for row in wider] == ["succeeded"] * 6
+    assert len({each.key for each in read_table(tmp_path / PREDICTIONS, PredictionRow)}) == 6
+
+
+def test_rows_of_other_jobs_that_nothing_else_is_left_of_are_never_overwritten(
+    service: FakeService, tmp_path: Path
+) -> None:
+    ran(plan_of(), service, tmp_path)
+    narrower = plan_of(grid={"epsilon": [0.02]})
+    assert len(ran(narrower, service, tmp_path)[0]) == 2
+    ran(plan_of(), service, tmp_path)
+    shutil.rmtree(tmp_path / "jobs")
+    table = (tmp_path / RESULTS).read_bytes()
+    with pytest.raises(SpecError, match=r"rows of 2 jobs .* mug, epsilon 0.05, .* choose another --out"):
+        ran(narrower, service, tmp_path)
+    assert (tmp_path / RESULTS).read_bytes() == table
+
+
+def test_the_jobs_of_an_experiment_are_found_on_a_server(
+    service: FakeService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.failing = {"chair"}
+    ran(plan_of(), service, tmp_path)
+    monkeypatch.setattr(cli, "Service", lambda client: service)
+    assert "mean of 4 rows: target A_drop 0.35" in invoked("show", "small")
+    assert "no job of an experiment 'other'" in invoked("show", "other", status=1)
+
+
+def displayed(plan: Plan, service: FakeService, folder: Path, **options: Any) -> str:
+    written = StringIO()
+    with experiment_display(Console(file=written, width=200, **options)) as show:
+        run_experiment(plan, service, folder, show=show)
+    return written.getvalue()
+
+
+def test_a_log_shows_a_line_for_each_job_that_is_done_and_a_terminal_a_bar_over_all(
+    service: FakeService, tmp_path: Path
+) -> None:
+    service.failing = {"chair"}
+    lines = displayed(plan_of(), service, tmp_path / "log").splitlines()
+    assert lines[0] == "4 jobs, 0 already done"
+    assert lines[1].startswith("1/4  mug  epsilon 0.02  seed 0  A_drop 0.20, held-out 0.20  about ")
+    assert lines[4].startswith("4/4  chair  epsilon 0.05  seed 0  failed: the renderer said no")
+    assert "4/4" in displayed(plan_of(), service, tmp_path / "terminal", force_terminal=True)
+
+
+def test_jobs_that_the_server_did_long_ago_promise_nothing_on_the_time_that_is_left(
+    service: FakeService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran(plan_of(grid={"epsilon": [0.05]}), service, tmp_path / "before")
+    service.by_key = {key: service.job(job.id) for key, job in service.by_key.items()}
+    now = count(step=20)
+    monkeypatch.setattr(time, "monotonic", lambda: next(now))
+    told = displayed(plan_of(grid={"epsilon": [0.02, 0.03, 0.05]}), service, tmp_path / "now")
+    ends = [line.partition("seed 0  ")[2].partition("  ")[2] for line in told.splitlines()[1:]]
+    assert ends == ["", "", "about 60 s left", "about 40 s left", "about 20 s left", ""]
+
+
+def test_how_an_experiment_was_made_is_noted_and_its_runs_add_up(tmp_path: Path) -> None:
+    source = tmp_path / "mine.yaml"
+    source.write_text("name: mine\n")
+    for _ in range(2):
+        write_about(tmp_path, "trompe experiment run mine.yaml", seconds=30.0, source=source)
+    note = json.loads((tmp_path / ABOUT).read_text())
+    assert (note["command"], note["seconds"], note["took"]) == ("trompe experiment run mine.yaml", 60.0, "60 s")
+    assert (tmp_path / "experiment.yaml").read_text() == "name: mine\n"
+
+
+def test_more_views_steps_and_networks_take_longer() -> None:
+    def job(**options: Any) -> JobRequest:
+        return JobRequest.of("mug", label="mug", **options)
+
+    base = estimated_seconds([job()])
+    for more in ({"steps": 1000}, {"pool": 480}, {"held_out": 300}, {"ensemble": ["tiny"]}, {"surrogate": "curve"}):
+        assert estimated_seconds([job(**more)]) > base
+    assert estimated_seconds([job(), job()]) == pytest.approx(2 * base)

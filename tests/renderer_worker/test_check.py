@@ -1,0 +1,497 @@
+"""The check names each fault of an adapter, and nothing else; right adapters of many kinds pass."""
+
+import contextlib
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from numpy.typing import NDArray
+
+from tests.worker_process import started
+from trompe_renderer.check import REMEDIES, EngineRender, check, questions
+from trompe_renderer.command import render
+from trompe_renderer.engines.engine import Engine, noise_seed
+from trompe_renderer.engines.pyrender import PyrenderEngine, PyrenderOptions
+from trompe_renderer.world.lights import WorldLight
+from trompe_renderer.world.model import model_of
+from trompe_renderer.world.snapshot import Instance, Snapshot
+from trompe_shared.engine import EngineInfo
+from trompe_shared.geometry import look_rotation
+from trompe_shared.sailenv_client import SailenvTarget
+
+Picture = NDArray[np.uint8]
+Levels = NDArray[np.float64]
+Aim = Callable[[Snapshot, int, int], Snapshot]
+See = Callable[[Levels, Snapshot], Levels]
+
+RANDOM = EngineInfo("random", "1", deterministic=False)
+
+
+class Wrong:
+    """An engine with changed worlds (``aim``, given width and height) and pictures (``see``, float, 0 to 255)."""
+
+    def __init__(
+        self, inner: Engine, *, aim: Aim | None = None, see: See | None = None, info: EngineInfo | None = None
+    ):
+        self.inner, self.aim, self.see, self.info = inner, aim, see, info or inner.info
+
+    def render(self, world: Snapshot, *, width: int, height: int) -> Picture:
+        shown = world if self.aim is None else self.aim(world, width, height)
+        picture = self.inner.render(shown, width=width, height=height)
+        if self.see is None:
+            return picture
+        return np.clip(np.round(self.see(picture.astype(float), world)), 0, 255).astype(np.uint8)
+
+
+Fault = Callable[[Engine], Engine]
+
+
+def seen(see: See, info: EngineInfo | None = None) -> Fault:
+    return lambda engine: Wrong(engine, see=see, info=info)
+
+
+def aimed(aim: Aim) -> Fault:
+    return lambda engine: Wrong(engine, aim=aim)
+
+
+def lens(scale: Callable[[float], tuple[float, float]]) -> Fault:
+    """Half the width and half the height of what is seen at depth 1, over the right ones, from width / height."""
+
+    def aim(world: Snapshot, width: int, height: int) -> Snapshot:
+        return replace(world, camera=world.camera @ np.diag([*scale(width / height), 1, 1]))
+
+    return aimed(aim)
+
+
+def wide(degrees: float) -> Fault:
+    k = np.tan(np.radians(degrees / 2)) / np.tan(np.radians(30))
+    return lens(lambda _: (k, k))
+
+
+def shifted(right: float, down: float) -> Fault:
+    """By pixels of a picture that is 160 high: the camera is turned a little."""
+    turn, nod = np.arctan(np.array([right, -down]) * np.tan(np.radians(30)) / 80)
+    change = np.eye(4)
+    change[:3, :3] = look_rotation(np.degrees(turn), np.degrees(nod))
+    return aimed(lambda world, *_: replace(world, camera=world.camera @ change))
+
+
+def lit(change: Callable[[WorldLight, Snapshot], WorldLight]) -> Fault:
+    return aimed(lambda world, *_: replace(world, lights=tuple(change(light, world) for light in world.lights)))
+
+
+def turned(light: WorldLight, matrix: Levels) -> WorldLight:
+    x, y, z = (matrix @ np.array(light.direction)).tolist()
+    return replace(light, direction=(x, y, z))
+
+
+def linear(picture: Levels) -> Levels:
+    level = picture / 255
+    return np.asarray(np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4))
+
+
+def encoded(light: Levels) -> Levels:
+    return 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.clip(light, 1e-9, None) ** (1 / 2.4) - 0.055)
+
+
+def painted(change: Callable[[Picture], NDArray[Any]]) -> Fault:
+    def aim(world: Snapshot, *_: int) -> Snapshot:
+        def other(each: Instance) -> Instance:
+            obj = each.model.obj
+            return replace(
+                each,
+                model=model_of(
+                    obj.with_textures(
+                        {
+                            name: np.ascontiguousarray(change(texture)).astype(np.uint8)
+                            for name, texture in obj.textures.items()
+                        }
+                    )
+                ),
+            )
+
+        return replace(world, instances=tuple(map(other, world.instances)))
+
+    return aimed(aim)
+
+
+def turned_world(matrix: list[list[int]]) -> Fault:
+    pose = np.eye(4)
+    pose[:3, :3] = matrix
+    return aimed(
+        lambda world, *_: replace(world, instances=tuple(replace(i, pose=pose @ i.pose) for i in world.instances))
+    )
+
+
+def upright(world: Snapshot, *_: int) -> Snapshot:
+    """A camera that looks at the origin, whatever was asked."""
+    back = world.camera[:3, 3] / np.linalg.norm(world.camera[:3, 3])
+    right = np.cross([0, 1, 0], back)
+    right /= np.linalg.norm(right)
+    camera = world.camera.copy()
+    camera[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    return replace(world, camera=camera)
+
+
+def cached_by(key: Callable[[Instance], str]) -> Callable[[Engine], Engine]:
+    """Draws the first object with an equal ``key`` again."""
+
+    def wrong(engine: Engine) -> Engine:
+        known: dict[str, Instance] = {}
+        return Wrong(
+            engine,
+            aim=lambda world, *_: replace(
+                world, instances=tuple(known.setdefault(key(each), each) for each in world.instances)
+            ),
+        )
+
+    return wrong
+
+
+frozen, by_name = cached_by(lambda each: each.model.shape), cached_by(lambda each: each.model.obj.name)
+
+
+def late(engine: Engine) -> Engine:
+    """A repaint shows one picture later."""
+    last: dict[str, Instance] = {}
+
+    def aim(world: Snapshot, *_: int) -> Snapshot:
+        shown = tuple(last.get(each.model.shape, each) for each in world.instances)
+        last.update({each.model.shape: each for each in world.instances})
+        return replace(world, instances=shown)
+
+    return Wrong(engine, aim=aim)
+
+
+def hoarding(engine: Engine) -> Engine:
+    """Never removes an object."""
+    known: dict[str, Instance] = {}
+
+    def aim(world: Snapshot, *_: int) -> Snapshot:
+        known.update({each.model.shape: each for each in world.instances})
+        return replace(world, instances=tuple(known.values()))
+
+    return Wrong(engine, aim=aim)
+
+
+def grain(sigma: float, seed: Callable[[Snapshot], int | None]) -> See:
+    return lambda picture, world: picture + np.random.default_rng(seed(world)).normal(0, sigma, picture.shape)
+
+
+def one_pixel(engine: Engine) -> Engine:
+    """Every other picture differs by one level in one pixel."""
+    count = iter(range(10**6))
+
+    def see(picture: Levels, _: Snapshot) -> Levels:
+        picture[50, 50, 1] += (-1) ** next(count)
+        return picture
+
+    return Wrong(engine, see=see)
+
+
+def adapting(engine: Engine) -> Engine:
+    """Its exposure follows the pictures of before."""
+    past = [80.0]
+
+    def see(picture: Levels, world: Snapshot) -> Levels:
+        exposed = on_object(lambda levels: levels * (1 + 0.0005 * (past[0] - 80)))(picture, world)
+        past[0] = picture.mean()
+        return exposed
+
+    return Wrong(engine, see=see)
+
+
+def on_object(change: Callable[[Levels], Levels]) -> See:
+    """``change`` of all but the background."""
+
+    def see(picture: Levels, world: Snapshot) -> Levels:
+        asked = np.round(255 * np.array(world.background))
+        return np.where((picture == asked).all(axis=-1, keepdims=True), picture, change(picture))
+
+    return see
+
+
+def off_background(change: Callable[[Levels], Levels]) -> See:
+    def see(picture: Levels, world: Snapshot) -> Levels:
+        asked = np.round(255 * np.array(world.background))
+        return np.where((picture == asked).all(axis=-1, keepdims=True), change(asked), picture)
+
+    return see
+
+
+def slow(engine: Engine) -> Engine:
+    def see(picture: Levels, _: Snapshot) -> Levels:
+        time.sleep(0.1)
+        return picture
+
+    return Wrong(engine, see=see)
+
+
+def square_only(engine: Engine) -> Engine:
+    return lens(lambda aspect: (1 / aspect, 1))(engine)
+
+
+def padded(engine: Engine) -> Engine:
+    """Rows are read as if they were multiples of four bytes."""
+
+    def see(picture: Levels, _: Snapshot) -> Levels:
+        height, width = picture.shape[:2]
+        row = -(-3 * width // 4) * 4
+        flat = np.zeros(height * row)
+        flat[: picture.size] = picture.ravel()
+        return flat.reshape(height, row)[:, : 3 * width].reshape(picture.shape)
+
+    return Wrong(engine, see=see)
+
+
+def attached(light: WorldLight, world: Snapshot) -> WorldLight:
+    return turned(light, world.camera[:3, :3])
+
+
+def headlight(light: WorldLight, world: Snapshot) -> WorldLight:
+    x, y, z = (-world.camera[:3, 2]).tolist()
+    return replace(light, direction=(x, y, z))
+
+
+FAULTS = [
+    pytest.param("not repeatable", one_pixel, id="one pixel"),
+    pytest.param("not repeatable", seen(grain(3, lambda _: None)), id="grain"),
+    pytest.param("not repeatable", adapting, id="adaptive exposure"),
+    pytest.param("noise not numbered", seen(grain(3, lambda _: None), RANDOM), id="noise without seed"),
+    pytest.param("noise number ignored", seen(grain(3, lambda _: 7), RANDOM), id="noise with a constant seed"),
+    pytest.param("noise number ignored", seen(lambda picture, _: picture, RANDOM), id="noise declared, and none"),
+    pytest.param("mirrored", seen(lambda picture, _: picture[:, ::-1]), id="mirrored"),
+    pytest.param("upside down", seen(lambda picture, _: picture[::-1]), id="upside down"),
+    pytest.param("v flipped", painted(lambda texture: texture[::-1]), id="v flipped"),
+    pytest.param("u flipped", painted(lambda texture: texture[:, ::-1]), id="u flipped"),
+    pytest.param("texture turned", painted(lambda texture: texture.swapaxes(0, 1)), id="transposed"),
+    pytest.param("untextured", painted(lambda texture: np.full_like(texture, 180)), id="no textures"),
+    pytest.param("field of view", wide(61), id="61 degrees"),
+    pytest.param("field of view", wide(62), id="62 degrees"),
+    pytest.param("field of view", wide(45), id="45 degrees"),
+    pytest.param("field of view", wide(59), id="59 degrees"),
+    pytest.param("aspect", square_only, id="a square camera"),
+    pytest.param("aspect", lens(lambda aspect: (1.04, 1)), id="4 percent too narrow"),
+    pytest.param("aspect", lens(lambda aspect: (1 / aspect, 1 / aspect)), id="horizontal field of view"),
+    pytest.param("aspect", lens(lambda aspect: (1 / min(aspect, 1),) * 2), id="field of view of the shorter side"),
+    pytest.param("sheared", padded, id="padded rows"),
+    pytest.param("channel order", seen(lambda picture, _: picture[..., ::-1]), id="BGR"),
+    pytest.param("channel order", seen(lambda picture, _: picture[..., [1, 2, 0]]), id="GBR"),
+    pytest.param("gamma twice", seen(on_object(lambda picture: encoded(picture / 255))), id="encoded twice"),
+    pytest.param("gamma missing", seen(on_object(lambda picture: 255 * linear(picture))), id="not encoded"),
+    pytest.param(
+        "texture not decoded", painted(lambda texture: np.round(encoded(texture / 255))), id="texture not decoded"
+    ),
+    pytest.param(
+        "texture decoded twice",
+        painted(lambda texture: np.round(255 * linear(texture.astype(float)))),
+        id="decoded twice",
+    ),
+    pytest.param("shifted", shifted(0.5, 0), id="half a pixel right"),
+    pytest.param("shifted", shifted(0, -0.5), id="half a pixel up"),
+    pytest.param("shifted", shifted(-2, 3), id="left and down"),
+    pytest.param("frozen texture", frozen, id="frozen"),
+    pytest.param("late texture", late, id="late"),
+    pytest.param("stale scene", hoarding, id="earlier objects"),
+    pytest.param("stale object", by_name, id="cached by name"),
+    pytest.param("light reversed", lit(lambda light, _: turned(light, -np.eye(3))), id="light reversed"),
+    pytest.param("light direction", lit(lambda light, _: turned(light, np.diag([-1, 1, 1]))), id="light mirrored"),
+    pytest.param(
+        "light direction", lit(lambda light, _: turned(light, np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]))), id="z up"
+    ),
+    pytest.param("light follows camera", lit(attached), id="camera light"),
+    pytest.param("light follows camera", lit(headlight), id="headlight"),
+    pytest.param("light missing", lit(lambda light, _: replace(light, intensity=0.0)), id="no light"),
+    pytest.param("light intensity", lit(lambda light, _: replace(light, intensity=0.6)), id="constant light"),
+    pytest.param("light colour", lit(lambda light, _: replace(light, color=(255, 255, 255))), id="white light"),
+    pytest.param(
+        "ambient missing", aimed(lambda world, *_: replace(world, ambient=(0.0, 0.0, 0.0))), id="no ambient light"
+    ),
+    pytest.param("background", seen(off_background(lambda asked: asked + 3 * np.sign(127 - asked))), id="3 levels off"),
+    pytest.param("background", seen(off_background(lambda asked: 255 * linear(asked))), id="background not encoded"),
+    pytest.param("axes", turned_world([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), id="z up world"),
+    pytest.param("axes", turned_world([[-1, 0, 0], [0, 1, 0], [0, 0, -1]]), id="from behind"),
+    pytest.param("axes", turned_world([[-1, 0, 0], [0, 1, 0], [0, 0, 1]]), id="left-handed world"),
+    pytest.param("camera", aimed(upright), id="looks at the origin"),
+    pytest.param("invisible", aimed(lambda world, *_: replace(world, instances=())), id="nothing"),
+]
+
+
+@pytest.fixture(scope="module")
+def engine() -> Engine:
+    return PyrenderEngine(PyrenderOptions())
+
+
+def faults(engine: Engine) -> set[str]:
+    return {each.name for each in check(EngineRender(engine), engine.info) if each.level != "ok"} - {"stopped"}
+
+
+@pytest.mark.parametrize(("name", "fault"), FAULTS)
+def test_the_fault_of_an_adapter_is_named_and_no_other(name: str, fault: Fault, engine: Engine) -> None:
+    assert faults(fault(engine)) == {name}
+
+
+def reinhard(light: Levels) -> Levels:
+    return light / (1 + light)
+
+
+def aces(light: Levels) -> Levels:
+    """Narkowicz's fit."""
+    return np.clip(light * (2.51 * light + 0.03) / (light * (2.43 * light + 0.59) + 0.14), 0, 1)
+
+
+def agx(light: Levels) -> Levels:
+    """three.js's, with its polynomial; linear light out."""
+    into = np.array(
+        [[0.842479, 0.0784336, 0.0792237], [0.0423303, 0.878469, 0.0791661], [0.0423745, 0.0784336, 0.879142]]
+    )
+    x = np.clip((np.log2(np.clip(light @ into.T, 1e-10, None)) + 12.47393) / 16.5, 0, 1)
+    curve = np.polyval([15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232], x)
+    return np.asarray(np.clip(curve @ np.linalg.inv(into).T, 0, None) ** 2.2)
+
+
+def toned(curve: Callable[[Levels], Levels]) -> Fault:
+    return seen(on_object(lambda picture: encoded(np.clip(curve(linear(picture)), 0, 1))))
+
+
+def grained(engine: Engine) -> Engine:
+    """A film: ACES's curve and strong, numbered grain, over all."""
+    return Wrong(toned(aces)(engine), see=grain(6, noise_seed), info=RANDOM)
+
+
+def composited_in_light(engine: Engine) -> Engine:
+    """Edges mix linear light, as path tracers do."""
+
+    def see(picture: Levels, world: Snapshot) -> Levels:
+        height, width = picture.shape[:2]
+        large = engine.render(world, width=2 * width, height=2 * height).astype(float)
+        return encoded(linear(large).reshape(height, 2, width, 2, 3).mean(axis=(1, 3)))
+
+    return Wrong(engine, see=see)
+
+
+RIGHT = [
+    *(pytest.param(toned(curve), id=curve.__name__) for curve in (reinhard, aces, agx)),
+    pytest.param(grained, id="film with grain"),
+    pytest.param(composited_in_light, id="edges mixed in linear light"),
+    pytest.param(seen(on_object(lambda picture: 255 * (picture / 255) ** (2.2 / 2.0))), id="gamma 2.0"),
+    pytest.param(wide(60.3), id="60.3 degrees"),
+    pytest.param(shifted(0.15, -0.15), id="0.15 pixels"),
+]
+
+
+@pytest.mark.parametrize("adapter", RIGHT)
+def test_a_right_adapter_passes(adapter: Fault, engine: Engine) -> None:
+    assert faults(adapter(engine)) == set()
+
+
+@pytest.mark.parametrize("setting", ["msaa=1", "supersample=2", "anisotropy=8", "shadows=no"])
+def test_our_own_engine_passes_with_all_settings(setting: str) -> None:
+    with started("--set", setting) as worker, contextlib.closing(SailenvTarget(*worker.address)) as target:
+        assert {each.level for each in check(target.render, target.engine)} == {"ok"}
+
+
+def by_id(name: str) -> tuple[str, Fault]:
+    return next((str(each.values[0]), each.values[1]) for each in FAULTS if each.id == name)  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("mirrored", "v flipped"),
+        ("upside down", "light reversed"),
+        ("BGR", "62 degrees"),
+        ("texture not decoded", "frozen"),
+        ("texture not decoded", "encoded twice"),
+        ("a square camera", "padded rows"),
+        ("half a pixel right", "a square camera"),
+        ("noise with a constant seed", "camera light"),
+        ("3 levels off", "earlier objects"),
+        ("no ambient light", "looks at the origin"),
+    ],
+)
+def test_two_faults_at_once_are_both_named(one: str, other: str, engine: Engine) -> None:
+    (first, spoil), (second, spoil_too) = by_id(one), by_id(other)
+    assert faults(spoil_too(spoil(engine))) == {first, second}
+
+
+def test_light_on_encoded_colours_is_a_warning(engine: Engine) -> None:
+    old = by_id("not encoded")[1](by_id("texture not decoded")[1](engine))
+    levels = {each.name: each.level for each in check(EngineRender(old), old.info)}
+    assert levels.pop("light on encoded colours") == "warning"
+    assert set(levels.values()) == {"ok"}
+
+
+def test_a_slow_adapter_is_told_by_a_warning(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(questions, "SLOW", 0.1)
+    (told,) = (each for each in check(EngineRender(slow(engine)), engine.info) if each.level != "ok")
+    assert (told.level, told.name) == ("warning", "slow")
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("half a pixel right", r"0\.5\d pixels too far right\."),
+        ("half a pixel up", r"0\.5\d pixels too far up\."),
+        ("62 degrees", r"is 62\.0 degrees, not 60\."),
+        ("horizontal field of view", r"1\.3\d x 1\.3\d in a wide picture, 0\.7\d x 0\.7\d in a tall"),
+        ("light mirrored", r"from azimuth 60, elevation 35 seems to come from azimuth -[56]\d, elevation [23]\d"),
+        ("one pixel", "differ in 1 pixel, by up to [12] levels?"),
+    ],
+)
+def test_a_fault_is_told_with_its_figure(fault: str, words: str, engine: Engine) -> None:
+    wrong = by_id(fault)[1](engine)
+    said = " ".join(each.seen for each in check(EngineRender(wrong), wrong.info) if each.level == "fault")
+    assert re.search(words, said), said
+
+
+def test_each_fault_has_a_test_and_a_remedy() -> None:
+    tested = {each.values[0] for each in FAULTS} | {"slow", "light on encoded colours"}
+    assert tested == set(REMEDIES)
+
+
+@pytest.mark.parametrize("kind", ["worker", "plain_worker"])
+def test_a_running_renderer_is_checked_over_its_socket_with_and_without_extensions(
+    kind: str, request: pytest.FixtureRequest
+) -> None:
+    host, port = request.getfixturevalue(kind)
+    found = CliRunner().invoke(render, ["--check", f"{host}:{port}"])
+    assert found.exit_code == 0, found.output
+    assert found.output.splitlines()[-1] == "No fault."
+    assert found.output.startswith("sailenv" if kind == "plain_worker" else "pyrender 0")
+
+
+def test_an_engine_of_ones_own_is_checked_by_the_command_and_fails_it(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from trompe_renderer.engines.pyrender import PyrenderEngine, PyrenderOptions\n\n\n"
+        "class Mirrored(PyrenderEngine):\n"
+        "    def __init__(self):\n        super().__init__(PyrenderOptions())\n\n"
+        "    def render(self, world, *, width, height):\n"
+        "        return super().render(world, width=width, height=height)[:, ::-1]\n"
+    )
+    command = [sys.executable, "-m", "trompe_renderer", "--engine", "mine:Mirrored", "--check"]
+    found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert found.returncode == 1
+    lines = found.stdout.splitlines()
+    assert lines[0] == "mine:Mirrored " + version("pyrender")
+    assert [line for line in lines if not line.startswith("ok")][1:] == [
+        "FAULT    mirrored: Left and right are exchanged. Flip the columns: picture[:, ::-1]. "
+        "Trompe's world is right-handed.",
+        "1 fault.",
+    ]
+
+
+@pytest.mark.parametrize("address", ["somewhere", "127.0.0.1:9"])
+def test_the_check_says_what_it_cannot_reach(address: str) -> None:
+    found = CliRunner().invoke(render, ["--check", address])
+    assert found.exit_code == 1
+    assert re.search("expected HOST:PORT|There is no renderer at 127.0.0.1:9", found.output)

@@ -1,0 +1,365 @@
+"""All engines by the properties of their pictures, through real workers; and what each tells of itself."""
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.documentation import blocks
+from tests.made_objects import CANDLE, FLAG, GLASS, LATTICE, lantern
+from tests.wire import Wire, boxes, on_screen, plain
+from tests.worker_process import Worker, started
+from trompe_renderer.engines.loading import ENGINES, engine_maker
+from trompe_server.formats import read_object
+from trompe_server.renderers import SailenvTarget
+from trompe_shared.engine import EngineInfo
+from trompe_shared.errors import RendererError
+from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View
+from trompe_shared.object3d import Object3D
+from trompe_shared.sailenv_client import SAILENV
+
+SETTINGS: Final = {"mitsuba": ["samples=32"], "cycles": ["samples=32"]}
+RANDOM: Final = {"mitsuba", "cycles"}
+PACKAGES: Final = {"three": "playwright", "cycles": "bpy"}
+BLENDER: Final = os.environ.get("TROMPE_BLENDER_PYTHON", sys.executable)
+"""A Python with bpy."""
+SIZE: Final = (60, 80)
+AMBIENT: Final = Light(intensity=0.0, ambient=1.0)
+BEHIND: Final = (9, 200, 77)
+OWN: Final = "tests.renderer_worker.noisy_engine:Noisy"
+
+Make = Callable[..., Any]
+Picture = NDArray[np.float64]
+
+
+def options_of(name: str) -> list[str]:
+    """Options of a worker with an engine that is installed here; skips the test otherwise."""
+    if name == "cycles":
+        found = subprocess.run([BLENDER, "-c", "import importlib.util as u; exit(not u.find_spec('bpy'))"], check=False)
+        if found.returncode:
+            pytest.skip("no bpy: TROMPE_BLENDER_PYTHON names a Python that has it")
+        return [*(f"--set={each}" for each in SETTINGS["cycles"]), f"--set=python={BLENDER}", "--engine=cycles"]
+    if importlib.util.find_spec(PACKAGES.get(name, name)) is None:
+        pytest.skip(f"NOT TESTED: {name}. {ENGINES[name][1]}")
+    return [*(f"--set={each}" for each in SETTINGS.get(name, [])), f"--engine={name}"]
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[dict[str, Worker]]:
+    """Workers by their engine; tests share them."""
+    with ExitStack() as stack:
+
+        class Running(dict[str, Worker]):
+            def __missing__(self, name: str) -> Worker:
+                self[name] = stack.enter_context(started(*options_of(name)))
+                return self[name]
+
+        yield Running()
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def shown(engine: str, running: dict[str, Worker]) -> Iterator[SailenvTarget]:
+    with closing(SailenvTarget(*running[engine].address, timeout=100)) as target:
+        yield target
+
+
+def picture(target: SailenvTarget, obj: Object3D, camera: Camera, light: Light = AMBIENT, **more: Any) -> Picture:
+    """(H, W, 3), 0 to 255."""
+    options: dict[str, Any] = {"background": BEHIND, "noise": 1, "size": SIZE} | more
+    size = options.pop("size")
+    image: Picture = target.render(obj, [View(camera, light, **options)], size=size)[0].astype(float)
+    return image
+
+
+def linear(image: Picture) -> Picture:
+    encoded = image / 255
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def sphere(make_object: Make, radius: float) -> Object3D:
+    """A white ball of 96 x 48 quads, smooth."""
+    around, up = np.meshgrid(np.linspace(0, 2 * np.pi, 97), np.linspace(-np.pi / 2, np.pi / 2, 49))
+    points = radius * np.stack([np.cos(up) * np.sin(around), np.sin(up), np.cos(up) * np.cos(around)], axis=-1)
+    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
+    corners = np.concatenate([np.stack(each, axis=-2).reshape(-1, 3, 3) for each in ((a, b, c), (a, c, d))])
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    corners = corners[area > 1e-9 * area.max()]
+    return make_object((corners, np.full((len(corners), 3, 2), 0.5), plain(255, 255, 255)))  # type: ignore[no-any-return]
+
+
+def test_a_texture_is_upright_not_mirrored_and_repeats(
+    shown: SailenvTarget, make_object: Make, make_quad: Make
+) -> None:
+    colors = np.array([[[250, 20, 20], [20, 250, 20]], [[20, 20, 250], [250, 250, 250]]], np.uint8)
+    texture = colors.repeat(32, axis=0).repeat(32, axis=1)
+    once, twice = (make_object(make_quad(texture, repeat=repeat)) for repeat in (1, 2))
+    image = picture(shown, once, Camera(0.5, 0, 0))
+    corners = [image[row, column] for row in (24, 36) for column in (34, 46)]
+    assert np.abs(np.array(corners).reshape(2, 2, 3) - colors).max() < 70  # 20 is read as 80 by a glossy material
+    again = picture(shown, twice, Camera(0.5, 0, 0))
+    starts = [again[row, column] for row in (21, 33) for column in (31, 43)]  # of each repetition, its first quarter
+    assert np.abs(np.array(starts) - colors[0, 0]).max() < 70
+    assert (image[0] == BEHIND).all()
+
+
+@pytest.mark.parametrize("size", [(90, 120), (130, 70)], ids=str)
+def test_the_outline_of_a_sphere_is_where_the_field_of_view_puts_it(
+    size: tuple[int, int], shown: SailenvTarget, make_object: Make
+) -> None:
+    radius, distance = 0.1, 0.42
+    image = picture(shown, sphere(make_object, radius), Camera(distance, 30, 20), size=size, background=(0, 0, 0))
+    covered = image[..., 1] / np.median(
+        image[size[0] // 2 - 9 : size[0] // 2 + 9, size[1] // 2 - 9 : size[1] // 2 + 9, 1]
+    )
+    expected = size[0] / 2 / np.tan(np.radians(FIELD_OF_VIEW / 2)) * radius / np.sqrt(distance**2 - radius**2)
+    rows, columns = (np.clip(covered, 0, 1) > 0.5).any(axis=1), (np.clip(covered, 0, 1) > 0.5).any(axis=0)
+    for line, side in ((rows, size[0]), (columns, size[1])):
+        first, last = np.flatnonzero(line)[[0, -1]]
+        assert first == pytest.approx(side / 2 - expected, abs=1.0)
+        assert last + 1 == pytest.approx(side / 2 + expected, abs=1.0)
+    assert np.sqrt((covered > 0.5).sum() / np.pi) == pytest.approx(expected, abs=0.5)
+
+
+def test_light_comes_from_its_side_with_its_colour(shown: SailenvTarget, make_object: Make) -> None:
+    ball, camera = sphere(make_object, 0.1), Camera(0.4, 0, 0)
+    right = picture(shown, ball, camera, Light(90, 0, 0.8, 0.1, (255, 128, 0)))
+    height, width = SIZE
+    lit, dark = right[height // 2, width // 2 + 10], right[height // 2, width // 2 - 10]
+    assert lit[0] > lit[1] > lit[2]
+    assert lit[0] > dark[0] + 50
+    above = picture(shown, ball, camera, Light(0, 80, 0.8, 0.1))
+    assert above[height // 2 - 10, width // 2].min() > above[height // 2 + 10, width // 2].max() + 50
+    unlit = picture(shown, ball, camera, Light(180, 0, 0.8, 0.1))
+    assert linear(unlit[height // 2, width // 2]).mean() == pytest.approx(0.1, abs=0.02)
+
+
+def test_white_reflects_the_intensity_and_linear_light_follows_albedo(
+    shown: SailenvTarget, make_object: Make, make_quad: Make
+) -> None:
+    def light(albedo: int, intensity: float) -> float:
+        obj = make_object(make_quad(plain(albedo, albedo, albedo)))
+        image = picture(shown, obj, Camera(0.5, 0, 0), Light(0, 0, intensity, 0.0))
+        return float(linear(image[25:35, 35:45]).mean())
+
+    assert light(255, 1.0) > 0.93
+    assert light(255, 0.5) == pytest.approx(0.5, abs=0.05)
+    dark, middle, bright = (light(albedo, 0.9) for albedo in (90, 150, 200))
+    steps = np.diff(linear(np.array([90.0, 150.0, 200.0])))
+    assert (bright - middle) / (middle - dark) == pytest.approx(steps[1] / steps[0], rel=0.06)
+
+
+def test_a_repaint_changes_its_surface_alone(shown: SailenvTarget) -> None:
+    box, camera = boxes(), Camera(0.3, 0, 0)
+    other = box.with_textures({"front_albedo.png": plain(20, 40, 60)})
+    before, after = (picture(shown, obj, camera, Light(0, 0, 0.5, 0.3)) for obj in (box, other))
+    changed = np.abs(before - after).max(axis=-1) > 30
+    assert changed[25:35, 35:45].all()
+    assert not changed[:8].any()
+    hidden = box.with_textures({"back_albedo.png": plain(255, 255, 255)})
+    assert (picture(shown, hidden, camera, Light(0, 0, 0.5, 0.3)) == before).all()
+    assert (picture(shown, box, camera, Light(0, 0, 0.5, 0.3)) == before).all()
+
+
+@pytest.mark.parametrize("color", [(0, 0, 0), (255, 255, 255), (1, 128, 254)], ids=str)
+def test_the_background_is_exact(color: tuple[int, int, int], shown: SailenvTarget) -> None:
+    image = picture(shown, boxes(), Camera(0.5, 20, 10), background=color)
+    assert (image[:10] == color).all()
+    assert (image != color).any()
+
+
+def test_equal_noise_numbers_give_equal_bytes(engine: str, shown: SailenvTarget) -> None:
+    first, again, other = (picture(shown, boxes(), Camera(0.3, 40, 30), Light(20, 40), noise=n) for n in (1, 1, 2))
+    assert (first == again).all()
+    assert (first != other).any() == (engine in RANDOM)
+    assert np.abs(first - other).mean() < 5
+
+
+def test_several_objects_and_a_point_light_are_drawn_as_by_pyrender(engine: str, running: dict[str, Worker]) -> None:
+    images = []
+    for name in ("pyrender", engine):
+        with closing(Wire(running[name].address, size=(60, 80))) as wire:
+            wire.ask("set_ambient_light_color", color=(60, 60, 60))
+            wire.ask("set_light_intensity", light="Main Light", intensity=0.3)
+            for x in (-0.12, 0.12):
+                wire.spawn(boxes(((0, 0, 0), (0.05, 0.05, 0.05))), position=(x, 0.0, 0.0), rotation=(20.0, 30.0, 0.0))
+            wire.look(Camera(0.45, 0, 15))
+            images.append(wire.picture().astype(float))
+            wire.ask("change_scene", scene="room_01/scene")
+            for light in ("Main Light", "Rim Light"):
+                wire.ask("set_light_intensity", light=light, intensity=0.0)
+            wire.ask("set_ambient_light_color", color=(0, 0, 0))
+            wire.ask("set_light_color", light="Ceiling Light", color=(255, 60, 60))
+            wire.ask("set_light_position", light="Ceiling Light", position=(0.0, 1.8, 0.2))
+            images.append(wire.picture().astype(float))
+    for ours, theirs in ((images[0], images[2]), (images[1], images[3])):
+        assert np.corrcoef(ours.ravel(), theirs.ravel())[0, 1] > 0.9
+    assert images[3][..., 0].mean() > images[3][..., 1].mean() + 5
+
+
+@pytest.mark.parametrize(
+    ("point", "layers"),
+    [
+        pytest.param((0, 0, 0), [GLASS, CANDLE], id="a pane before the candle"),
+        pytest.param((0, 0.2, 0), [BEHIND], id="the hole of the lattice"),
+        pytest.param((0.08, 0.2, 0), [LATTICE], id="the lattice"),
+        pytest.param((0.15, 0, 0), [FLAG], id="the flag"),
+    ],
+)
+def test_surfaces_show_what_is_behind_them(
+    point: tuple[float, float, float], layers: list[tuple[int, int, int]], shown: SailenvTarget
+) -> None:
+    camera, size = Camera(0.8, 0, 0), (160, 160)
+    image = picture(shown, read_object(lantern(opacity=0.4), name="lantern.glb").obj, camera, size=size)
+    column, row = np.rint(on_screen(camera, np.array(point), size)).astype(int)
+    color = image[row - 1 : row + 2, column - 1 : column + 2].mean(axis=(0, 1))
+    front, *behind = (np.array(layer, float) for layer in layers)
+    expected = 0.4 * front + 0.6 * behind[0] if behind else front
+    assert np.abs(color - expected).max() < 60
+
+
+@pytest.mark.parametrize(("normal", "light"), [((218, 128, 218), (60, 0)), ((128, 218, 218), (0, 60))], ids=["x", "y"])
+def test_a_normal_map_turns_the_surface_to_the_light(
+    normal: tuple[int, int, int], light: tuple[int, int], engine: str, shown: SailenvTarget
+) -> None:
+    if engine == "panda3d":
+        pytest.xfail("normal maps are left out (docs/engines.md)")
+    gray = {"front": plain(128, 128, 128)}
+    bumpy, flat = (boxes(textures=gray, maps={"normal": plain(*each)}) for each in (normal, (128, 128, 255)))
+    towards, away = Light(*light, 0.8, 0.0), Light(-light[0], -light[1], 0.8, 0.0)
+    images = [picture(shown, bumpy, Camera(0.3, 0, 0), towards), picture(shown, flat, Camera(0.3, 0, 0), towards)]
+    images.append(picture(shown, bumpy, Camera(0.3, 0, 0), away))
+    turned, straight, averted = (image[28:32, 38:42].mean() for image in images)
+    assert turned > straight + 10 > averted + 20
+
+
+def test_each_engine_tells_who_it_is(engine: str, running: dict[str, Worker], shown: SailenvTarget) -> None:
+    info = shown.engine
+    assert info.name == engine
+    assert info.version[0].isdigit()
+    assert info.deterministic == (engine not in RANDOM)
+    assert all(each in info.settings for each in SETTINGS.get(engine, []))
+
+
+def test_a_renderer_without_our_extensions_is_sailenv(plain_worker: tuple[str, int]) -> None:
+    with closing(SailenvTarget(*plain_worker)) as target:
+        assert target.engine == SAILENV
+
+
+def test_an_engine_of_ones_own_has_its_name_its_options_and_the_noise() -> None:
+    views = [View(Camera(0.3, 0, 0), noise=number) for number in (1, 1, 2, 2**31)]
+    worker = "--engine", OWN, "--set", "level=20", "--set", "spread=200"
+    with started(*worker) as running, closing(SailenvTarget(*running.address)) as target:
+        greys = target.render(boxes(), views, size=SIZE)[:, 0, 0, 0]
+        assert target.engine == EngineInfo(OWN, "7", "level=20, spread=200.0", deterministic=False)
+    assert greys[0] == greys[1]
+    assert len(set(greys.tolist())) == 3
+
+
+def test_the_documented_engine_runs(tmp_path: Path) -> None:
+    ((_, code),) = blocks("engines.md", "python")
+    (tmp_path / "points.py").write_text(code)
+    command = [sys.executable, "-m", "trompe_renderer", "--port", "0", "--engine", "points:Points", "--set", "size=3"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            port = int(process.stdout.readline().split(":")[1].split(",")[0])
+            with closing(SailenvTarget("127.0.0.1", port)) as target:
+                image = picture(target, boxes(((0.05, 0.04, 0), (0.02, 0.02, 0.02))), Camera(0.3, 0, 0))
+                assert str(target.engine) == "points:Points 1 (size=3)"
+        finally:
+            process.kill()
+    rows, columns = np.nonzero((image != BEHIND).any(axis=-1))
+    assert rows.max() < SIZE[0] / 2
+    assert columns.min() > SIZE[1] / 2
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "reason"),
+    [
+        pytest.param("unreal", {}, "There is no engine 'unreal'. Choose pyrender, three", id="an unknown engine"),
+        pytest.param("nowhere:Engine", {}, "cannot be imported.*PYTHONPATH", id="an unknown module"),
+        pytest.param("json:loads", {}, "not an engine", id="no engine"),
+        pytest.param(
+            "pyrender", {"mssa": "4"}, r"no option 'mssa'.*msaa \(1 to 32, default 4\)", id="an unknown option"
+        ),
+        pytest.param("pyrender", {"msaa": "0"}, "--set msaa: 0 is not in the range", id="out of range"),
+        pytest.param("pyrender", {"shadows": "perhaps"}, "--set shadows: 'perhaps' is not", id="no boolean"),
+        pytest.param(OWN, {"level": "much"}, r"--set level: 'much'.*spread \(float, default 50", id="by keyword"),
+        pytest.param("mitsuba", {"filter": "sinc"}, "--set filter: 'sinc' is not one of 'gaussian'", id="a choice"),
+    ],
+)
+def test_a_wrong_engine_or_option_is_refused(name: str, settings: dict[str, str], reason: str) -> None:
+    if name == "mitsuba":
+        pytest.importorskip("mitsuba", reason="NOT TESTED: pip install mitsuba")
+    with pytest.raises(RendererError, match=reason):
+        engine_maker(name, settings)
+
+
+def test_a_missing_package_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("playwright.sync_api", "trompe_renderer.engines.three", "trompe_renderer.engines.three.engine"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(RendererError, match=r"engine three cannot be imported.*pip install 'trompe\[three\]'"):
+        engine_maker("three", {})
+
+
+def test_a_picture_of_the_wrong_kind_is_refused() -> None:
+    refused = pytest.raises(RendererError, match=r"Noisy gave float32 \(60, 80, 3\); expected uint8")
+    with (
+        started("--engine", OWN, "--set", "wrong=yes") as worker,
+        closing(SailenvTarget(*worker.address)) as target,
+        refused,
+    ):
+        picture(target, boxes(), Camera(0.3, 0, 0))
+
+
+def children(process: int) -> list[int]:
+    """All descendants of a process."""
+    listed = subprocess.run(["ps", "-eo", "pid=,ppid="], capture_output=True, text=True, check=True).stdout
+    pairs = [line.split() for line in listed.splitlines()]
+    found = [process]
+    for parent in found:
+        found += [int(child) for child, of in pairs if int(of) == parent]
+    return found[1:]
+
+
+@pytest.mark.parametrize("name", ["three", "cycles"])
+def test_a_worker_ends_with_the_process_of_its_engine(name: str, tmp_path: Path) -> None:
+    with (tmp_path / "log").open("w+") as log, started(*options_of(name), log=log) as worker:
+        with closing(SailenvTarget(*worker.address, timeout=60)) as target:
+            picture(target, boxes(), Camera(0.3, 0, 0))
+            for child in children(worker.process.pid):
+                os.kill(child, signal.SIGKILL)
+            with pytest.raises(RendererError):
+                picture(target, boxes(), Camera(0.3, 0, 0))
+        assert worker.process.wait(60) == os.EX_TEMPFAIL
+        log.seek(0)
+        assert "The engine is lost" in log.read()
+
+
+@pytest.mark.parametrize("name", ["three", "cycles"])
+def test_the_process_of_an_engine_ends_with_its_worker(name: str) -> None:
+    with started(*options_of(name)) as worker:
+        with closing(SailenvTarget(*worker.address, timeout=60)) as target:
+            picture(target, boxes(), Camera(0.3, 0, 0))
+        left = children(worker.process.pid)
+        assert left
+        worker.process.kill()
+        deadline = time.monotonic() + 30
+        while any(Path(f"/proc/{pid}/exe").exists() for pid in left):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)

@@ -1,0 +1,140 @@
+"""``trompe serve`` as a real process, for every test that needs one."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final, Self
+
+import httpx
+
+from trompe_server.queue.store import JobStore
+from trompe_server.settings import Settings
+from trompe_shared.api import Job, JobRequest
+
+CHILD: Final = [sys.executable, "-m", "trompe_server.system.child"]
+FAKE: Final = {
+    "TROMPE_PIPELINE": "tests.fake_job:open_job",
+    "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]),
+}
+"""Environment in which workers run fake jobs."""
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port: int = free.getsockname()[1]
+        return port
+
+
+def wait_until(
+    condition: Callable[[], Any], *, seconds: float = 60.0, pause: float = 0.02, story: Callable[[], str] = str
+) -> Any:
+    """Wait for ``condition``, checked every ``pause`` seconds; return its value. Fails after ``seconds``."""
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f"timeout after {seconds:.0f} s\n{story()}"
+        time.sleep(pause)
+    return value
+
+
+class Queue:
+    """The API's side of a queue of fake jobs: their record and their folders."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings, self.store = settings, JobStore(settings.database_url)
+
+    def submit(self, label: str, **options: Any) -> str:
+        """Queue a fake job, whose label the API would refuse. Returns its id."""
+        return self.store.create(JobRequest.of("mug", label=label, **options))[0].id
+
+    def state(self, job: str) -> Job:
+        return self.store.get(job)
+
+    def in_gate(self, job: str) -> bool:
+        found = self.store.get(job)
+        return found.state == "running" and found.progress.phase == "attack-001"
+
+    def open_gate(self, job: str) -> None:
+        (self.folder(job) / "go").touch()
+
+    def folder(self, job: str) -> Path:
+        return Path(self.settings.store_url) / "jobs" / job
+
+
+class Served(Queue):
+    """``trompe serve`` on the folder ``data``; a context manager. Its messages go to ``log``.
+
+    It takes a free port, and the same one after a restart.
+    """
+
+    def __init__(self, data: Path, *options: str, environment: Mapping[str, str] = FAKE) -> None:
+        super().__init__(Settings(data=data))
+        self.data, self.log, self.port = data, data.parent / f"{data.name}.log", 0
+        self._options, self._environment = options, os.environ | environment
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def start(self) -> Self:
+        """Start it and wait until it serves."""
+        command = [*CHILD, "serve", "--port", str(self.port), "--data", str(self.data), *self._options]
+        self.data.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("ab") as log:
+            pipe = subprocess.PIPE
+            self.process = subprocess.Popen(
+                command, stdin=pipe, stdout=pipe, stderr=log, text=True, env=self._environment
+            )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line.startswith("trompe serving on http://127.0.0.1:"), self.log.read_text()
+        self.port = int(line.rpartition(":")[2])
+        self.http = self.client_of()
+        return self
+
+    def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """End it and return its exit status."""
+        self.http.close()
+        self.process.send_signal(number)
+        status = self.process.wait(60)
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe is not None
+            pipe.close()
+        return status
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.stop()
+        self.store.close()
+
+    def client_of(self, secret: str | None = None) -> httpx.Client:
+        """An HTTP client, with a token or without."""
+        headers = {"Authorization": f"Bearer {secret}"} if secret else {}
+        limits = httpx.Limits(max_connections=None)
+        return httpx.Client(base_url=self.url, headers=headers, timeout=60, limits=limits, trust_env=False)
+
+    def get(self, path: str) -> Any:
+        return self.http.get(path).raise_for_status().json()
+
+    def children(self) -> dict[str, int]:
+        """Process ids of the supervised children, by command."""
+        found = {}
+        for entry in Path("/proc").iterdir():
+            if entry.name.isdecimal() and self.process.pid == parent(int(entry.name)):
+                words = (entry / "cmdline").read_text().split("\0")
+                if CHILD[-1] in words:
+                    found[words[words.index(CHILD[-1]) + 1]] = int(entry.name)
+        return found
+
+
+def parent(pid: int) -> int | None:
+    try:
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+    except (FileNotFoundError, ProcessLookupError):
+        return None

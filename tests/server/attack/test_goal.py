@@ -1,0 +1,207 @@
+"""The goal: each loss against its formula, and extreme logits."""
+
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.nn.functional import cross_entropy
+
+from trompe_server.attack import Goal
+from trompe_server.attack.goal import SAFE_MARGIN
+from trompe_shared.errors import SpecError
+
+CLASSES = 5
+LOGITS = st.lists(st.lists(st.floats(-50, 50, width=32), min_size=5, max_size=5), min_size=1, max_size=6)
+LOSSES = ("margin", "cross_entropy")
+GOALS = [
+    pytest.param({}, id="untargeted"),
+    pytest.param({"target": 3}, id="targeted"),
+    pytest.param({"top_k": 3}, id="top-3"),
+    pytest.param({"label": (0, 2)}, id="several classes"),
+    pytest.param({"label": (0, 2), "top_k": 3}, id="several classes, top-3"),
+]
+SETS = st.permutations(range(5)).flatmap(lambda order: st.integers(1, 4).map(lambda n: tuple(order[:n])))
+"""Some of the five classes, but not all."""
+
+
+@given(LOGITS, st.integers(0, 4))
+@settings(max_examples=100)
+def test_the_margin_is_the_best_other_logit_minus_the_true_one(rows: list[list[float]], label: int) -> None:
+    goal, logits = Goal(label), torch.tensor(rows)
+    others = [max(row[:label] + row[label + 1 :]) for row in rows]
+    margins = torch.tensor([other - row[label] for other, row in zip(others, rows, strict=True)])
+    torch.testing.assert_close(goal.margins(logits), margins)
+    torch.testing.assert_close(goal.losses(logits), margins.clamp(max=SAFE_MARGIN))
+    torch.testing.assert_close(goal.losses(logits, clamped=False), margins)
+    assert goal.reached(logits)[margins > 0].all()
+    assert not goal.reached(logits)[margins < 0].any()
+    assert torch.equal(logits, torch.tensor(rows))
+
+
+@given(LOGITS, st.integers(0, 3))
+@settings(max_examples=100)
+def test_a_targeted_goal_is_reached_where_the_target_is_the_best_class(rows: list[list[float]], target: int) -> None:
+    goal, logits = Goal(4, target=target), torch.tensor(rows)
+    margins = goal.margins(logits)
+    for row, margin, reached in zip(rows, margins, goal.reached(logits), strict=True):
+        assert float(margin) == pytest.approx(row[target] - max(row[:target] + row[target + 1 :]), abs=1e-5)
+        assert bool(reached) == (row.index(max(row)) == target)
+
+
+@given(LOGITS, st.integers(0, 4), st.integers(1, 4))
+@settings(max_examples=100)
+def test_a_top_k_goal_is_reached_where_k_classes_beat_the_true_one(rows: list[list[float]], label: int, k: int) -> None:
+    goal, logits = Goal(label, top_k=k), torch.tensor(rows)
+    for row, margin, reached in zip(rows, goal.margins(logits), goal.reached(logits), strict=True):
+        kth = sorted(row[:label] + row[label + 1 :], reverse=True)[k - 1]
+        assert float(margin) == pytest.approx(kth - row[label], abs=1e-5)
+        assert bool(reached) is (margin > 0).item() or margin == 0
+
+
+@given(LOGITS, SETS, st.integers(1, 4))
+@settings(max_examples=100)
+def test_each_class_of_a_set_counts_as_the_object(rows: list[list[float]], labels: tuple[int, ...], k: int) -> None:
+    k = min(k, CLASSES - len(labels))
+    goal, logits = Goal(labels, top_k=k), torch.tensor(rows)
+    for row, margin, reached in zip(rows, goal.margins(logits), goal.reached(logits), strict=True):
+        best, others = max(row[label] for label in labels), [x for j, x in enumerate(row) if j not in labels]
+        assert float(margin) == pytest.approx(sorted(others, reverse=True)[k - 1] - best, abs=1e-5)
+        assert bool(reached) is (margin > 0).item() or margin == 0
+    shares = logits.softmax(1)[:, list(labels)].sum(1)
+    torch.testing.assert_close((-Goal(labels, loss="cross_entropy").losses(logits)).exp(), shares, atol=1e-6, rtol=1e-4)
+
+
+@given(LOGITS, SETS)
+@settings(max_examples=100)
+def test_one_class_more_in_the_set_never_helps_the_attack(rows: list[list[float]], labels: tuple[int, ...]) -> None:
+    logits, fewer = torch.tensor(rows), labels[:-1] or labels
+    assert not (Goal(labels).reached(logits) & ~Goal(fewer).reached(logits)).any()
+    assert (Goal(labels).margins(logits) <= Goal(fewer).margins(logits)).all()
+    entropies = [Goal(some, loss="cross_entropy").losses(logits) for some in (labels, fewer)]
+    assert (entropies[0] <= entropies[1] + 1e-5).all()
+
+
+@given(LOGITS, st.integers(0, 4), st.sampled_from(LOSSES))
+@settings(max_examples=100)
+def test_a_set_of_one_class_gives_the_bytes_of_the_textbook_formula(
+    rows: list[list[float]], label: int, loss: Any
+) -> None:
+    leaf, same = (torch.tensor(rows).requires_grad_() for _ in range(2))
+    losses = Goal((label,), loss=loss).losses(leaf, clamped=False)
+    others = same.clone()
+    others[:, label] = -torch.inf
+    wanted = {
+        "margin": lambda: others.topk(1, dim=1).values[:, -1] - same[:, label],
+        "cross_entropy": lambda: cross_entropy(same, torch.full((len(rows),), label), reduction="none"),
+    }[loss]()
+    assert torch.equal(losses, wanted)
+    assert torch.equal(*(torch.autograd.grad(each.sum(), x)[0] for each, x in ((losses, leaf), (wanted, same))))
+
+
+def test_cross_entropy_is_that_of_the_class_one_leaves_or_minus_that_of_the_target() -> None:
+    logits = torch.tensor([[1.0, 2.0, 0.0, -1.0, 0.5], [30.0, -30.0, 0.0, 0.0, 0.0]])
+    log_shares = logits.log_softmax(1)
+    torch.testing.assert_close(Goal(1, loss="cross_entropy").losses(logits), -log_shares[:, 1])
+    torch.testing.assert_close(Goal(1, target=0, loss="cross_entropy").losses(logits), log_shares[:, 0])
+
+
+@pytest.mark.parametrize("options", GOALS)
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_small_step_along_the_gradient_raises_the_loss(loss: Any, options: dict[str, Any]) -> None:
+    goal, logits = Goal(**{"label": 0, "loss": loss} | options), torch.tensor([[4.0, 1.0, 2.5, -1.0, 0.0]])
+    leaf = logits.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(goal.losses(leaf).sum(), leaf)
+    assert goal.losses(logits + 1e-3 * gradient.sign()) > goal.losses(logits)
+
+
+EXTREME = [
+    [0.0, 9.0, 1.0, 2.0, 3.0],
+    [9.0, 0.0, 1.0, 2.0, 3.0],
+    [9.0, -9.0, 1.0, 2.0, 3.0],
+    [0.0] * 5,
+    [9.0, 9.0, 9.0, 9.0, 0.0],
+]
+
+
+@pytest.mark.parametrize("size", [1.0, 1e4, 1e30])
+@pytest.mark.parametrize("options", GOALS)
+@pytest.mark.parametrize("loss", LOSSES)
+def test_saturated_and_equal_logits_give_finite_losses_and_gradients(
+    loss: Any, options: dict[str, Any], size: float
+) -> None:
+    check_finite(Goal(**{"label": 0, "loss": loss} | options), torch.tensor(EXTREME) * size)
+
+
+@pytest.mark.parametrize("options", GOALS)
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("odd", [torch.inf, -torch.inf, torch.nan])
+def test_logits_that_are_not_finite_give_finite_losses_and_gradients(
+    odd: float, loss: Any, options: dict[str, Any]
+) -> None:
+    goal = Goal(**{"label": 0, "loss": loss} | options)
+    for count in range(1, CLASSES + 1):
+        logits = torch.tensor(EXTREME)
+        logits[:, :count] = odd
+        check_finite(goal, logits)
+        check_finite(goal, logits.flip(1))
+
+
+def check_finite(goal: Goal, logits: Tensor) -> None:
+    leaf = logits.clone().requires_grad_()
+    losses = goal.losses(leaf)
+    (gradient,) = torch.autograd.grad(losses.sum(), leaf)
+    assert torch.isfinite(losses).all()
+    assert torch.isfinite(gradient).all()
+    assert torch.isfinite(goal.margins(logits)).all()
+
+
+def test_only_a_margin_that_is_safe_settles_a_view_and_its_gradient_is_zero() -> None:
+    logits = torch.tensor([[0.0, SAFE_MARGIN + 0.1, 0, 0, 0], [0.0, SAFE_MARGIN - 0.1, 0, 0, 0]])
+    assert Goal(0).settled(logits).tolist() == [True, False]
+    assert not Goal(0, loss="cross_entropy").settled(logits * 100).any()
+    leaf = logits.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(Goal(0).losses(leaf).sum(), leaf)
+    assert gradient.any(1).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        pytest.param({"target": 2}, "the object's own class", id="the target is the true class"),
+        pytest.param(
+            {"label": (1, 4), "target": 4}, "the object's own class", id="the target is one of the true classes"
+        ),
+        pytest.param({"top_k": 0}, "at least 1", id="no best class"),
+        pytest.param({"target": 1, "top_k": 2}, "use one of the two", id="towards one class and away from many"),
+        pytest.param({"loss": "hinge"}, "margin, cross_entropy", id="an unknown loss"),
+    ],
+)
+def test_a_goal_that_contradicts_itself_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        Goal(**{"label": 2} | options)
+
+
+@pytest.mark.parametrize(
+    ("goal", "n_classes", "message"),
+    [
+        pytest.param(Goal(5), 5, "label 5 .* 5 classes", id="no such class"),
+        pytest.param(Goal(-1), 5, "label -1", id="a negative class"),
+        pytest.param(Goal(0, target=5), 5, "target class 5", id="no such target"),
+        pytest.param(Goal(0, top_k=5), 5, "other than the object's, 4; got 5", id="every class is among the best"),
+        pytest.param(Goal((0, 1), top_k=4), 5, "other than the object's, 3; got 4", id="every other class is"),
+        pytest.param(Goal((0, 3, 0)), 5, "0 and 0 are the same class, 0", id="a class twice"),
+        pytest.param(Goal((2, 0, 1)), 3, "3 of the classifier's 3 classes", id="no other class"),
+        pytest.param(Goal(()), 3, "0 of the classifier's 3 classes", id="no class"),
+    ],
+)
+def test_a_goal_that_the_classifier_cannot_have_is_refused(goal: Goal, n_classes: int, message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        goal.check(n_classes)
+
+
+def test_a_goal_that_the_classifier_can_have_is_accepted() -> None:
+    for goal in (Goal(4), Goal(0, target=4), Goal(0, top_k=4), Goal((3, 1), top_k=3)):
+        goal.check(5)

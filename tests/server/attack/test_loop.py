@@ -1,0 +1,465 @@
+"""The attack loop on a small scene: ascent, budget, resumption, skipped views, safe margin, odd classifiers."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from torch import Tensor
+
+from tests.attack_runs import (
+    EPS,
+    LABEL,
+    SIZE,
+    SMALL,
+    fooled_classifier,
+    objective_of,
+    run,
+    same,
+    steps_of,
+    surrogate_of,
+)
+from tests.fakes import fake_classifier
+from trompe_server.attack import (
+    AttackState,
+    Backgrounds,
+    Budget,
+    Goal,
+    Step,
+    ViewDistribution,
+    attack,
+    grid_views,
+    load_state,
+    movable,
+    save_state,
+    start,
+)
+from trompe_server.attack.goal import SAFE_MARGIN
+from trompe_server.attack.search import RISE, SAFE_ENOUGH
+from trompe_server.classifiers import NetworkClassifier, load_classifier
+from trompe_server.judging.metrics import accuracy, texels_altered
+from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
+from trompe_shared.errors import SpecError
+from trompe_shared.geometry import Camera, View
+from trompe_shared.object3d import Object3D, load_object
+from trompe_shared.shipped import shipped_objects
+
+
+def test_the_attack_raises_the_margin_within_its_budget(square: Object3D, surrogate: Surrogate) -> None:
+    seen: list[Step] = []
+    state = run(square, surrogate, on_step=seen.append)
+    assert [step.step for step in seen] == list(range(6))
+    assert seen[-1].loss > seen[0].loss + 0.01
+    assert all(0 <= step.fooled <= 1 for step in seen)
+    assert state.step == 6
+    delta, texture = state.deltas["m0.png"], textures_of(square)["m0.png"]
+    assert 0.059 < delta.abs().max() <= 0.06 + EPS
+    assert (texture + delta).min() >= 0
+    assert (texture + delta).max() <= 1
+
+
+def test_a_step_reports_the_mean_over_all_views_before_it_moves(square: Object3D, surrogate: Surrogate) -> None:
+    (step,) = steps_of(square, surrogate, steps=1)
+    logits = fake_classifier().logits(surrogate.render_all(surrogate.texels(textures_of(square))))
+    assert step.loss == pytest.approx(float(Goal(LABEL).losses(logits).mean()), abs=1e-4)
+    assert step.fooled == float(Goal(LABEL).reached(logits).float().mean())
+
+
+def test_a_step_goes_along_the_sign_of_the_mean_gradient(square: Object3D, surrogate: Surrogate) -> None:
+    leaf = textures_of(square)["m0.png"].requires_grad_()
+    texels = surrogate.texels(textures_of(square) | {"m0.png": leaf})
+    logits = fake_classifier().logits(surrogate.render_all(texels))
+    (gradient,) = torch.autograd.grad(Goal(LABEL).losses(logits).mean(), leaf)
+    clear = gradient.abs() > 1e-6
+    delta = run(square, surrogate, steps=1).deltas["m0.png"]
+    assert clear.float().mean() > 0.5
+    torch.testing.assert_close(delta[clear], 0.02 * gradient.sign()[clear], atol=EPS, rtol=0)
+
+
+def test_unseen_texels_do_not_move(square: Object3D, surrogate: Surrogate) -> None:
+    assert (run(square, surrogate).deltas["m1.png"] == 0).all()
+
+
+def test_a_search_can_begin_at_a_known_change(square: Object3D, surrogate: Surrogate) -> None:
+    known = run(square, surrogate, steps=4)
+    again = run(square, surrogate, steps=1, state=AttackState(0, known.deltas), budget=Budget(0.06, 1e-4))
+    assert (again.deltas["m0.png"] - known.deltas["m0.png"]).abs().max() <= 1e-4 + EPS
+
+
+# Saliency masks
+
+
+def test_with_masks_only_texels_of_masked_pixels_move(square: Object3D, surrogate: Surrogate) -> None:
+    masks = torch.zeros(surrogate.n_views, *SIZE, dtype=torch.bool)
+    masks[:4, 12:18, 12:18] = True
+    moved = (run(square, surrogate, masks=masks).deltas["m0.png"] != 0).any(dim=2)
+    read = surrogate.influence(masks)["m0.png"] > 0
+    assert moved.any()
+    assert not moved[~read].any()
+    assert moved.sum() < (run(square, surrogate).deltas["m0.png"] != 0).any(dim=2).sum()
+
+
+class Askew(torch.nn.Module):
+    """Class 1 grows with the brightness of a small part of the image (by ``gain``), and falls with that of the rest."""
+
+    def __init__(self, rows: slice, columns: slice, *, gain: float, offset: float = 0.0) -> None:
+        super().__init__()
+        weights = torch.full((1, 1, *SIZE), -0.003)
+        weights[..., rows, columns] = gain
+        self.weights, self.offset = torch.nn.Parameter(weights), offset
+
+    def forward(self, images: Tensor) -> Tensor:
+        logit = (images * self.weights).sum((1, 2, 3)) + self.offset
+        return torch.stack([torch.zeros_like(logit), logit], 1)
+
+
+@pytest.mark.parametrize("gain", [0.001, 0.004], ids=["the loss falls", "the loss rises and a view is lost"])
+def test_a_masked_attack_never_ends_below_the_unpainted_object(
+    square: Object3D, surrogate: Surrogate, gain: float
+) -> None:
+    """The unmasked pixels pull their texels up; other views of the same texels lose by it."""
+    rows, columns = slice(12, 18), slice(20, 26)
+    masks = torch.zeros(surrogate.n_views, *SIZE, dtype=torch.bool)
+    masks[0, rows, columns] = True
+    textures = textures_of(square)
+
+    def askew(offset: float) -> NetworkClassifier:
+        return NetworkClassifier("askew", Askew(rows, columns, gain=gain, offset=offset), SIZE, 2)
+
+    def logits(change: Tensor) -> Tensor:
+        painted = textures | {"m0.png": textures["m0.png"] + change}
+        return askew(0.0).logits(surrogate.render_all(surrogate.texels(painted)))[:, 1]
+
+    pulled = 0.06 * movable(surrogate, Budget(0.06, 0.02), masks)["m0.png"][..., None]
+    before, after = logits(torch.zeros_like(textures["m0.png"])), logits(pulled)
+    barely_fooled = askew(1e-4 - float(before[after < before - 1e-3].max()))
+    seen: list[Step] = []
+    state = run(square, surrogate, classifier=barely_fooled, goal=Goal(0), masks=masks, on_step=seen.append)
+
+    objective = objective_of(square, surrogate, barely_fooled, goal=Goal(0))
+    unpainted = objective.score(torch.zeros_like(objective.source))
+    assert min((step.fooled, step.loss) for step in seen) < (unpainted.fooled - 0.01, 0)
+    assert (max(step.loss for step in seen) > unpainted.loss + 1e-3) == (gain == 0.004)
+    assert objective.score(objective.join(state.deltas)) >= unpainted
+    assert seen[-1].evaluations == (6 + 2) * surrogate.n_views
+
+
+def test_movable_texels_change_the_views_by_four_levels(square: Object3D, surrogate: Surrogate) -> None:
+    small, large = movable(surrogate, Budget(0.004, 0.004)), movable(surrogate, Budget(1.0, 0.1))
+    influence = surrogate.influence()
+    for name in square.textures:
+        assert torch.equal(large[name], influence[name] * surrogate.footprint[name] >= 4 / 255)
+        assert not (small[name] & ~large[name]).any()
+    assert not large["m1.png"].any()
+
+
+@pytest.mark.parametrize("epsilon", [0.01, 0.02, 0.05])
+def test_the_same_part_of_a_picture_is_movable_at_any_resolution(epsilon: float) -> None:
+    """At 32 x 32 pixels even the coarsest of these textures is finer than the pixels."""
+    mug, budget, chosen = load_object(shipped_objects()["mug"].path), Budget(epsilon, epsilon), []
+    views = [View(Camera(0.157, azimuth, 20)) for azimuth in (-30, 0, 30)]
+    for side in (128, 256, 1024):
+        fine = mug.with_textures({name: np.full((side, side, 3), 128, np.uint8) for name in mug.textures})
+        mask = torch.stack(list(movable(surrogate_of(fine, views), budget).values()))
+        chosen.append(torch.nn.functional.avg_pool2d(mask.float(), side // 128))
+    assert 0.05 < chosen[0].mean() < 0.95
+    for finer in chosen[1:]:
+        assert (finer - chosen[0]).abs().mean() < 0.02
+
+
+def test_a_picture_stored_at_four_sizes_is_attacked_alike() -> None:
+    mug, tiny = shipped_objects()["mug"], load_classifier("tiny")
+    assert isinstance(tiny, NetworkClassifier)
+    obj, label = load_object(mug.path), (tiny.classes or ()).index(mug.label)
+    cameras = ViewDistribution(mug.distance, mug.elevation)
+    sets = [cameras.sample(12, generator=np.random.default_rng(seed)) for seed in (0, 1)]
+    drops, altered = [], []
+    for side in (256, 512, 1024, 2048):
+        stored = {name: Image.fromarray(image).resize((side, side)) for name, image in obj.textures.items()}
+        sized = obj.with_textures({name: np.array(image) for name, image in stored.items()})
+        own, unseen = (surrogate_of(sized, views, size=tiny.image_size) for views in sets)
+        budget, textures = Budget(0.05, 0.01), textures_of(sized)
+        state = attack(start(textures), textures, own, tiny, goal=Goal(label), budget=budget, steps=6)
+        painted = budget.repaint(sized, state.deltas)
+        pairs = [(tiny.predict(each.images(sized)), tiny.predict(each.images(painted))) for each in (own, unseen)]
+        drops.append([accuracy(before, after, label).a_drop or 0.0 for before, after in pairs])
+        altered.append(texels_altered(sized.textures, painted.textures))
+    assert min(drops[0]) > 0.1
+    assert np.ptp(drops, axis=0).max() <= 1 / 12 + 1e-6  # one view
+    assert max(altered) - min(altered) < 0.01
+
+
+def test_an_attack_without_a_visible_texel_ends_at_once(square: Object3D, surrogate: Surrogate) -> None:
+    with pytest.raises(SpecError, match=r"epsilon=0.0001. Come closer by `distance`, or raise `epsilon`"):
+        run(square, surrogate, budget=Budget(0.0001, 0.0001))
+
+
+# The pool: each step evaluates some of the views
+
+
+def pool(n: int, *, seed: int) -> list[View]:
+    generator = np.random.default_rng(seed)
+    return ViewDistribution(2, (0, 40), backgrounds=((0, 0, 0),)).sample(n, generator=generator)
+
+
+@pytest.fixture(scope="module")
+def many_views(square: Object3D) -> Surrogate:
+    return surrogate_of(square, pool(30, seed=5))
+
+
+def losses(square: Object3D, surrogate: Surrogate, **options: Any) -> list[float]:
+    return [step.loss for step in steps_of(square, surrogate, steps=4, **options)]
+
+
+def test_each_step_draws_other_views(square: Object3D, many_views: Surrogate) -> None:
+    texels = many_views.texels(textures_of(square))
+    with torch.no_grad():
+        logits = [fake_classifier().logits(many_views.render(texels, batch)) for batch in range(3)]
+    first = losses(square, many_views, views_per_step=10)[0]
+    assert any(first == pytest.approx(float(Goal(LABEL).losses(some).mean()), abs=1e-4) for some in logits)
+    assert first != pytest.approx(losses(square, many_views)[0], abs=1e-6)
+
+
+def test_the_seed_decides_the_drawn_views(square: Object3D, many_views: Surrogate) -> None:
+    drawn = [losses(square, many_views, views_per_step=10, seed=seed) for seed in (1, 1, 2, 3)]
+    assert drawn[0] == drawn[1]
+    assert drawn[2:] != [drawn[0], drawn[0]]
+
+
+# Resumption
+
+PICTURES = torch.tensor([0, 255], dtype=torch.uint8)[:, None, None, None].expand(2, *SIZE, 3)
+RUNS: dict[str, dict[str, Any]] = {
+    "pgd": {"optimiser": "pgd"},
+    "nesterov": {"optimiser": "nesterov"},
+    "pool": {"views_per_step": 10},
+    "backgrounds": {"views_per_step": 10, "backgrounds": Backgrounds(PICTURES, [k % 2 for k in range(30)])},
+    "view budget": {"budget": Budget(0.3, 0.1, 0.02)},
+    "early end": {"classifier": fooled_classifier(), "budget": Budget(0.1, 0.1), "total_steps": 40},
+}
+
+
+@pytest.mark.parametrize("kind", RUNS)
+@given(share=st.floats(0.1, 0.9), seed=st.integers(0, 99))
+@SMALL
+def test_a_run_cut_anywhere_resumes_bit_for_bit(
+    kind: str, square: Object3D, surrogate: Surrogate, many_views: Surrogate, share: float, seed: int
+) -> None:
+    views = many_views if "views_per_step" in RUNS[kind] else surrogate
+    options: dict[str, Any] = {"seed": seed, "total_steps": 7} | RUNS[kind]
+    total, seen = options["total_steps"], list[Step]()
+    cut = max(1, round(share * total))
+    whole = run(square, views, steps=total, **options)
+    part = load_state(save_state(run(square, views, steps=cut, on_step=seen.append, **options)))
+    ended = run(square, views, steps=total - cut, state=part, on_step=seen.append, **options)
+    assert same(ended, whole)
+    assert [step.step for step in seen] == list(range(len(seen)))
+    assert (len(seen) == total) == (kind != "early end")
+
+
+def test_backgrounds_change_a_run(square: Object3D, many_views: Surrogate) -> None:
+    plain, drawn = (run(square, many_views, steps=5, **RUNS[kind]) for kind in ("pool", "backgrounds"))
+    assert save_state(plain) != save_state(drawn)
+
+
+# Odd classifiers
+
+
+class Broken(torch.nn.Module):
+    """Infinite or NaN logits, or a NaN gradient, for half of a batch or for all of it."""
+
+    def __init__(self, inner: torch.nn.Module, *, every: bool, where: str) -> None:
+        super().__init__()
+        self.inner, self.every, self.where = inner, every, where
+
+    def forward(self, images: Tensor) -> Tensor:
+        broken = torch.ones(len(images), 1, 1, 1, dtype=torch.bool)
+        broken[: 0 if self.every else len(images) // 2] = False
+        if self.where == "gradient":
+            root = torch.where(broken, images - images, 1.0).sqrt()  # its gradient is 0 times infinity where broken
+            return self.inner(images + torch.where(broken, root, 0.0))  # type: ignore[no-any-return]
+        odd = torch.inf if self.where == "inf" else torch.nan
+        return self.inner(images).masked_fill(broken[:, :, 0, 0], odd)  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("every", [False, True], ids=["some images", "all images"])
+@pytest.mark.parametrize("where", ["gradient", "inf", "nan"])
+@pytest.mark.parametrize("optimiser", ["pgd", "nesterov"])
+def test_a_failing_classifier_never_makes_nan_and_leaves_the_object_alone_if_it_fails_on_all_images(
+    optimiser: str, where: str, every: bool, square: Object3D, surrogate: Surrogate
+) -> None:
+    network = Broken(fake_classifier().network, every=every, where=where)
+    broken = NetworkClassifier("broken", network, SIZE, 10)
+    state = run(square, surrogate, classifier=broken, steps=3, budget=Budget(0.1, 0.03), optimiser=optimiser)
+    assert all(torch.isfinite(delta).all() for delta in state.deltas.values())
+    assert any((delta != 0).any() for delta in state.deltas.values()) == (not every)
+    assert every or (state.deltas["m0.png"] != 0).any()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        pytest.param({"optimiser": "sgd"}, "choose one of pgd, nesterov", id="unknown optimiser"),
+        pytest.param({"total_steps": 2}, "total_steps is 2", id="more steps than the total"),
+        pytest.param({"goal": Goal(10)}, "10 classes", id="unknown class"),
+        pytest.param({"classifier": []}, "No classifier", id="no classifier"),
+        pytest.param(
+            {"classifier": [fake_classifier(), fake_classifier(image_size=(48, 48))]},
+            r"\(48, 48\).*\(32, 32\)",
+            id="another image size",
+        ),
+        pytest.param({"masks": torch.zeros(12, *SIZE, dtype=torch.bool)}, "Lower `tau`", id="empty masks"),
+    ],
+)
+def test_contradictions_are_refused_before_any_work(
+    options: dict[str, Any], message: str, square: Object3D, surrogate: Surrogate
+) -> None:
+    seen: list[Step] = []
+    with pytest.raises(SpecError, match=message):
+        run(square, surrogate, steps=3, on_step=seen.append, **options)
+    assert seen == []
+
+
+# Several classifiers
+
+
+def test_the_loss_of_several_classifiers_is_their_mean(square: Object3D, surrogate: Surrogate) -> None:
+    one, other = fake_classifier(seed=0), fake_classifier(seed=1)
+    found = [
+        objective_of(square, surrogate, *members).evaluate(
+            torch.zeros(512, 3), [0, 1], torch.ones(12, dtype=torch.bool)
+        )
+        for members in ((one,), (other,), (one, other))
+    ]
+    assert found[2].loss == pytest.approx((found[0].loss + found[1].loss) / 2, abs=1e-5)
+    mean = (found[0].gradient + found[1].gradient) / 2
+    torch.testing.assert_close(found[2].gradient, mean, atol=1e-6, rtol=1e-4)
+    assert found[2].fooled <= min(found[0].fooled, found[1].fooled)
+    assert found[2].images == found[0].images == 12
+
+
+def test_a_view_is_fooled_when_every_classifier_is(square: Object3D, surrogate: Surrogate) -> None:
+    members = [fake_classifier(seed=0), fake_classifier(seed=1)]
+    (step,) = steps_of(square, surrogate, classifier=members, budget=Budget(0.1, 0.1), steps=1)
+    with torch.no_grad():
+        images = surrogate.render_all(surrogate.texels(textures_of(square)))
+        reached = [Goal(LABEL).reached(member.logits(images)) for member in members]
+    assert reached[0].tolist() != reached[1].tolist()
+    assert step.fooled == float((reached[0] & reached[1]).float().mean())
+
+
+# Views: their order, and the skipped ones
+
+
+@given(seed=st.integers(0, 99))
+@SMALL
+def test_the_order_of_the_views_does_not_matter_beyond_rounding(square: Object3D, seed: int) -> None:
+    views = pool(13, seed=1)
+    shuffled = [views[index] for index in np.random.default_rng(seed).permutation(len(views))]
+    found = [
+        objective_of(square, surrogate_of(square, some)).evaluate(
+            torch.zeros(512, 3), [0, 1], torch.ones(13, dtype=torch.bool)
+        )
+        for some in (views, shuffled)
+    ]
+    assert found[0].loss == pytest.approx(found[1].loss, abs=1e-5)
+    assert found[0].fooled == found[1].fooled
+    torch.testing.assert_close(found[0].gradient, found[1].gradient, atol=1e-5, rtol=1e-3)
+
+
+def test_only_active_views_are_evaluated(square: Object3D, surrogate: Surrogate) -> None:
+    objective = objective_of(square, surrogate)
+    active = torch.zeros(12, dtype=torch.bool)
+    active[[1, 4, 11]] = True
+    change = torch.zeros(512, 3)
+    some, rest = (objective.evaluate(change, [0, 1], which) for which in (active, ~active))
+    everything = objective.evaluate(change, [0, 1], active | True)
+    assert (some.images, rest.images) == (3, 9)
+    torch.testing.assert_close(some.gradient + rest.gradient, everything.gradient, atol=1e-5, rtol=1e-3)
+    total = some.loss * 12 - 9 * SAFE_MARGIN + rest.loss * 12 - 3 * SAFE_MARGIN
+    assert total / 12 == pytest.approx(everything.loss, abs=1e-5)
+    none = objective.evaluate(change, [0, 1], torch.zeros(12, dtype=torch.bool))
+    assert (none.images, none.loss, none.fooled) == (0, SAFE_MARGIN, 1.0)
+    assert not none.gradient.any()
+
+
+# The safe margin, and the end of a search
+
+
+def fooled_run(obj: Object3D, surrogate: Surrogate, **options: Any) -> AttackState:
+    """A search on a classifier that is fooled from the beginning."""
+    return run(obj, surrogate, classifier=fooled_classifier(), **{"budget": Budget(0.1, 0.1)} | options)
+
+
+@pytest.mark.parametrize("optimiser", ["pgd", "nesterov"])
+def test_safely_won_views_are_skipped_for_two_steps_and_nothing_moves(
+    optimiser: str, square: Object3D, surrogate: Surrogate
+) -> None:
+    seen: list[Step] = []
+    state = fooled_run(square, surrogate, steps=5, optimiser=optimiser, on_step=seen.append)
+    assert [step.evaluations for step in seen] == [12, 12, 12, 24, 24]
+    assert [step.fooled for step in seen] == [1.0] * 5
+    assert [step.loss for step in seen] == pytest.approx([SAFE_MARGIN * RISE**step.step for step in seen])
+    assert all((delta == 0).all() for delta in state.deltas.values())
+
+
+def test_a_search_ends_once_all_views_are_safely_won(square: Object3D, surrogate: Surrogate) -> None:
+    seen: list[Step] = []
+    state = fooled_run(square, surrogate, steps=40, on_step=seen.append)
+    assert len(seen) == int(np.log(SAFE_ENOUGH / SAFE_MARGIN) / np.log(RISE)) + 1
+    assert [step.least_left for step in seen] == list(range(len(seen)))[::-1]
+    assert state.step == 40
+    assert all((delta == 0).all() for delta in state.deltas.values())
+
+
+def test_a_goal_with_an_unreachable_margin_runs_all_steps(square: Object3D, surrogate: Surrogate) -> None:
+    seen: list[Step] = []
+    state = fooled_run(square, surrogate, steps=40, goal=Goal(LABEL, safe=1000.0), on_step=seen.append)
+    assert [step.step for step in seen] == list(range(40))
+    assert all(90 < step.loss < 110 and step.fooled == 1 for step in seen)
+    assert [step.least_left for step in seen] == list(range(40))[::-1]
+    assert float(state.memory["search.safe"]) == 1000.0
+
+
+@pytest.mark.parametrize(
+    ("before", "steps", "after"),
+    [
+        pytest.param(SAFE_MARGIN, 4, SAFE_MARGIN, id="stays low while views are not won"),
+        pytest.param(3.0, 1, 3 / RISE, id="falls when views are lost again"),
+    ],
+)
+def test_the_margin_follows_the_views(
+    before: float, steps: int, after: float, square: Object3D, surrogate: Surrogate
+) -> None:
+    known = AttackState(0, start(textures_of(square)).deltas, {"search.safe": torch.tensor(before)})
+    seen: list[Step] = []
+    state = run(square, surrogate, steps=steps, state=known, budget=Budget(0.01, 0.001), on_step=seen.append)
+    assert float(state.memory["search.safe"]) == pytest.approx(after)
+    assert [step.least_left for step in seen] == [steps - step.step - 1 for step in seen]  # so few that none is spared
+
+
+# Without any server
+
+
+def test_a_few_lines_attack_a_shipped_object_without_a_server(tmp_path: Path) -> None:
+    entry, classifier = shipped_objects()["mug"], load_classifier("tiny")
+    assert isinstance(classifier, NetworkClassifier)
+    obj, label = load_object(entry.read()), (classifier.classes or ()).index(entry.label)
+    views = grid_views(
+        distance=entry.distance, elevation=entry.elevation, azimuths=3, elevations=1, background=(255,) * 3
+    )
+    geometry = prepare_geometry(obj, views, size=classifier.image_size, sampling=SamplingModel())
+    surrogate = diffuse_surrogate(geometry, views)
+    textures, budget, seen = textures_of(obj), Budget(epsilon=0.2, alpha=0.05), list[Step]()
+    state = attack(
+        start(textures), textures, surrogate, classifier, goal=Goal(label), budget=budget, steps=4, on_step=seen.append
+    )
+    (tmp_path / "adversarial.zip").write_bytes(budget.repaint(obj, state.deltas).to_zip())
+    again = load_object(tmp_path / "adversarial.zip")
+    change = np.abs(again.textures[min(again.textures)].astype(int) - obj.textures[min(obj.textures)])
+    assert seen[-1].loss > seen[0].loss
+    assert 0 < change.max() <= 51

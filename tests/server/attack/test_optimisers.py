@@ -1,0 +1,102 @@
+"""The update rules, each on a small scene and against its formula."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.attack_runs import EPS, SMALL, mean_loss, random_state, run, steps_of
+from trompe_server.attack import AttackState, Budget, save_state, start
+from trompe_server.attack.optimiser import OPTIMISERS, ROUND, step_factor
+from trompe_server.surrogate import Surrogate, textures_of
+from trompe_shared.object3d import Object3D
+
+every_optimiser = pytest.mark.parametrize("optimiser", OPTIMISERS)
+
+
+@every_optimiser
+def test_every_optimiser_raises_the_loss(optimiser: str, square: Object3D, surrogate: Surrogate) -> None:
+    before = mean_loss(square, surrogate, start(textures_of(square)))
+    state = run(square, surrogate, steps=8, optimiser=optimiser)
+    assert mean_loss(square, surrogate, state) > before + 0.03
+
+
+@every_optimiser
+@given(epsilon=st.floats(1 / 255, 1), share=st.floats(0.05, 1), seed=st.integers(0, 99))
+@SMALL
+def test_every_optimiser_keeps_the_budget_to_the_last_bit_once_saved(
+    optimiser: str, square: Object3D, surrogate: Surrogate, epsilon: float, share: float, seed: int
+) -> None:
+    budget = Budget(epsilon, share * epsilon)
+    begin = random_state(square, budget, seed)
+    state = run(square, surrogate, steps=3, state=begin, budget=budget, seed=seed, optimiser=optimiser)
+    delta, texture = state.deltas["m0.png"], textures_of(square)["m0.png"]
+    painted = budget.repaint(square, state.deltas).textures
+    for name, image in square.textures.items():
+        assert np.abs(painted[name].astype(int) - image).max() <= np.floor(epsilon * 255 + 1e-6)
+    assert delta.abs().max() <= epsilon + EPS
+    assert 0 <= (texture + delta).min() <= (texture + delta).max() <= 1
+
+
+@every_optimiser
+def test_no_optimiser_moves_a_texel_outside_of_the_mask(optimiser: str, square: Object3D, surrogate: Surrogate) -> None:
+    allowed = {name: torch.zeros(16, 16, dtype=torch.bool) for name in square.textures}
+    allowed["m0.png"][3:9, 4:12] = True
+    state = run(square, surrogate, steps=4, texels=allowed, optimiser=optimiser)
+    moved = {name: (delta != 0).any(dim=2) for name, delta in state.deltas.items()}
+    assert moved["m0.png"].any()
+    assert not any((moved[name] & ~allowed[name]).any() for name in moved)
+
+
+@every_optimiser
+def test_the_same_arguments_give_the_same_bytes_and_leave_the_state_alone(
+    optimiser: str, square: Object3D, surrogate: Surrogate
+) -> None:
+    half = run(square, surrogate, steps=2, total_steps=4, seed=1, optimiser=optimiser)
+    before = save_state(half)
+    once, again = (
+        save_state(run(square, surrogate, steps=2, total_steps=4, seed=1, optimiser=optimiser, state=half))
+        for _ in range(2)
+    )
+    assert once == again != before
+    assert save_state(half) == before
+
+
+def test_one_pgd_step_of_the_whole_budget_is_fgsm(square: Object3D, surrogate: Surrogate) -> None:
+    state = run(square, surrogate, steps=1, optimiser="pgd", budget=Budget(0.06, 0.06))
+    moved = state.deltas["m0.png"][state.deltas["m0.png"] != 0].abs()
+    torch.testing.assert_close(moved, torch.full_like(moved, 0.06), atol=EPS, rtol=0)
+
+
+def test_nesterov_steps_along_the_sign_of_momentum_one_momentum_step_ahead(
+    square: Object3D, surrogate: Surrogate
+) -> None:
+    one = run(square, surrogate, steps=1, total_steps=3, optimiser="nesterov")
+    two = run(square, surrogate, steps=1, total_steps=3, optimiser="nesterov", state=one)
+    sizes = [2 * 0.02 * (3 - done - 0.5) / 3 for done in (0, 1)]
+    mean, delta = one.memory["momentum"], one.deltas["m0.png"]
+    assert float(mean.abs().sum()) == pytest.approx(1, abs=1e-4)
+    torch.testing.assert_close(delta.flatten(0, 1), sizes[0] * mean[:256].sign(), atol=EPS, rtol=0)
+    step = (two.deltas["m0.png"] - delta).flatten(0, 1)
+    torch.testing.assert_close(step, sizes[1] * two.memory["momentum"][:256].sign(), atol=EPS, rtol=0)
+
+    (seen,) = steps_of(square, surrogate, steps=1, total_steps=3, optimiser="nesterov", state=one)
+    ahead = 0.9 * 0.02 * mean[:256].sign().view(16, 16, 3)
+    there = {**one.deltas, "m0.png": (delta + ahead).clamp(-0.06, 0.06)}
+    assert seen.loss == pytest.approx(mean_loss(square, surrogate, AttackState(1, there)), abs=1e-5)
+
+
+@given(length=st.integers(1, 2000))
+@settings(max_examples=40)
+def test_the_step_falls_to_nothing_in_every_round_and_rounds_grow(length: int) -> None:
+    falling = [step_factor(done, length) for done in range(length)]
+    starts = [0, *(done for done in range(1, length) if falling[done] > falling[done - 1])]
+    rounds = np.diff([*starts, length])
+    assert np.mean(falling) == pytest.approx(1)
+    assert all(later >= 2 * sooner for sooner, later in pairwise(rounds))
+    assert len(rounds) == 1 or rounds[0] == ROUND
+    for begin, size in zip(starts, rounds, strict=True):
+        np.testing.assert_allclose(falling[begin : begin + size], np.arange(2 * size - 1, 0, -2) / size)

@@ -1,0 +1,535 @@
+"""Classifiers: the contract they keep, the files that are refused, and the speed-up that may not change a function."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torch import Tensor, nn
+
+from tests.fakes import fake_classifier
+from tests.pretend_device import pretend_device
+from trompe_server.classifiers import (
+    Classifier,
+    NetworkClassifier,
+    ScoringClassifier,
+    WhiteBoxClassifier,
+    inspect,
+    load_classifier,
+    resized,
+    score_based,
+)
+from trompe_server.classifiers.archive import read_program
+from trompe_server.classifiers.fold import BATCH_NORM, Formatted, fold_batch_norm
+from trompe_server.classifiers.onnx import OnnxClassifier, load_onnx
+from trompe_server.classifiers.protocol import fit_images
+from trompe_shared.errors import ClassifierError
+
+SIZE = (20, 24)
+ASSETS = os.environ.get("TROMPE_ASSETS")
+needs_assets = pytest.mark.skipif(ASSETS is None, reason="TROMPE_ASSETS is not set")
+
+
+class Net(nn.Module):
+    """Convolutions with batch norm that has seen some data, then a linear layer."""
+
+    def __init__(self, n_classes: int = 7) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.body = nn.Sequential(
+            nn.Conv2d(3, 8, 3, stride=2, bias=False),
+            nn.BatchNorm2d(8),
+            nn.ReLU(),
+            nn.Conv2d(8, 8, 3, padding=1, groups=8),
+            nn.BatchNorm2d(8, affine=False),
+            nn.ReLU6(),
+            nn.AdaptiveAvgPool2d(2),
+            nn.Flatten(),
+            nn.Linear(32, n_classes),
+        )
+
+    def forward(self, image: Tensor) -> Tensor:
+        logits: Tensor = self.body((image - 0.5) / 0.25)
+        return logits
+
+
+class Around(nn.Module):
+    """Some function of a network's input and output."""
+
+    def __init__(self, function: Callable[[Any, Tensor], Any]) -> None:
+        super().__init__()
+        self.net, self.function = Net(), function
+
+    def forward(self, image: Tensor) -> Any:
+        return self.function(self.net, image)
+
+
+class TwoInputs(nn.Module):
+    def forward(self, image: Tensor, scale: Tensor) -> Tensor:
+        return (image * scale).mean(dim=(2, 3))
+
+
+def trained(network: nn.Module) -> nn.Module:
+    """The network with running statistics that are not those of a new one."""
+    generator = torch.Generator().manual_seed(1)
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.running_mean = torch.randn(module.num_features, generator=generator)
+            module.running_var = torch.rand(module.num_features, generator=generator) + 0.5
+    return network.eval()
+
+
+def export(
+    network: nn.Module,
+    path: Path,
+    *,
+    shape: tuple[int, ...] = (2, 3, *SIZE),
+    dtype: torch.dtype = torch.float32,
+    dynamic: bool = True,
+) -> Path:
+    image = torch.rand(shape).to(dtype)
+    batch = ({0: torch.export.Dim.DYNAMIC},) if dynamic else None
+    torch.export.save(torch.export.export(trained(network), (image,), dynamic_shapes=batch), path)
+    return path
+
+
+def write_onnx(
+    path: Path,
+    *,
+    batch: int | str = "n",
+    size: tuple[int | str, int | str] = SIZE,
+    kind: int = TensorProto.FLOAT,
+    n_classes: int = 7,
+    last: str = "Identity",
+) -> Path:
+    """A network: mean over the image, then a linear layer."""
+    weight = np.random.default_rng(0).normal(size=(3, n_classes)).astype(np.float32)
+    nodes = [
+        helper.make_node("Cast", ["image"], ["x"], to=TensorProto.FLOAT),
+        helper.make_node("GlobalAveragePool", ["x"], ["pooled"]),
+        helper.make_node("Flatten", ["pooled"], ["flat"]),
+        helper.make_node("MatMul", ["flat", "weight"], ["raw"]),
+        helper.make_node(last, ["raw"], ["logits"]),
+    ]
+    image = helper.make_tensor_value_info("image", kind, [batch, 3, *size])
+    logits = helper.make_tensor_value_info("logits", TensorProto.FLOAT, [batch, n_classes])
+    graph = helper.make_graph(nodes, "net", [image], [logits], [numpy_helper.from_array(weight, "weight")])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path)
+    return path
+
+
+def noise(count: int, size: tuple[int, int] = SIZE, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (count, *size, 3), np.uint8)
+
+
+@pytest.fixture(scope="session")
+def pt2(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export(Net(), tmp_path_factory.mktemp("pt2") / "net.pt2")
+
+
+def white_box(path: Path | str) -> NetworkClassifier:
+    classifier = load_classifier(path)
+    assert isinstance(classifier, NetworkClassifier)
+    return classifier
+
+
+@pytest.fixture(
+    params=[
+        *("fake", "pt2", "tiny", "resized", "score based"),
+        *("onnx", "onnx with a batch of 1", "onnx with a batch of 4"),
+    ]
+)
+def classifier(request: pytest.FixtureRequest, tmp_path: Path) -> Classifier:
+    if request.param == "fake":
+        return fake_classifier()
+    if request.param == "resized":
+        return resized(fake_classifier(), (16, 40))
+    if request.param == "score based":
+        return score_based(fake_classifier(), seed=0)
+    if request.param == "tiny":
+        return load_classifier("tiny")
+    if request.param == "pt2":
+        return load_classifier(request.getfixturevalue("pt2"))
+    batches: dict[str, int | str] = {"onnx": "n", "onnx with a batch of 1": 1, "onnx with a batch of 4": 4}
+    return load_classifier(write_onnx(tmp_path / "net.onnx", batch=batches[request.param]))
+
+
+def test_every_classifier_gives_float32_logits_for_any_number_of_images(classifier: Classifier) -> None:
+    for count in (0, 1, 11):
+        logits = classifier.predict(noise(count, classifier.image_size))
+        assert logits.shape == (count, classifier.n_classes)
+        assert logits.dtype == np.float32
+
+
+def test_the_logits_of_an_image_do_not_depend_on_its_company(classifier: Classifier) -> None:
+    images = noise(11, classifier.image_size)
+    alone = np.concatenate([classifier.predict(image[None]) for image in images])
+    np.testing.assert_allclose(classifier.predict(images), alone, rtol=1e-4, atol=1e-5)
+
+
+def test_images_of_another_size_are_resized(classifier: Classifier) -> None:
+    flat = np.full((1, 3 * classifier.image_size[0], 50, 3), 90, np.uint8)
+    right = np.full((1, *classifier.image_size, 3), 90, np.uint8)
+    np.testing.assert_allclose(classifier.predict(flat), classifier.predict(right), rtol=1e-4, atol=1e-5)
+
+
+def test_scores_of_images_that_are_not_8_bit_are_the_predictions_of_those_that_are(classifier: Classifier) -> None:
+    if not isinstance(classifier, ScoringClassifier):
+        pytest.skip("gives gradients by a detour of its own")
+    images = noise(11, classifier.image_size)
+    scores = classifier.scores(fit_images(images, classifier.image_size).requires_grad_())
+    assert not scores.requires_grad
+    np.testing.assert_allclose(scores.numpy(), classifier.predict(images), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        pytest.param(np.zeros((2, 8, 8, 3), np.float32), id="not uint8"),
+        pytest.param(np.zeros((2, 3, 8, 8), np.uint8), id="channels first"),
+        pytest.param(np.zeros((8, 8, 3), np.uint8), id="no batch"),
+    ],
+)
+def test_images_of_another_form_are_refused(classifier: Classifier, images: np.ndarray) -> None:
+    with pytest.raises(ClassifierError, match="uint8, sRGB"):
+        classifier.predict(images)
+
+
+class Odd:
+    """An onnxruntime session whose network says what is no number."""
+
+    def get_inputs(self) -> list[Any]:
+        return [self]
+
+    name = "image"
+
+    def run(self, _: None, images: dict[str, np.ndarray]) -> list[np.ndarray]:
+        return [np.tile(np.array([[np.nan, np.inf, -np.inf, 2.0]], np.float32), (len(images["image"]), 1))]
+
+
+def test_what_a_classifier_says_is_finite_whatever_its_network_says() -> None:
+    (logits,) = OnnxClassifier("odd", Odd(), (8, 8), 4, None).predict(np.zeros((1, 8, 8, 3), np.uint8))
+    assert np.isfinite(logits).all()
+    assert np.argsort(logits).tolist() == [2, 0, 3, 1]
+
+
+def test_resizing_averages_what_it_shrinks() -> None:
+    stripes = np.zeros((1, 8, 8, 3), np.uint8)
+    stripes[:, ::2] = 255
+    small = fit_images(stripes, (2, 2))
+    assert small.shape == (1, 3, 2, 2)
+    torch.testing.assert_close(small, torch.full_like(small, 0.5), atol=0.1, rtol=0)
+
+
+def test_white_boxes_agree_with_their_own_predictions_and_train_nothing(pt2: Path) -> None:
+    for classifier in (white_box(pt2), fake_classifier(image_size=SIZE), white_box("tiny")):
+        assert isinstance(classifier, WhiteBoxClassifier)
+        images = noise(3, classifier.image_size)
+        inputs = fit_images(images, classifier.image_size).requires_grad_()
+        logits = classifier.logits(inputs)
+        np.testing.assert_allclose(logits.detach().numpy(), classifier.predict(images), rtol=1e-4, atol=1e-5)
+        (gradient,) = torch.autograd.grad(logits.sum(), inputs)
+        assert gradient.abs().amax(dim=(1, 2, 3)).min() > 0
+        assert not any(parameter.requires_grad for parameter in classifier.network.parameters())
+
+
+def test_an_exported_network_is_read_with_its_size_classes_and_name(pt2: Path) -> None:
+    classifier = load_classifier(pt2, classes=list("abcdefg"))
+    assert (classifier.image_size, classifier.n_classes, classifier.name) == (SIZE, 7, "net")
+    assert classifier.classes == tuple("abcdefg")
+    assert load_classifier(pt2, name="mine").name == "mine"
+
+
+def test_the_number_of_class_names_must_be_that_of_the_logits(pt2: Path, tmp_path: Path) -> None:
+    for file in (pt2, write_onnx(tmp_path / "net.onnx")):
+        with pytest.raises(ClassifierError, match="7 classes, but 2 class names"):
+            load_classifier(file, classes=["a", "b"])
+
+
+def test_an_exported_network_is_the_network_it_was(pt2: Path) -> None:
+    images = fit_images(noise(5), SIZE).requires_grad_()
+    classifier, source = white_box(pt2), read_program(pt2).module(check_guards=False)
+    torch.testing.assert_close(classifier.logits(images), source(images))
+    gradients = [torch.autograd.grad(f(images).square().sum(), images)[0] for f in (classifier.logits, source)]
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["pt2", "tiny"])
+def test_a_network_on_another_device_gives_the_same_logits_and_gradients_there(
+    kind: str, pt2: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device, path = pretend_device(monkeypatch), pt2 if kind == "pt2" else kind
+    found = []
+    for name in ("cpu", device):
+        network = load_classifier(path, device=name)
+        assert isinstance(network, NetworkClassifier)
+        images = torch.linspace(0, 1, 6 * network.image_size[0] * network.image_size[1]).to(name)
+        images = images.view(2, 3, *network.image_size).requires_grad_()
+        logits = network.logits(images)
+        assert logits.device.type == name
+        found.append([logits.detach().cpu(), *(each.cpu() for each in torch.autograd.grad(logits.sum(), images))])
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
+def batch_norms(graph: Any) -> int:
+    return sum(node.target is BATCH_NORM for node in graph.nodes)
+
+
+def test_batch_norm_is_folded_into_the_convolution_before_it(pt2: Path) -> None:
+    assert batch_norms(read_program(pt2).graph) == 2
+    network = white_box(pt2).network
+    assert isinstance(network, Formatted)
+    assert network.memory_format is torch.channels_last
+    assert batch_norms(network.network.graph) == 0
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        pytest.param(lambda net, x: _normed_and_not(net, net.body[0](x)), id="the convolution has another reader"),
+        pytest.param(lambda net, x: net.body[1](net.body[0](x).relu()).mean((2, 3)), id="something is in between"),
+        pytest.param(
+            lambda net, x: nn.functional.batch_norm(net.body[0](x), None, None, training=True).mean((2, 3)),
+            id="training",
+        ),
+    ],
+)
+def test_a_batch_norm_that_cannot_be_folded_is_left_alone(
+    function: Callable[[Any, Tensor], Tensor], tmp_path: Path
+) -> None:
+    program = read_program(export(Around(function), tmp_path / "net.pt2"))
+    images = fit_images(noise(3), SIZE)
+    folded = fold_batch_norm(program.module(check_guards=False))
+    assert batch_norms(folded.graph) == 1
+    torch.testing.assert_close(folded(images), program.module(check_guards=False)(images))
+
+
+def _normed_and_not(net: Any, features: Tensor) -> Tensor:
+    sums: Tensor = net.body[1](features) + features
+    return sums.mean((2, 3))
+
+
+def test_a_network_that_does_not_run_channels_last_is_left_as_it_was(tmp_path: Path) -> None:
+    network = Around(lambda net, x: net.body[0](x).view(x.shape[0], -1)[:, :9])
+    classifier = white_box(export(network, tmp_path / "net.pt2"))
+    assert isinstance(classifier.network, Formatted)
+    assert classifier.network.memory_format is torch.contiguous_format
+    images = fit_images(noise(3), SIZE)
+    torch.testing.assert_close(classifier.logits(images), network(images.contiguous()))
+
+
+@pytest.mark.parametrize(
+    ("network", "options", "message"),
+    [
+        pytest.param(Net(), {"dynamic": False}, "batch is fixed to 2", id="fixed batch"),
+        pytest.param(nn.Flatten(), {"shape": (2, 3, 8)}, r"its input is torch.float32 \(s", id="no image"),
+        pytest.param(nn.Flatten(), {"dtype": torch.uint8}, "its input is torch.uint8", id="uint8 input"),
+        pytest.param(
+            nn.Conv2d(3, 4, 3), {}, r"its output for two images is torch.float32 \(2, 4,", id="maps, not logits"
+        ),
+        pytest.param(
+            Around(lambda net, x: (net(x), net(x))), {}, "its output for two images is a tuple", id="two outputs"
+        ),
+        pytest.param(
+            Around(lambda net, x: net(x).argmax(1)), {}, "its output for two images is torch.int64", id="class index"
+        ),
+        pytest.param(Around(lambda net, x: net(x).softmax(1)), {}, "ends in a softmax", id="probabilities"),
+        pytest.param(Around(lambda net, x: net(x) / 0), {}, "not finite", id="not finite"),
+        pytest.param(Around(lambda net, x: (5 * net(x)).round()), {}, "no gradient in the image", id="rounded"),
+        pytest.param(Around(lambda net, x: net(x).detach()), {}, "no gradient in the image", id="detached"),
+    ],
+)
+def test_an_exported_network_that_breaks_the_contract_is_refused(
+    network: nn.Module, options: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ClassifierError, match=message):
+        load_classifier(export(network, tmp_path / "net.pt2", **options))
+
+
+def test_a_network_with_two_inputs_is_refused(tmp_path: Path) -> None:
+    inputs = (torch.rand(2, 3, *SIZE), torch.rand(1))
+    torch.export.save(torch.export.export(TwoInputs(), inputs), tmp_path / "net.pt2")
+    with pytest.raises(ClassifierError, match="takes 2 inputs"):
+        load_classifier(tmp_path / "net.pt2")
+
+
+class RunsCode:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return exec, (f"open({str(self.mark)!r}, 'w').close()",)
+
+
+def pickled(thing: object) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(thing, buffer)
+    return buffer.getvalue()
+
+
+def replacing(old: str, new: str, file: str = "models/model.json") -> Callable[[dict[str, bytes], Path], None]:
+    """Replaces text of the program, or of another file of the archive; ``MARK`` stands for the path of the mark."""
+
+    def tamper(members: dict[str, bytes], mark: Path) -> None:
+        (name,) = (member for member in members if member.endswith(file))
+        members[name] = members[name].decode().replace(old, new.replace("MARK", str(mark))).encode()
+
+    return tamper
+
+
+def _pickled_inputs(members: dict[str, bytes], mark: Path) -> None:
+    (name,) = (member for member in members if member.endswith("sample_inputs/model.pt"))
+    members[name] = pickled((RunsCode(mark),))
+
+
+def _pickled_weights(members: dict[str, bytes], mark: Path) -> None:
+    (name,) = (member for member in members if member.endswith("/weight_0"))
+    members[name] = pickled(RunsCode(mark))
+    replacing('"use_pickle": false', '"use_pickle": true', "model_weights_config.json")(members, mark)
+
+
+def _pickled_constants(members: dict[str, bytes], mark: Path) -> None:
+    config = next(member for member in members if member.endswith("model_constants_config.json"))
+    payload = {"path_name": "opaque_obj_0", "is_param": False, "use_pickle": True, "tensor_meta": None}
+    members[config] = json.dumps({"config": {"c": payload}}).encode()
+
+
+def _compiled_library(members: dict[str, bytes], mark: Path) -> None:
+    root = next(iter(members)).split("/")[0]
+    members[f"{root}/data/aotinductor/model/model.so"] = b"\x7fELF"
+
+
+SUBTRACTION = "torch.ops.aten.sub.Tensor"
+
+
+@pytest.mark.parametrize(
+    ("tamper", "message"),
+    [
+        pytest.param(_pickled_inputs, "sample inputs that are not tensors", id="pickled sample inputs"),
+        pytest.param(_pickled_weights, "pickled weights", id="pickled weights"),
+        pytest.param(_pickled_constants, "pickled constants", id="pickled constants"),
+        pytest.param(
+            replacing("integer=True)", "integer=True) + __import__('os').system('touch MARK')"),
+            "expr_str",
+            id="a size that is code",
+        ),
+        pytest.param(replacing(SUBTRACTION, "torch.os.system"), "torch.os.system", id="an operator that is not ATen's"),
+        pytest.param(
+            replacing(SUBTRACTION, "torch.ops.aten.from_file.default"), "aten.from_file", id="an operator of files"
+        ),
+        pytest.param(replacing("body.0.weight", 'a\\")+exec(\\"'), "exec", id="a name that is code"),
+        pytest.param(
+            replacing('\\"context\\": \\"[]\\"', '\\"context\\": \\"{}\\"'),
+            "the tree",
+            id="an input structure that could import",
+        ),
+        pytest.param(_compiled_library, "aotinductor", id="a compiled library"),
+    ],
+)
+def test_a_file_that_could_run_code_is_refused_before_it_does(
+    tamper: Callable[[dict[str, bytes], Path], None], message: str, tmp_path: Path, pt2: Path
+) -> None:
+    mark, file = tmp_path / "ran", tmp_path / "net.pt2"
+    with zipfile.ZipFile(pt2) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    tamper(members, mark)
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    with pytest.raises(ClassifierError, match=rf"(?s)is refused.*{message}"):
+        load_classifier(file)
+    assert not mark.exists()
+
+
+def test_a_file_in_torch_2_7s_format_is_refused_unread(tmp_path: Path) -> None:
+    mark, file = tmp_path / "ran", tmp_path / "old.pt2"
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("version", "8.20")
+        archive.writestr("serialized_exported_program.json", "{}")
+        archive.writestr("serialized_state_dict.pt", pickled((RunsCode(mark),)))
+    with pytest.raises(ClassifierError, match="cannot be read as an exported program"):
+        load_classifier(file)
+    assert not mark.exists()
+
+
+def test_cut_and_foreign_files_are_refused(pt2: Path, tmp_path: Path) -> None:
+    for ending in (".pt2", ".onnx"):
+        for data in (b"", b"not a classifier", pt2.read_bytes()[:3000]):
+            file = tmp_path / f"net{ending}"
+            file.write_bytes(data)
+            with pytest.raises(ClassifierError, match=r"cannot be read|cannot read it"):
+                load_classifier(file)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        pytest.param({"size": ("h", "w")}, "no height and width: fix them with", id="symbolic size"),
+        pytest.param({"kind": TensorProto.UINT8}, r"its input is tensor\(uint8\)", id="uint8 input"),
+        pytest.param({"last": "Softmax"}, "ends in a softmax", id="probabilities"),
+        pytest.param({"last": "Shape"}, "onnxruntime cannot read it|its output for one image", id="no logits"),
+        pytest.param({"last": "Log"}, "not finite", id="not finite"),
+    ],
+)
+def test_an_onnx_network_that_breaks_the_contract_is_refused(
+    options: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ClassifierError, match=message):
+        load_onnx(write_onnx(tmp_path / "net.onnx", **options))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        *[
+            pytest.param(name, {}, "not a supported classifier; give 'tiny'", id=name)
+            for name in ("weights.h5", "net.pt", "net.torchscript", "hub:owner/nets:small")
+        ],
+        pytest.param(Path("absent.pt2"), {}, "There is no classifier file", id="no file"),
+        pytest.param("tiny", {"weights": Path("w.pth")}, "'tiny' has its own weights", id="weights of tiny"),
+        *[
+            pytest.param("tiny", {"device": device}, f"The device '{device}' cannot be used here", id=device)
+            for device in ("nonsense", "cuda:99")
+        ],
+    ],
+)
+def test_what_cannot_be_loaded_is_refused_with_the_reason(
+    name: str | Path, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ClassifierError, match=message):
+        load_classifier(name, **options)
+
+
+def test_inspect_prints_one_line_of_json(pt2: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = [sys.executable, "-m", "trompe_server.classifiers.inspect", str(pt2)]
+    (line,) = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout.splitlines()
+    assert json.loads(line) == {"white_box": True, "image_size": [*SIZE], "n_classes": 7, "classes": None}
+    (tmp_path / "bad.pt2").write_bytes(b"no")
+    assert inspect.main([str(tmp_path / "bad.pt2")]) == 1
+    assert list(json.loads(capsys.readouterr().out)) == ["error"]
+
+
+@pytest.mark.assets
+@needs_assets
+@pytest.mark.parametrize("name", ["mobilenet_v2", "mobilenet_edgetpu_075", "squeezenet1_1"])
+def test_real_networks_agree_between_their_exported_and_onnx_files(name: str) -> None:
+    folder = Path(ASSETS or "") / "classifiers"
+    exported, judge = (load_classifier(folder / f"{name}{ending}") for ending in (".pt2", ".onnx"))
+    assert isinstance(exported, NetworkClassifier)
+    assert isinstance(exported.network, Formatted)
+    assert batch_norms(exported.network.network.graph) == 0
+    assert exported.image_size == judge.image_size
+    images = noise(4, (240, 240))
+    np.testing.assert_allclose(exported.predict(images), judge.predict(images), atol=1e-3)

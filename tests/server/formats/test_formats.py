@@ -1,0 +1,475 @@
+"""OBJ, SAILenv, FBX, PLY and STL: what is missing is made, what is there comes back as it was."""
+
+import os
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.small_models import corners, painted, refusal, same_paint, with_picture_inside
+from trompe_server.formats import FORMATS, import_file, read_object, repaint_file, repaint_limited, write_glb
+from trompe_server.formats.fbx import unit
+from trompe_server.formats.fbx_tree import MAGIC, parse_tree
+from trompe_server.formats.pictures import cutout_alpha, encode_srgb, linear_rgb, shrink, tinted
+from trompe_server.formats.unwrap import unwrap
+from trompe_server.renderers import SailenvTarget
+from trompe_shared.errors import ObjectError
+from trompe_shared.geometry import Camera, View
+from trompe_shared.object3d import Object3D, decode_alpha, encode_png, load_object, pack_zip, unpack
+from trompe_shared.wavefront import Part, obj_text, parse_obj
+
+PICTURE = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
+OBJ = (
+    "mtllib t.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl red\nf 1/1 2/2 3/3 4/4\n"
+)
+MTL = "# by hand\nnewmtl red\nKd 0.5 0 0\nNs 12\n\nnewmtl other\nKd 0 0 1\n"
+VIEWS = [View(Camera(3.0, azimuth, 20.0)) for azimuth in (-40.0, 10.0, 150.0)]
+needs_assimp = pytest.mark.skipif(shutil.which("assimp") is None, reason="assimp-utils is not installed")
+
+
+def comes_back(data: bytes, name: str) -> tuple[Object3D, bytes]:
+    """The object and the repainted file of an upload, of which it is checked that it holds mesh and paint."""
+    obj = read_object(data, name=name).obj
+    new = painted(obj)
+    exported = repaint_file(data, new, name=name)
+    again = read_object(exported.data, name=f"again{exported.ending}").obj
+    same_paint(again, new)
+    assert repaint_file(data, obj, name=name).data == data
+    return obj, exported.data
+
+
+def ball() -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(subdivisions=1)
+
+
+# SAILenv and OBJ
+
+
+def test_a_sailenv_zip_comes_back_with_other_albedos_and_nothing_else(mug: Object3D) -> None:
+    data = mug.to_zip()
+    assert read_object(data, name="mug.zip").format == "sailenv"
+    _, out = comes_back(data, "mug.zip")
+    before, after = unpack(data), unpack(out)
+    assert {name for name in before if before[name] != after[name]} == set(mug.textures)
+
+
+def test_an_obj_with_textures_in_a_folder_of_their_own_keeps_its_folders() -> None:
+    files = {"t.obj": OBJ.encode(), "t.mtl": b"newmtl red\nmap_Kd maps/red.png\n", "maps/red.png": encode_png(PICTURE)}
+    _, out = comes_back(pack_zip(files), "t.zip")
+    after = unpack(out)
+    assert [name for name in files if files[name] != after[name]] == ["maps/red.png"]
+
+
+def test_a_colour_becomes_a_texture_and_the_obj_stays() -> None:
+    files = {"t.obj": OBJ.encode(), "t.mtl": MTL.encode()}
+    obj, out = comes_back(pack_zip(files), "t.zip")
+    after = unpack(out)
+    assert after["t.obj"] == files["t.obj"]
+    assert after["t.mtl"].decode() == MTL.replace(
+        "newmtl red\nKd 0.5 0 0", "newmtl red\nmap_Kd red_albedo.png\nKd 1 1 1"
+    )
+    assert obj.textures["red_albedo.png"][0, 0].tolist() == [188, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("lines", "opacity", "alpha"),
+    [
+        pytest.param("d 0.3", 0.3, None, id="d"),
+        pytest.param("d -halo 0.3", 0.3, None, id="d with an option"),
+        pytest.param("Tr 0.75", 0.25, None, id="Tr"),
+        pytest.param("Tr 0.75\nd 0.5", 0.5, None, id="d counts more than Tr"),
+        pytest.param("d 1.0", None, None, id="opaque"),
+        pytest.param("Tr 1.0", None, None, id="opaque, as MeshLab writes it"),
+        pytest.param("d 0", None, None, id="opaque, by a slip of the program"),
+        pytest.param("map_d mask.png", 1.0, 100, id="a grey picture"),
+        pytest.param("d 0.5\nmap_d clear.png", 0.5, 80, id="the alpha of a picture, and d"),
+        pytest.param("map_d red.png", None, None, id="the texture itself, without alpha"),
+        pytest.param("map_d elsewhere.png", None, None, id="a picture that is not there"),
+    ],
+)
+def test_an_mtl_says_how_transparent_its_materials_are(lines: str, opacity: float | None, alpha: int | None) -> None:
+    clear = np.dstack([PICTURE, np.full((8, 8), 80, np.uint8)])
+    files = {
+        "t.obj": OBJ.encode(),
+        "t.mtl": f"newmtl red\nmap_Kd red.png\n{lines}\n".encode(),
+        "red.png": encode_png(PICTURE),
+        "mask.png": encode_png(np.full((4, 4, 3), 100, np.uint8)),
+        "clear.png": encode_png(clear),
+    }
+    obj, out = comes_back(pack_zip(files), "t.zip")
+    assert obj.materials["red"].opacity == opacity
+    found = decode_alpha(obj.files["red.png"], "red.png")
+    assert found is None if alpha is None else set(np.unique(found)) == {alpha}  # type: ignore[arg-type]
+    after = unpack(out)
+    assert [name for name in files if files[name] != after[name]] == ["red.png"]
+    assert decode_alpha(after["red.png"], "red.png") is None
+
+
+def test_one_texture_with_two_opacity_maps_is_refused_with_a_remedy() -> None:
+    mtl = "".join(f"newmtl {k}\nmap_Kd red.png\nmap_d {k}.png\n" for k in ("red", "other"))
+    pictures = dict.fromkeys(("red.png", "other.png"), encode_png(PICTURE))
+    files = {"t.obj": OBJ.encode(), "t.mtl": mtl.encode(), **pictures}
+    assert "under a name for each" in refusal(pack_zip(files), "t.zip")
+    wrong = files | {"t.mtl": b"newmtl red\nmap_Kd red.png\nd half\n"}
+    assert "expected 0 to 1" in refusal(pack_zip(wrong), "t.zip")
+
+
+def test_a_mesh_without_texture_coordinates_is_unwrapped_and_written_anew() -> None:
+    bare = OBJ.replace("f 1/1 2/2 3/3 4/4", "f 1 2 3 4")
+    obj, out = comes_back(pack_zip({"t.obj": bare.encode(), "t.mtl": MTL.encode(), "notes.txt": b"kept"}), "t.zip")
+    assert unpack(out)["notes.txt"] == b"kept"
+    (part,) = obj.parts
+    assert part.uvs.min() >= 0
+    assert part.uvs.max() <= 1
+    assert np.ptp(part.uvs, axis=0).min() > 0.2
+
+
+def test_a_bare_obj_is_grey_and_comes_back_with_its_texture() -> None:
+    obj, out = comes_back(OBJ.replace("mtllib t.mtl\n", "").encode(), "t.obj")
+    assert set(np.unique(next(iter(obj.textures.values())))) == {204}
+    assert sorted(unpack(out)) == ["red_albedo.png", "t.mtl", "t.obj"]
+
+
+def test_colours_of_an_objs_vertices_are_baked() -> None:
+    lines = [f"v {x:g} {y:g} {z:g} {abs(x):g} {abs(y):g} {abs(z):g}" for x, y, z in ball().vertices]
+    faces = [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in ball().faces]
+    obj, _ = comes_back("\n".join(lines + faces).encode(), "ball.obj")
+    (image,) = obj.textures.values()
+    assert image.reshape(-1, 3).max(axis=0).min() > 230
+    assert image.reshape(-1, 3).min(axis=0).max() < 25
+
+
+def test_a_texture_without_texture_coordinates_is_refused() -> None:
+    bare = OBJ.replace("f 1/1 2/2 3/3 4/4", "f 1 2 3 4").encode()
+    assert "unwrap" in refusal(
+        pack_zip({"t.obj": bare, "t.mtl": b"newmtl red\nmap_Kd a.png\n", "a.png": encode_png(PICTURE)}),
+        "t.zip",
+    )
+
+
+def test_smaller_textures_come_back_at_their_size_and_other_maps_at_their_own(mug: Object3D) -> None:
+    data = mug.to_zip()
+    small = read_object(data, name="mug.zip", max_texture=64).obj
+    assert {max(image.shape) for image in small.textures.values()} == {64}
+    after = unpack(repaint_file(data, painted(small), name="mug.zip").data)
+    before = unpack(data)
+    assert {name for name in before if before[name] != after[name]} == set(mug.textures)
+    assert {max(image.shape) for image in load_object(pack_zip(after)).textures.values()} == {64}
+    assert repaint_file(data, small, name="mug.zip").data == data
+
+
+# FBX
+
+
+def fbx_of(materials: str, folder: Path) -> bytes:
+    """An FBX of the square, as assimp writes it."""
+    (folder / "t.obj").write_text(OBJ)
+    (folder / "t.mtl").write_text(materials)
+    subprocess.run(["assimp", "export", "t.obj", "t.fbx", "-ffbxa"], cwd=folder, check=True, capture_output=True)
+    return (folder / "t.fbx").read_bytes()
+
+
+@needs_assimp
+def test_an_fbx_comes_back_as_it_was_with_another_texture_file(tmp_path: Path) -> None:
+    files = {"t.fbx": fbx_of("newmtl red\nmap_Kd red.png\nd 0.5\n", tmp_path), "red.png": encode_png(PICTURE)}
+    obj, out = comes_back(pack_zip(files), "t.zip")
+    assert obj.materials["red"].opacity == 0.5
+    assert [name for name, data in unpack(out).items() if files[name] != data] == ["red.png"]
+    np.testing.assert_allclose(np.ptp(corners(obj).reshape(-1, 3), axis=0), [unit(files["t.fbx"])] * 2 + [0], rtol=1e-6)
+    assert "red.png" in refusal(files["t.fbx"], "t.fbx")
+
+
+@needs_assimp
+def test_paint_that_an_fbx_has_no_file_for_is_refused(tmp_path: Path) -> None:
+    data = fbx_of(MTL, tmp_path)
+    obj = read_object(data, name="t.fbx").obj
+    with pytest.raises(ObjectError, match="take the GLB"):
+        repaint_file(data, painted(obj), name="t.fbx")
+    assert corners(read_object(write_glb(painted(obj)), name="t.glb").obj).shape == (2, 3, 3)
+
+
+def test_without_assimp_an_fbx_is_refused_with_the_name_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    assert "assimp-utils" in refusal(b"; FBX 7.3.0 project file\n", "t.fbx")
+
+
+def test_an_fbx_says_what_its_unit_is() -> None:
+    binary = b"S\x0f\0\0\0UnitScaleFactorS\x06\0\0\0doubleS\x06\0\0\0NumberS\0\0\0\0D"
+    original = binary.replace(b"\x0f\0\0\0Unit", b"\x17\0\0\0OriginalUnit")
+    assert unit(original + np.float64(7).tobytes() + binary + np.float64(2.54).tobytes()) == pytest.approx(0.0254)
+    assert unit(b'P: "UnitScaleFactor", "double", "Number", "",100\n') == pytest.approx(1.0)
+    assert unit(b"nothing of the kind") == pytest.approx(0.01)
+
+
+# PLY and STL
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_a_ply_comes_back_with_a_texture_it_names(encoding: str) -> None:
+    obj, out = comes_back(ball().export(file_type="ply", encoding=encoding), "ball.ply")
+    after = unpack(out)
+    assert sorted(after) == ["ball.ply", "ball_albedo.png"]
+    assert len(corners(obj)) == len(ball().faces)
+    _, again = comes_back(out, "ball.zip")  # and this one keeps its mesh byte for byte
+    assert unpack(again)["ball.ply"] == after["ball.ply"]
+
+
+def test_colours_of_a_plys_vertices_are_baked() -> None:
+    mesh = ball()
+    mesh.visual.vertex_colors = (255 * np.abs(mesh.vertices)).astype(np.uint8)
+    obj, _ = comes_back(mesh.export(file_type="ply"), "ball.ply")
+    (image,) = obj.textures.values()
+    assert image.reshape(-1, 3).max(axis=0).min() > 230
+
+
+def ply(vertices: str, faces: str, *, columns: str = "", corners: str = "", texture: str = "") -> bytes:
+    """A PLY in text; ``columns`` are those after x, y, z, ``corners`` a list of each face beside its vertices."""
+    named = "".join(f"property float {name}\n" for name in ("x", "y", "z", *columns.split()))
+    lists = "property list uchar int vertex_indices\n" + (f"property list uchar float {corners}\n" if corners else "")
+    return (
+        f"ply\nformat ascii 1.0\n{f'comment TextureFile {texture}' if texture else 'comment'}\n"
+        f"element vertex {vertices.count(',') + 1}\n{named}element face {faces.count(',') + 1}\n{lists}end_header\n"
+        + f"{vertices}, {faces}\n".replace(", ", "\n")
+    ).encode()
+
+
+SQUARE = "0 0 0, 1 0 0, 1 1 0, 0 1 0"
+
+
+def binary(text: bytes, order: str) -> bytes:
+    """A PLY of ``ply`` in binary, with an element and bytes after its faces."""
+    header, _, rows = text.partition(b"end_header\n")
+    name = {"<": b"binary_little_endian", ">": b"binary_big_endian"}[order]
+    body = b""
+    for row in rows.decode().splitlines():
+        numbers = [float(word) for word in row.split()]
+        if len(numbers) == 3:
+            body += struct.pack(f"{order}3f", *numbers)
+        else:
+            body += struct.pack(f"{order}B{len(numbers) - 1}i", *map(int, numbers))
+    edges = b"element edge 1\nproperty int vertex1\nproperty uchar kind\nend_header\n"
+    return header.replace(b"ascii", name) + edges + body + bytes(5) + b"more"
+
+
+@pytest.mark.parametrize(
+    "order", [pytest.param("", id="text"), pytest.param("<", id="little"), pytest.param(">", id="big")]
+)
+@pytest.mark.parametrize(
+    ("faces", "count"),
+    [
+        pytest.param("4 0 1 2 3, 3 1 4 2", 3, id="a square and a triangle"),
+        pytest.param("4 0 1 2 3, 3 0 1 2, 5 0 1 4 2 3", 6, id="on average squares"),
+        pytest.param("5 0 1 4 2 3", 3, id="a pentagon"),
+        pytest.param("4 0 1 2 3, 4 1 4 2 3", 4, id="squares"),
+    ],
+)
+def test_polygons_of_any_size_are_split_in_a_ply(faces: str, count: int, order: str) -> None:
+    text = ply(f"{SQUARE}, 2 0 0", faces)
+    found = corners(read_object(binary(text, order) if order else text + b"more\n", name="t.ply").obj)
+    assert len(found) == count
+    area = np.linalg.norm(np.cross(found[:, 1] - found[:, 0], found[:, 2] - found[:, 0]), axis=1).sum() / 2
+    polygons = [[int(word) for word in face.split()[1:]] for face in faces.split(", ")]
+    points = np.array([*(row.split() for row in SQUARE.split(", ")), (2, 0, 0)], float)
+    rings = [points[polygon] for polygon in polygons]
+    assert area == pytest.approx(sum(abs(np.cross(ring, np.roll(ring, -1, 0)).sum(0)[2]) / 2 for ring in rings))
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        pytest.param(
+            ply("0 0 0 0 0, 1 0 0 1 0, 1 1 0 1 1, 0 1 0 0 1", "4 0 1 2 3", columns="s t", texture="my red.png"),
+            id="of vertices",
+        ),
+        pytest.param(
+            ply(SQUARE, "3 0 1 2 6 0 0 1 0 1 1, 3 0 2 3 6 0 0 1 1 0 1", corners="texcoord", texture="my red.png"),
+            id="of corners, as MeshLab writes them",
+        ),
+    ],
+)
+def test_a_texture_that_a_ply_names_is_the_only_thing_that_changes(mesh: bytes) -> None:
+    files = {"t.ply": mesh, "my red.png": encode_png(PICTURE)}
+    obj, out = comes_back(pack_zip(files), "t.zip")
+    assert [name for name, data in unpack(out).items() if files[name] != data] == ["my red.png"]
+    (part,) = obj.parts
+    np.testing.assert_array_equal(part.uvs, part.vertices[:, :2])
+    assert part.normals.tolist() == [[0, 0, 1]] * 4
+
+
+@pytest.mark.parametrize(("scale", "kind"), [(1, "float"), (255, "float"), (255, "uchar"), (1, "double")])
+def test_colours_of_a_ply_are_those_of_its_numbers(scale: int, kind: str) -> None:
+    rows = ", ".join(f"{point} {scale} 0 0" for point in SQUARE.split(", "))
+    data = ply(rows, "4 0 1 2 3", columns="red green blue")
+    for name in (b"red", b"green", b"blue"):
+        data = data.replace(b"float " + name, kind.encode() + b" " + name)
+    (image,) = read_object(data, name="t.ply").obj.textures.values()
+    assert np.unique(image.reshape(-1, 3), axis=0).tolist() == [[255, 0, 0]]
+
+
+@pytest.mark.parametrize("file_type", ["stl", "stl_ascii"])
+def test_an_stl_is_read_in_a_grey_of_its_own_and_goes_out_as_glb(file_type: str) -> None:
+    data = ball().export(file_type=file_type)
+    data = data if isinstance(data, bytes) else data.encode()
+    obj = read_object(data, name="ball.stl").obj
+    np.testing.assert_allclose(np.sort(corners(obj).ravel()), np.sort(ball().triangles.ravel()), atol=1e-6)
+    edges = np.diff(corners(obj), axis=1)
+    facing = np.cross(edges[:, 0], edges[:, 1])
+    assert (np.einsum("ij,ij->i", facing, corners(obj).mean(axis=1)) > 0).all()
+    with pytest.raises(ObjectError, match="take the GLB"):
+        repaint_file(data, painted(obj), name="ball.stl")
+    assert (corners(read_object(write_glb(painted(obj)), name="t.glb").obj) == corners(obj)).all()
+
+
+def test_all_solids_of_an_stl_are_one_object() -> None:
+    text = ball().export(file_type="stl_ascii").encode()
+    assert len(corners(read_object(text + text, name="balls.stl").obj)) == 2 * len(ball().faces)
+
+
+# What they have in common
+
+
+def test_every_format_is_known_by_its_content() -> None:
+    mesh = ball()
+    for name, data in (
+        ("stl", mesh.export(file_type="stl")),
+        ("ply", mesh.export(file_type="ply")),
+        ("gltf", mesh.export(file_type="glb")),
+    ):
+        assert read_object(data, name="upload").format == name
+        assert (
+            read_object(
+                pack_zip({f"x{next(f for f in FORMATS if f.name == name).endings[-1]}": data}), name="u.zip"
+            ).format
+            == name
+        )
+
+
+def test_unwrapping_the_same_mesh_twice_gives_the_same() -> None:
+    first, second = (unwrap([(ball().vertices.astype(np.float32), ball().faces.astype(np.int32))]) for _ in range(2))
+    assert first[1] == second[1]
+    assert (first[0][0].uvs == second[0][0].uvs).all()
+    assert (first[0][0].source[first[0][0].faces] == ball().faces).all()
+
+
+def test_an_unwrapped_object_looks_the_same_in_its_own_format_and_as_glb(target: SailenvTarget) -> None:
+    mesh = ball()
+    mesh.visual.vertex_colors = (255 * np.abs(mesh.vertices)).astype(np.uint8)
+    data = mesh.export(file_type="ply")
+    new = painted(read_object(data, name="ball.ply").obj)
+    images = target.render(new, VIEWS, size=(64, 64)).astype(int)
+    for out, name in ((repaint_file(data, new, name="ball.ply").data, "b.zip"), (write_glb(new), "b.glb")):
+        again = target.render(read_object(out, name=name).obj, VIEWS, size=(64, 64))
+        assert np.abs(images - again).max() <= 1
+    assert (images != 255).any()
+
+
+@given(st.lists(st.floats(-1e6, 1e6, width=32), min_size=9, max_size=9, unique=True))
+@settings(max_examples=50)
+def test_every_number_of_a_part_survives_the_obj_it_is_written_to(numbers: list[float]) -> None:
+    vertices = np.array(numbers, np.float32).reshape(3, 3)
+    part = Part("m", vertices, np.eye(3, dtype=np.float32), vertices[:, :2].copy(), np.array([[2, 0, 1]], np.int32))
+    (again,) = parse_obj(obj_text((part,)), "t.obj")
+    assert (again.vertices[again.faces] == part.vertices[part.faces]).all()
+    assert (again.uvs[again.faces] == part.uvs[part.faces]).all()
+
+
+def test_a_texture_multiplied_by_one_is_itself_and_by_black_is_black() -> None:
+    assert tinted(PICTURE, (1.0, 1.0, 1.0)) is PICTURE
+    assert not tinted(PICTURE, (0.0, 0.0, 0.0)).any()
+    assert (encode_srgb(linear_rgb(np.arange(256, dtype=np.uint8))) == np.arange(256)).all()
+
+
+@given(st.integers(0, 255), st.floats(0.05, 1.0), st.floats(0.05, 1.0))
+def test_alpha_is_cut_on_the_same_side_of_one_half_as_of_the_files_cutoff(
+    alpha: int, factor: float, cutoff: float
+) -> None:
+    if abs(alpha / 255 * factor - cutoff) < 0.005:
+        return
+    (mapped,) = cutout_alpha(np.array([alpha], np.uint8), factor=factor, cutoff=cutoff)
+    assert (mapped / 255 >= 0.5) == (alpha / 255 * factor >= cutoff)
+
+
+def test_channels_are_made_smaller_one_by_one() -> None:
+    picture = np.zeros((64, 32, 4), np.uint8)
+    picture[..., 0] = 200  # under an alpha of zero, which would take the colour with it
+    small = shrink(picture, 16)
+    assert small.shape == (16, 8, 4)
+    assert (small[..., 0] == 200).all()
+
+
+# In a process of its own
+
+
+def test_a_file_is_read_and_repainted_in_another_process_as_in_this_one(mug: Object3D) -> None:
+    data = mug.to_zip()
+    converted = import_file(data, name="mug.zip")
+    assert load_object(converted.archive).files == mug.files
+    assert converted.format == "sailenv"
+    assert converted.textures == {name: image.shape[:2] for name, image in mug.textures.items()}
+    assert converted.radius == pytest.approx(mug.radius)
+    new = painted(mug)
+    assert repaint_limited(data, new, name="mug.zip") == repaint_file(data, new, name="mug.zip")
+
+
+def test_what_another_process_refuses_is_refused_with_its_words() -> None:
+    with pytest.raises(ObjectError, match="is not a supported model file"):
+        import_file(b"no model", name="t.bin")
+
+
+# The real objects
+
+
+@pytest.fixture
+def assets() -> Path:
+    folder = os.environ.get("TROMPE_ASSETS")
+    if folder is None:
+        pytest.skip("TROMPE_ASSETS is not set")
+    return Path(folder)
+
+
+@pytest.mark.assets
+@needs_assimp
+def test_the_fbx_of_the_cube_is_the_cube_that_was_published_as_obj(assets: Path, target: SailenvTarget) -> None:
+    names = ("cube_of_power.fbx", "Cube_AlbedoTransparency.png")
+    cube = read_object(pack_zip({name: (assets / "fbx" / name).read_bytes() for name in names}), name="cube.zip").obj
+    published = load_object(assets / "fbx" / "cube_of_power.obj")
+    assert cube.radius == pytest.approx(published.radius, rel=1e-6)
+    images = [target.render(obj, VIEWS, size=(96, 96)).astype(int) for obj in (cube, published)]
+    assert np.abs(images[0] - images[1]).max() <= 1
+
+
+@pytest.mark.assets
+@pytest.mark.parametrize("name", ["candle", "pot", "tennis_racket", "toilet_paper"])
+def test_a_published_object_looks_the_same_as_glb(name: str, assets: Path, target: SailenvTarget) -> None:
+    obj = load_object(assets / "objects" / name)
+    views = [View(Camera(3 * obj.radius, azimuth, 20.0)) for azimuth in (0.0, 130.0)]
+    again = read_object(write_glb(obj), name="t.glb").obj
+    images = [target.render(each, views, size=(128, 128)).astype(int) for each in (obj, again)]
+    assert np.abs(images[0] - images[1]).max() <= 1
+
+
+@pytest.mark.assets
+@needs_assimp
+def test_a_picture_inside_an_fbx_is_painted_there(assets: Path) -> None:
+    plain = (assets / "fbx" / "cube_of_power.fbx").read_bytes()
+    picture = (assets / "fbx" / "Cube_AlbedoTransparency.png").read_bytes()
+    tree = parse_tree(plain)
+    assert tree.to_bytes() == plain
+    data = with_picture_inside(tree, picture)
+    assert parse_tree(data).pictures() == {"Cube_AlbedoTransparency.png": picture}
+    _, out = comes_back(data, "cube.fbx")
+    assert parse_tree(out).with_pictures({"Cube_AlbedoTransparency.png": None}).to_bytes() == plain
+
+
+@pytest.mark.parametrize("cut", [30, 60, 200])
+def test_a_binary_fbx_that_is_no_tree_is_refused(cut: int) -> None:
+    data = (
+        MAGIC + (7400).to_bytes(4, "little") + bytes([cut, 0, 0, 0, 1, 0, 0, 0, 99, 0, 0, 0, 4]) + b"Node" + bytes(20)
+    )
+    assert "FBX" in refusal(data, "t.fbx")

@@ -1,0 +1,478 @@
+"""glTF in and out: what is shown is what was there, and only base colours come back changed."""
+
+import base64
+import json
+import math
+from collections.abc import Callable
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from PIL import Image
+
+from tests.made_objects import CORNERS, SQUARE, UVS, Scene
+from tests.small_models import corners, painted, refusal, same_paint
+from trompe_server.formats import read_object, repaint_file, write_glb
+from trompe_server.formats.gltf_container import split_glb
+from trompe_server.renderers import SailenvTarget
+from trompe_shared.errors import ObjectError
+from trompe_shared.geometry import Camera, View
+from trompe_shared.object3d import Object3D, decode_rgb, encode_png, load_object, pack_zip, unpack
+
+Json = dict[str, Any]
+Pixels = NDArray[np.uint8]
+
+HALF = math.sqrt(0.5)
+GRADIENT = np.arange(16 * 16 * 3, dtype=np.uint8).reshape(16, 16, 3)
+VIEWS = [View(Camera(3.0, azimuth, 15.0)) for azimuth in (-30.0, 20.0, 170.0)]
+
+
+def textured(picture: Pixels = GRADIENT, **material: Any) -> Scene:
+    scene = Scene()
+    scene.square(scene.material(scene.texture(picture), **material))
+    return scene
+
+
+def read(data: bytes | Scene) -> Object3D:
+    return read_object(data.to_glb() if isinstance(data, Scene) else data, name="scene.glb").obj
+
+
+def repainted(data: bytes, obj: Object3D) -> bytes:
+    return repaint_file(data, obj, name="scene.glb").data
+
+
+def painted_over(scene: Scene) -> tuple[Object3D, bytes]:
+    """The object of ``scene`` with other paint, and the repainted file."""
+    data = scene.to_glb()
+    new = painted(read(data))
+    return new, repainted(data, new)
+
+
+def beside(scene: Scene) -> Scene:
+    """The two meshes of ``scene`` side by side."""
+    scene.document["nodes"] = [{"mesh": 0, "children": [1]}, {"mesh": 1, "translation": [3, 0, 0]}]
+    return scene
+
+
+def contents(data: bytes) -> tuple[Json, bytes]:
+    chunks = split_glb(data)
+    return json.loads(chunks[0][1]), chunks[1][1]
+
+
+# What is read
+
+
+def test_a_textured_square_is_read_as_it_is() -> None:
+    obj = read(textured())
+    assert (corners(obj) == SQUARE[CORNERS].reshape(2, 3, 3)).all()
+    ((name, image),) = obj.textures.items()
+    assert (image == GRADIENT).all()
+    (part,) = obj.parts
+    assert part.uvs[part.faces].reshape(-1, 2).tolist() == (np.array([0, 1], "<f4") + UVS[CORNERS] * [1, -1]).tolist()
+    assert obj.materials[part.material].metallic is None
+    assert name == "image_0.png"
+
+
+def test_nodes_stand_where_the_tree_puts_them_and_mirrored_ones_face_outwards() -> None:
+    scene = textured()
+    scene.document["nodes"] = [
+        {"children": [1, 2], "translation": [0, 0, 5]},
+        {"mesh": 0, "rotation": [0, HALF, 0, HALF], "scale": [2, 2, 2]},
+        {"mesh": 0, "matrix": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 10, 0, 0, 1]},
+    ]
+    turned, mirrored = read(scene).parts[0], read(scene).parts[0]
+    faces = turned.vertices[turned.faces]
+    normals = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    np.testing.assert_allclose(normals[:2], [[16, 0, 0]] * 2, atol=1e-5)  # a quarter turn about y: faces +x
+    np.testing.assert_allclose(normals[2:], [[0, 0, 4]] * 2, atol=1e-5)  # mirrored, and still faces +z
+    np.testing.assert_allclose(faces[:2].reshape(-1, 3)[:, 2].min(), 3, atol=1e-5)
+    np.testing.assert_allclose(faces[2:].reshape(-1, 3)[:, 0].max(), 11, atol=1e-5)
+    np.testing.assert_allclose(mirrored.normals[mirrored.faces][2:], np.tile([0, 0, 1], (2, 3, 1)), atol=1e-6)
+
+
+def test_a_colour_factor_is_multiplied_in_linear_light() -> None:
+    grey = np.full((4, 4, 3), 188, np.uint8)  # half of white, linear
+    image = next(iter(read(textured(grey, factor=[1.0, 0.5, 0.0, 1.0])).textures.values()))
+    assert image[0, 0].tolist() == [188, 137, 0]
+
+
+@pytest.mark.parametrize(
+    ("mode", "alpha", "expected"),
+    [
+        pytest.param({}, 40, None, id="opaque: alpha means nothing"),
+        pytest.param({"alphaMode": "MASK"}, 40, 40, id="mask"),
+        pytest.param({"alphaMode": "MASK", "alphaCutoff": 0.25}, 40, 80, id="mask with another cutoff"),
+        pytest.param({"alphaMode": "BLEND", "factor": [1.0, 1.0, 1.0, 0.3]}, 40, 40, id="blend: its factor is apart"),
+    ],
+)
+def test_alpha_cuts_where_the_material_says_so(mode: Json, alpha: int, expected: int | None) -> None:
+    picture = np.dstack([GRADIENT, np.full((16, 16), alpha, np.uint8)])
+    obj = read(textured(picture, **mode))
+    ((name, _),) = obj.textures.items()
+    with Image.open(BytesIO(obj.files[name])) as image:
+        found = np.array(image.getchannel("A")).max() if "A" in image.getbands() else None
+    assert found == expected
+
+
+@pytest.mark.parametrize(
+    ("mode", "alpha", "opacity"),
+    [
+        pytest.param({"alphaMode": "BLEND", "factor": [1.0, 1.0, 1.0, 0.25]}, 255, 0.25, id="a factor"),
+        pytest.param({"alphaMode": "BLEND"}, 254, 1.0, id="an image"),
+        pytest.param({"alphaMode": "BLEND"}, 255, None, id="opaque everywhere"),
+        pytest.param({"alphaMode": "MASK", "factor": [1.0, 1.0, 1.0, 0.25]}, 255, None, id="mask"),
+        pytest.param({"factor": [1.0, 1.0, 1.0, 0.25]}, 100, None, id="opaque"),
+    ],
+)
+def test_a_blended_material_has_an_opacity_there_and_back(mode: Json, alpha: int, opacity: float | None) -> None:
+    data = textured(np.dstack([GRADIENT, np.full((16, 16), alpha, np.uint8)]), **mode).to_glb()
+    obj = read(data)
+    (material,) = obj.materials.values()
+    assert material.opacity == opacity
+    out = repainted(data, painted(obj))
+    assert contents(out)[0]["materials"] == contents(data)[0]["materials"]
+    (again,) = read(out).materials.values()
+    assert again == material
+    (written,) = read(write_glb(obj)).materials.values()
+    assert written.opacity == opacity
+
+
+def test_both_sides_of_a_double_sided_material_are_there() -> None:
+    (part,) = read(textured(doubleSided=True)).parts
+    assert len(part.faces) == 4
+    sides = part.normals[part.faces][:, 0, 2]
+    assert sorted(sides.tolist()) == [-1, -1, 1, 1]
+
+
+def test_metal_and_roughness_become_unitys_map() -> None:
+    scene = textured()
+    picture = np.dstack([np.zeros((4, 4), np.uint8), np.full((4, 4), 200, np.uint8), np.full((4, 4), 100, np.uint8)])
+    scene.document["materials"][0]["pbrMetallicRoughness"] |= {
+        "metallicRoughnessTexture": {"index": scene.texture(picture)},
+        "metallicFactor": 0.5,
+        "roughnessFactor": 1.0,
+    }
+    obj = read(scene)
+    (material,) = obj.materials.values()
+    assert material.metallic is not None
+    with Image.open(BytesIO(obj.files[material.metallic])) as image:
+        assert image.getpixel((0, 0)) == (50, 50, 50, 55)
+
+
+def test_texture_coordinates_are_moved_by_khr_texture_transform() -> None:
+    scene = textured()
+    info = scene.document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+    info["extensions"] = {"KHR_texture_transform": {"offset": [0.5, 0.0], "scale": [2.0, 1.0], "rotation": math.pi / 2}}
+    (part,) = read(scene).parts
+    # (u, v) -> rotated counter-clockwise as seen on the image, where v grows downwards
+    u, v = UVS[CORNERS][:, 0] * 2, UVS[CORNERS][:, 1]
+    np.testing.assert_allclose(part.uvs[part.faces].reshape(-1, 2), np.stack([v + 0.5, 1 + u], axis=1), atol=1e-6)
+
+
+def test_the_set_of_texture_coordinates_that_the_material_names_is_read() -> None:
+    scene = Scene()
+    material = scene.material(scene.texture(GRADIENT))
+    scene.document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["texCoord"] = 1
+    scene.square(material, TEXCOORD_1=scene.accessor(UVS * np.float32(0.5)))
+    (part,) = read(scene).parts
+    assert part.uvs[:, 0].max() == 0.5
+
+
+def test_strips_and_fans_are_the_triangles_they_stand_for() -> None:
+    found = []
+    for mode, order in ((4, [0, 1, 2, 0, 2, 3]), (5, [1, 2, 0, 3]), (6, [0, 1, 2, 3])):
+        scene = textured()
+        primitive = scene.document["meshes"][0]["primitives"][0]
+        primitive |= {"mode": mode, "indices": scene.accessor(np.array(order, "<u2"))}
+        triangles = corners(read(scene))
+        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        assert (normals == [0, 0, 4]).all()
+        found.append({frozenset(map(tuple, triangle)) for triangle in triangles.tolist()})
+    assert found[0] == found[1] == found[2]
+
+
+def test_whole_numbers_stand_for_fractions_where_they_are_normalized() -> None:
+    scene = textured()
+    primitive = scene.document["meshes"][0]["primitives"][0]
+    primitive["attributes"]["TEXCOORD_0"] = scene.accessor((UVS * 65535).astype("<u2"), normalized=True)
+    (part,) = read(scene).parts
+    assert sorted(set(part.uvs[:, 0].tolist())) == [0.0, 1.0]
+
+
+def test_without_normals_faces_are_flat() -> None:
+    scene = textured()
+    del scene.document["meshes"][0]["primitives"][0]["attributes"]["NORMAL"]
+    (part,) = read(scene).parts
+    assert (part.normals == [0, 0, 1]).all()
+
+
+def test_colours_of_vertices_are_baked_into_a_texture_of_their_own() -> None:
+    scene = Scene()
+    shades = np.array([[0, 0, 0], [255, 0, 0], [255, 255, 0], [0, 255, 0]], np.uint8)
+    scene.square(
+        scene.material(),
+        COLOR_0=scene.accessor(
+            np.dstack([shades[:, None], np.full((4, 1, 1), 255)])[:, 0].astype(np.uint8), normalized=True
+        ),
+    )
+    obj = read(scene)
+    (part,) = obj.parts
+    (image,) = obj.textures.values()
+    height, width = image.shape[:2]
+    for corner, shade in zip(SQUARE, shades, strict=True):
+        u, v = part.uvs[(part.vertices == corner).all(axis=1)][0]
+        inward = (np.array([0.5, 0.5]) - [u, v]) * 0.02
+        texel = image[int((1 - v - inward[1]) * height - 0.01), int((u + inward[0]) * width - 0.01)]
+        assert np.abs(texel.astype(int) - shade).max() < 60, (corner, texel, shade)
+
+
+def test_textures_are_made_smaller_on_request() -> None:
+    obj = read_object(textured().to_glb(), name="scene.glb", max_texture=8).obj
+    assert [image.shape for image in obj.textures.values()] == [(8, 8, 3)]
+
+
+# What is not read
+
+
+def test_what_cannot_be_shown_is_refused_with_a_reason() -> None:
+    mirrored = textured()
+    mirrored.document["textures"][0]["sampler"] = mirrored.add("samplers", {"wrapS": 33648})
+    mirrored.document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = mirrored.accessor(UVS * np.float32(3))
+    assert "mirrors" in refusal(mirrored.to_glb(), "scene.glb")
+
+    apart = textured()
+    apart.document["materials"][0]["normalTexture"] = {"index": apart.texture(GRADIENT), "texCoord": 1}
+    assert "one set" in refusal(apart.to_glb(), "scene.glb")
+
+    both = Scene()
+    shade = both.accessor(np.full((4, 3), 0.5, "<f4"))
+    both.square(both.material(both.texture(GRADIENT)), COLOR_0=shade)
+    assert "bake" in refusal(both.to_glb(), "scene.glb")
+
+    empty = textured()
+    empty.document["nodes"] = [{}]
+    assert "no triangles" in refusal(empty.to_glb(), "scene.glb")
+
+
+# What comes back
+
+
+def test_an_unchanged_object_gives_the_same_bytes() -> None:
+    data = textured(factor=[0.5, 1.0, 1.0, 1.0]).to_glb()
+    assert repainted(data, read(data)) == data
+
+
+def test_only_the_base_colour_image_changes() -> None:
+    scene = textured()
+    normals = scene.texture(np.full((4, 4, 3), (128, 128, 255), np.uint8))
+    scene.document["materials"][0]["normalTexture"] = {"index": normals}
+    new, out = painted_over(scene)
+    before, after = contents(scene.to_glb()), contents(out)
+    assert {k: v for k, v in before[0].items() if k not in {"bufferViews", "buffers"}} == {
+        k: v for k, v in after[0].items() if k not in {"bufferViews", "buffers"}
+    }
+    image_view = before[0]["images"][0]["bufferView"]
+    for number, (one, other) in enumerate(zip(before[0]["bufferViews"], after[0]["bufferViews"], strict=True)):
+        pieces = [
+            c[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for c, v in ((before[1], one), (after[1], other))
+        ]
+        assert (pieces[0] == pieces[1]) == (number != image_view)
+        assert other["byteOffset"] % 4 == 0
+    same_paint(read(out), new)
+
+
+def test_a_factor_that_was_taken_in_becomes_one_and_its_alpha_stays() -> None:
+    new, out = painted_over(textured(factor=[0.5, 0.25, 1.0, 0.75], alphaMode="MASK"))
+    assert contents(out)[0]["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] == [1.0, 1.0, 1.0, 0.75]
+    assert (next(iter(read(out).textures.values())) == next(iter(new.textures.values()))).all()
+
+
+def test_an_image_used_with_two_factors_becomes_two_and_each_keeps_its_paint() -> None:
+    scene = Scene()
+    texture = scene.texture(GRADIENT)
+    scene.square(scene.material(texture))
+    scene.square(scene.material(texture, factor=[0.2, 0.9, 0.2, 1.0]))
+    new, out = painted_over(beside(scene))
+    assert len(new.textures) == 2
+    again = read(out)
+    assert [again.textures[again.albedo_of(part)].tolist() for part in again.parts] == [
+        new.textures[new.albedo_of(part)].tolist() for part in new.parts
+    ]
+
+
+def test_materials_that_look_alike_share_their_texels() -> None:
+    scene = Scene()
+    texture = scene.texture(GRADIENT)
+    scene.square(scene.material(texture))
+    scene.square(scene.material(texture, doubleSided=True))
+    new, out = painted_over(beside(scene))
+    assert len(new.textures) == 1
+    document, _ = contents(out)
+    assert (len(document["images"]), len(document["textures"])) == (1, 1)
+
+
+def test_an_image_that_is_more_than_a_base_colour_is_left_alone() -> None:
+    scene = textured(emissiveFactor=[1, 1, 1])
+    scene.document["materials"][0]["emissiveTexture"] = {"index": 0}
+    document, chunk = contents(painted_over(scene)[1])
+    assert document["materials"][0]["emissiveTexture"]["index"] == 0
+    assert document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["index"] == 1
+    view = document["bufferViews"][document["images"][document["textures"][0]["source"]]["bufferView"]]
+    assert (
+        decode_rgb(chunk[view["byteOffset"] : view["byteOffset"] + view["byteLength"]], "x").tolist()
+        == GRADIENT.tolist()
+    )
+
+
+def test_alpha_of_the_image_is_kept_whatever_it_means() -> None:
+    alpha = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    document, chunk = contents(painted_over(textured(np.dstack([GRADIENT, alpha])))[1])
+    view = document["bufferViews"][document["images"][0]["bufferView"]]
+    with Image.open(BytesIO(chunk[view["byteOffset"] :][: view["byteLength"]])) as image:
+        assert (np.array(image.getchannel("A")) == alpha).all()
+
+
+@pytest.mark.parametrize("uvs", [None, UVS], ids=["without texture coordinates", "with them"])
+@pytest.mark.parametrize("colours", [False, True])
+def test_a_flat_colour_becomes_a_texture_and_the_mesh_gets_coordinates_if_it_has_none(
+    uvs: NDArray[Any] | None, colours: bool
+) -> None:
+    scene = Scene()
+    shade = {"COLOR_0": scene.accessor(np.linspace(0, 1, 12, dtype="<f4").reshape(4, 3))} if colours else {}
+    scene.square(scene.material(factor=[0.5, 0.1, 0.1, 1.0]), uvs=uvs, **shade)
+    scene.square(0)
+    new, out = painted_over(beside(scene))
+    same_paint(read(out), new)
+
+
+def test_paint_for_another_mesh_is_refused() -> None:
+    data = textured().to_glb()
+    other = textured()
+    other.document["nodes"][0]["scale"] = [2, 2, 2]
+    with pytest.raises(ObjectError, match="is not the uploaded one"):
+        repainted(data, painted(read(other)))
+
+
+def external(ending: str = "png") -> dict[str, bytes]:
+    """The textured square in a folder: JSON, buffer, and the picture in a folder of its own."""
+    scene = textured()
+    document = scene.document | {
+        "images": [{"uri": f"my%20maps/skin.{ending}"}],
+        "buffers": [{"byteLength": len(scene.data), "uri": "square.bin"}],
+    }
+    text = json.dumps(document, indent=1).encode()
+    return {
+        "square.gltf": text,
+        "square.bin": scene.data,
+        f"my maps/skin.{ending}": encode_png(GRADIENT),
+        "notes.txt": b"!",
+    }
+
+
+def test_of_a_folder_only_the_picture_changes() -> None:
+    files = external()
+    data = pack_zip(files)
+    new = painted(read_object(data, name="square.zip").obj)
+    exported = repaint_file(data, new, name="square.zip")
+    after = unpack(exported.data)
+    assert exported.ending == ".zip"
+    assert [name for name in files if after[name] != files[name]] == ["my maps/skin.png"]
+    assert list(after) == list(files)
+
+
+def test_a_picture_that_was_no_png_becomes_one_and_is_named_so() -> None:
+    data = pack_zip(external("jpg"))
+    after = unpack(repaint_file(data, painted(read_object(data, name="s.zip").obj), name="s.zip").data)
+    assert json.loads(after["square.gltf"])["images"] == [{"uri": "my%20maps/skin.png"}]
+    assert after["my maps/skin.png"][:4] == b"\x89PNG"
+    assert "my maps/skin.jpg" not in after
+
+
+def test_data_uris_stay_inside() -> None:
+    scene = textured()
+    picture = "data:image/png;base64," + base64.b64encode(encode_png(GRADIENT)).decode()
+    buffer = "data:application/octet-stream;base64," + base64.b64encode(scene.data).decode()
+    document = scene.document | {
+        "images": [{"uri": picture}],
+        "buffers": [{"byteLength": len(scene.data), "uri": buffer}],
+    }
+    data = json.dumps(document).encode()
+    new = painted(read_object(data, name="s.gltf").obj)
+    exported = repaint_file(data, new, name="s.gltf")
+    assert exported.ending == ".gltf"
+    after = json.loads(exported.data)
+    assert after["buffers"] == document["buffers"]
+    again = read_object(exported.data, name="s.gltf").obj
+    assert (next(iter(again.textures.values())) == next(iter(new.textures.values()))).all()
+
+
+# GLB from any object
+
+
+def test_any_object_becomes_a_glb_that_is_the_same_object(mug: Object3D) -> None:
+    again = read(write_glb(mug))
+    assert (corners(again) == corners(mug)).all()
+    for one, other in zip(again.parts, mug.parts, strict=True):
+        np.testing.assert_allclose(one.uvs[one.faces], other.uvs[other.faces], atol=6e-8)
+        np.testing.assert_allclose(one.normals[one.faces], other.normals[other.faces], atol=1.2e-7)
+        assert (again.textures[again.albedo_of(one)] == mug.textures[mug.albedo_of(other)]).all()
+
+
+def test_an_object_looks_the_same_as_glb(target: SailenvTarget, make_object: Callable[..., Object3D]) -> None:
+    random = np.random.default_rng(3)
+    side = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0.2], [0.5, 0.5, 0], [-0.5, 0.5, 0.2]])
+    uvs = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.5], [0.0, 1.5]])
+    rows = [0, 1, 2, 0, 2, 3]
+    surface = side[rows].reshape(-1, 3, 3), uvs[rows].reshape(-1, 3, 2)
+    plain = make_object((*surface, random.integers(0, 256, (32, 32, 3), dtype=np.uint8)))
+    maps = {"normal": random.integers((100, 100, 199), (156, 156, 255), (16, 16, 3), dtype=np.uint8)}
+    maps["metallic"] = random.integers(0, 256, (16, 16, 4), dtype=np.uint8)
+    files = dict(plain.files) | {f"{name}.png": encode_png(image) for name, image in maps.items()}
+    cut = np.dstack([plain.textures["m0.png"], random.integers(0, 256, (32, 32), dtype=np.uint8)])
+    files["m0.png"] = encode_png(cut)
+    files["made_mat_def.json"] = json.dumps(
+        {"m0": {"albedo": "m0.png", "normal": "normal.png", "metallic": "metallic.png"}}
+    ).encode()
+    obj = load_object(pack_zip(files))
+    before = target.render(obj, VIEWS, size=(64, 64))
+    after = target.render(read(write_glb(obj)), VIEWS, size=(64, 64))
+    assert np.abs(before.astype(int) - after).max() <= 1
+    assert (before != 255).any()
+
+
+def test_a_glb_and_the_zip_of_it_look_the_same_after_repainting(target: SailenvTarget) -> None:
+    scene = textured(factor=[0.9, 0.6, 0.6, 1.0], doubleSided=True)
+    scene.square(scene.material(factor=[0.1, 0.4, 0.1, 1.0]), uvs=None)
+    scene.document["nodes"] = [
+        {"mesh": 0, "children": [1], "scale": [0.5, 0.5, 0.5]},
+        {"mesh": 1, "scale": [-1, 1, 1], "translation": [0.5, 0.5, -0.5]},
+    ]
+    new, out = painted_over(scene)
+    before = target.render(new, VIEWS, size=(64, 64))
+    after = target.render(read(out), VIEWS, size=(64, 64))
+    assert np.abs(before.astype(int) - after).max() <= 1
+
+
+@given(
+    st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-3, 3)),
+    st.tuples(*[st.floats(0.1, 3) | st.floats(-3, -0.1)] * 3),
+    st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(x * x for x in q) > 0.01),
+)
+@settings(max_examples=30)
+def test_any_place_keeps_normals_on_the_side_that_triangles_face(
+    translation: tuple[float, ...], scale: tuple[float, ...], rotation: tuple[float, ...]
+) -> None:
+    scene = textured()
+    length = math.sqrt(sum(x * x for x in rotation))
+    scene.document["nodes"] = [
+        {"mesh": 0, "translation": translation, "scale": scale, "rotation": [x / length for x in rotation]}
+    ]
+    (part,) = read(scene).parts
+    faces = part.vertices[part.faces].astype(np.float64)
+    facing = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+    np.testing.assert_allclose(facing, part.normals[part.faces][:, 0], atol=1e-3)

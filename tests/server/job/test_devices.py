@@ -1,0 +1,91 @@
+"""Whole jobs on another device than the CPU: each kind of attack, in several chunks, to the same result."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.fakes import FakeTarget
+from tests.job_runs import MemoryArtifacts, run_job, spec_of
+from tests.pretend_device import pretend_device
+from tests.scores_only import Scores
+from trompe_server.attack import Budget, Goal, attack, start
+from trompe_server.classifiers import NetworkClassifier, load_classifier
+from trompe_server.job.texture_attack import CHUNK
+from trompe_server.library import Library
+from trompe_server.surrogate import SamplingModel, diffuse_surrogate, prepare_geometry, textures_of
+from trompe_shared.geometry import Camera, Light, View
+from trompe_shared.object3d import Object3D
+
+SIZE = (128, 128)
+MUG_VIEWS = [View(Camera(0.25, 60.0 * k, 20), Light(0, 60), (255, 255, 255)) for k in range(3)]
+
+KINDS: dict[str, dict[str, Any]] = {
+    "calibrated": {"surrogate": "calibrated"},
+    "curve, saliency": {"surrogate": "curve", "tau": 0.05},
+    "few texels": {"keep": 0.2},
+    "view budget": {"epsilon_view": 0.05, "optimiser": "pgd", "loss": "cross_entropy"},
+    "pool": {"pool": 12, "views_per_step": 6, "background": ["white", "black"]},
+    "ensemble": {"ensemble": ["tiny"], "judges": ["tiny"]},
+    "scores": {"queries": 20},
+}
+
+
+def done(kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *, device: str) -> MemoryArtifacts:
+    """The files of a finished job."""
+    if "queries" in KINDS[kind]:
+        hidden = "trompe_server.job.setup._stored_classifier"
+        monkeypatch.setattr(hidden, lambda _, *, device, **__: Scores(load_classifier("tiny", device=device)))
+    spec = spec_of(steps=CHUNK + 1, **KINDS[kind])
+    return run_job(spec, Library(folder), target=FakeTarget(2000), device=device).artifacts
+
+
+@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_job_on_another_device_is_the_same_job(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = done(kind, tmp_path / "cpu", monkeypatch, device="cpu")
+    found = done(kind, tmp_path / "other", monkeypatch, device=pretend_device(monkeypatch))
+    assert "result.json" in expected.files
+    assert found.lasting() == expected.lasting()
+
+
+def test_an_attack_computes_on_its_surrogates_device(mug: Object3D, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Textures, masks and a loaded state come from the CPU all the same."""
+    textures, masks = textures_of(mug), torch.rand(len(MUG_VIEWS), *SIZE) < 0.5
+    texels = {name: torch.rand(texture.shape[:2]) < 0.5 for name, texture in textures.items()}
+    found = []
+    for device in ("cpu", pretend_device(monkeypatch)):
+        geometry = prepare_geometry(mug, MUG_VIEWS, size=SIZE, sampling=SamplingModel(), device=device)
+        classifier = load_classifier("tiny", device=device)
+        assert isinstance(classifier, NetworkClassifier)
+        state = attack(
+            *(start(textures), textures, diffuse_surrogate(geometry, MUG_VIEWS), classifier),
+            goal=Goal((classifier.classes or ()).index("mug")),
+            budget=Budget(0.1, 0.03),
+            steps=2,
+            masks=masks,
+            texels=texels,
+        )
+        found.append({name: delta.cpu() for name, delta in state.deltas.items()})
+    expected, other = found
+    assert any(delta.any() for delta in expected.values())
+    assert all(torch.equal(expected[name], other[name]) for name in expected)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_job_on_a_graphics_card_comes_to_the_result_of_the_cpu(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To within rounding, which sign steps amplify: the classes of the views count."""
+    expected = done(kind, tmp_path / "cpu", monkeypatch, device="cpu").result()
+    found = done(kind, tmp_path / "cuda", monkeypatch, device="cuda").result()
+    pairs = [(expected.surrogate, found.surrogate), (expected.target, found.target)]
+    for one, other in pairs:
+        if one is not None and other is not None:
+            assert other.a_before == one.a_before
+            assert one.a_after is not None
+            assert other.a_after is not None
+            assert np.isclose(other.a_after, one.a_after, atol=0.25)

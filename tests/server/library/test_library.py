@@ -1,0 +1,119 @@
+"""The library: uploads, references, and inspection of classifiers without importing torch here."""
+
+import io
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE
+from trompe_server.errors import AmbiguousError, NotFoundError
+from trompe_server.library import Library
+from trompe_server.library.inspection import inspect_classifier
+from trompe_server.storage.folders import open_folder
+from trompe_shared.errors import ClassifierError, ObjectError
+from trompe_shared.object3d import load_object
+from trompe_shared.shipped import shipped_objects
+
+EXPORT = """
+import sys, torch
+class Net(torch.nn.Module):
+    def forward(self, x):
+        return x.mean(dim=(2, 3))
+batch = torch.export.Dim("batch", min=1, max=4096)
+torch.export.save(torch.export.export(Net(), (torch.zeros(2, 3, 8, 12),), dynamic_shapes=({0: batch},)), sys.argv[1])
+"""
+
+
+def test_an_object_comes_back_byte_for_byte(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
+    info = Library(tmp_path).add_object(io.BytesIO(triangle_zip()), "triangle.zip")
+    again = Library(tmp_path)
+    assert again.object("triangle") == info
+    assert again.object_bytes(info.id) == again.object_bytes(info.id[:6]) == triangle_zip()
+
+
+def test_the_same_upload_from_many_sides_at_once_is_stored_once(
+    tmp_path: Path, triangle_zip: Callable[..., bytes]
+) -> None:
+    library = Library(tmp_path)
+    with ThreadPoolExecutor(8) as pool:
+        infos = list(pool.map(lambda _: library.add_object(io.BytesIO(triangle_zip()), "triangle.zip"), range(16)))
+    assert len({info.id for info in infos}) == 1
+    assert len(list(tmp_path.rglob("data.zip"))) == 1
+    assert list(tmp_path.rglob(".*")) == []
+
+
+def test_short_beginnings_of_ids_are_not_taken(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
+    info = Library(tmp_path).add_object(io.BytesIO(triangle_zip()), "triangle.zip")
+    with pytest.raises(NotFoundError, match="triangle"):
+        Library(tmp_path).object(info.id[:5])
+
+
+def test_a_beginning_that_fits_two_ids_is_refused(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
+    library = Library(tmp_path)
+    info = library.add_object(io.BytesIO(triangle_zip()), "one.zip")
+    for identity in ("abcdef1", "abcdef2"):
+        stored = info.model_copy(update={"id": identity, "name": identity}).model_dump_json()
+        open_folder(tmp_path).within("objects").within(identity).write("info.json", stored.encode())
+    with pytest.raises(AmbiguousError, match="abcdef1, abcdef2"):
+        library.object("abcdef")
+
+
+def test_an_upload_that_cannot_be_read_leaves_nothing_behind(tmp_path: Path) -> None:
+    with pytest.raises(ObjectError):
+        Library(tmp_path).add_object(io.BytesIO(b"no zip"), "x.zip")
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_shipped_objects_are_there_from_the_start(tmp_path: Path) -> None:
+    infos = {info.name: info for info in Library(tmp_path).objects()}
+    assert list(infos) == list(shipped_objects())
+    assert all(info.shipped for info in infos.values())
+    assert load_object(Library(tmp_path).object_bytes("mug")).n_texels > 0
+
+
+def test_a_classifier_file_is_described_by_a_process_of_its_own_once(tmp_path: Path) -> None:
+    file = tmp_path / "net.pt2"
+    subprocess.run([sys.executable, "-W", "ignore", "-c", EXPORT, str(file)], check=True)
+    inspected: list[str] = []
+
+    def inspect(path: str) -> dict[str, object]:
+        inspected.append(path)
+        return inspect_classifier(path)
+
+    library = Library(tmp_path / "library", inspect=inspect)
+    with file.open("rb") as content:
+        info = library.add_classifier(content, "net.pt2", classes=["r", "g", "b"], name="colours")
+    assert (info.name, info.white_box, info.image_size, info.n_classes) == ("colours", True, (8, 12), 3)
+    assert info.classes == ["r", "g", "b"]
+    assert Path(library.classifier_path("colours")).read_bytes() == file.read_bytes()
+    with file.open("rb") as content:
+        again = library.add_classifier(content, "net.pt2")
+    assert again == info.model_copy(update={"name": "net"})
+    assert len(inspected) == 1
+    with file.open("rb") as content, pytest.raises(ClassifierError, match="2 class names for a classifier of 3"):
+        library.add_classifier(content, "net.pt2", classes=["r", "g"])
+
+
+def test_a_file_that_is_no_classifier_is_refused_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    with pytest.raises(ClassifierError):
+        Library(tmp_path).add_classifier(io.BytesIO(b"no network"), "net.pt2")
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_the_shipped_classifier_is_described_as_it_is(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    info = library.classifier("tiny")
+    assert library.classifier_path("tiny") == "tiny"
+    assert info.classes == list(CLASSES)
+    assert (info.n_classes, info.image_size, info.white_box) == (len(CLASSES), IMAGE_SIZE, True)
+
+
+def test_the_api_process_never_imports_torch_and_alembic_only_to_migrate() -> None:
+    modules = ", ".join(f"trompe_server.service.{name}" for name in ("app", "serve", "commands"))
+    script = f"import sys, {modules}; print('torch' in sys.modules, 'alembic' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False False"

@@ -1,0 +1,171 @@
+"""The SAILenv target when the other end is not there, is silent, or is something else: always an error that helps."""
+
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+
+import numpy as np
+import pytest
+
+from tests.small_models import OBJ
+from trompe_server.renderers import SailenvTarget, local_renderer
+from trompe_shared.errors import RendererError
+from trompe_shared.geometry import Camera, View
+from trompe_shared.object3d import Object3D, encode_png, object_from_files
+from trompe_shared.sailenv import COMMANDS, REGISTER, decode_request, encode_frame
+from trompe_shared.sailenv_client import engine_at
+
+VIEW = View(Camera(1.0, 0.0, 0.0))
+
+
+def triangle() -> Object3D:
+    table = b'{"m": {"albedo": "a.png"}}'
+    return object_from_files(
+        {"t.obj": OBJ, "t_mat_def.json": table, "a.png": encode_png(np.zeros((2, 2, 3), np.uint8))}
+    )
+
+
+@contextmanager
+def listening(answer: Callable[[socket.socket], None]) -> Iterator[tuple[str, int]]:
+    """A server whose one connection is handled by ``answer`` in a thread."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            connection, _ = listener.accept()
+            with connection:
+                answer(connection)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield listener.getsockname()[:2]
+        thread.join(timeout=30)
+
+
+def render(address: tuple[str, int], *, timeout: float = 30.0) -> str:
+    """The message of the error that rendering raises."""
+    with closing(SailenvTarget(*address, timeout=timeout)) as target, pytest.raises(RendererError) as raised:
+        target.render(triangle(), [VIEW], size=(8, 8))
+    assert f"{address[0]}:{address[1]}" in str(raised.value)
+    return str(raised.value)
+
+
+def pretend(frame: list[bytes], *, instance: str = "1") -> Callable[[socket.socket], None]:
+    """A renderer that agrees to everything and answers each FRAME with ``frame``, until the client hangs up."""
+
+    def answer(connection: socket.socket) -> None:
+        stream = connection.makefile("rb")
+
+        def read(count: int) -> bytes:
+            data = stream.read(count)
+            if len(data) < count:
+                raise EOFError
+            return data
+
+        with stream, suppress(EOFError):
+            REGISTER.decode_fields(read)
+            connection.sendall(REGISTER.encode_reply(0, []))
+            while True:
+                name = decode_request(read, is_long=lambda: True).command.name
+                values = {"send_obj_zip": ("path",), "spawn_object": (instance,), "last_error": ("lamp is broken",)}
+                values["get_light_type"] = ("light_not_found",)
+                reply = b"".join(frame) if name == "frame" else COMMANDS[name].encode_reply(*values.get(name, ()))
+                connection.sendall(reply)
+
+    return answer
+
+
+def test_where_nothing_listens_the_error_says_how_to_start_a_renderer() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        address = listener.getsockname()[:2]
+    message = render(address)
+    assert f"trompe render --host 127.0.0.1 --port {address[1]}" in message
+
+
+def test_a_renderer_that_stays_silent_is_given_up() -> None:
+    done = threading.Event()
+
+    def answer(connection: socket.socket) -> None:
+        done.wait(20)
+
+    with listening(answer) as address:
+        assert "did not answer within" in render(address, timeout=0.2)
+        done.set()
+
+
+def frame(picture: bytes, *, delta_time: float = 0.0) -> list[bytes]:
+    return encode_frame([picture], delta_time=delta_time, compress=False)
+
+
+def saying(data: bytes) -> Callable[[socket.socket], None]:
+    """Answers the first bytes with ``data``."""
+
+    def answer(connection: socket.socket) -> None:
+        connection.recv(9)
+        connection.sendall(data)
+
+    return answer
+
+
+BLACK = encode_png(np.zeros((8, 8, 3), np.uint8))
+OTHER = "not a SAILenv renderer"
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        pytest.param(lambda connection: None, "trompe render", id="hangs up"),
+        pytest.param(saying(b"HTTP/1.1 400 Bad Request\r\n\r\n" * 9), OTHER, id="another protocol"),
+        pytest.param(saying(struct.pack("<ii", 0, -1)), OTHER, id="a negative length"),
+        pytest.param(pretend(frame(encode_png(np.zeros((4, 8, 3), np.uint8)))), OTHER, id="wrong size"),
+        pytest.param(pretend(frame(b"no picture")), OTHER, id="not an image"),
+        pytest.param(pretend(frame(BLACK, delta_time=float("nan"))), "lamp is broken", id="a frame marked as failed"),
+        pytest.param(pretend([], instance=""), "lamp is broken", id="an object that is not spawned"),
+    ],
+)
+def test_a_renderer_that_fails_is_an_error_with_the_reason(answer: Callable[[socket.socket], None], words: str) -> None:
+    with listening(answer) as address:
+        assert words in render(address)
+
+
+def test_images_come_back_unmirrored() -> None:
+    sent = np.zeros((8, 8, 3), np.uint8)
+    sent[:, 0] = 200
+    with listening(pretend(frame(encode_png(sent)))) as address, closing(SailenvTarget(*address)) as target:
+        images = target.render(triangle(), [VIEW, VIEW], size=(8, 8))
+        target.close()
+    assert (images == sent[:, ::-1]).all()
+
+
+# A worker of one's own
+
+
+def test_a_local_renderer_renders_and_ends_with_its_block() -> None:
+    with local_renderer() as target:
+        assert (target.render(triangle(), [VIEW], size=(8, 8)) < 255).any()
+        address = target.address
+    assert engine_at(*address, timeout=5) is None
+
+
+def test_a_local_renderer_ends_when_its_parent_is_killed() -> None:
+    lines = (
+        "import os, signal",
+        "from trompe_server.renderers import local_renderer",
+        "with local_renderer() as target:",
+        "    print(*target.address, flush=True)",
+        "    os.kill(os.getpid(), signal.SIGKILL)",
+    )
+    killed = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=False)
+    host, port = killed.stdout.split()
+    deadline = time.monotonic() + 30
+    while engine_at(host, int(port), timeout=5) is not None:
+        assert time.monotonic() < deadline, "it outlives its parent"
+
+
+def test_a_local_renderer_that_does_not_start_is_an_error() -> None:
+    with pytest.raises(RendererError, match="did not start"), local_renderer([sys.executable, "-c", ""]):
+        pass

@@ -1,0 +1,72 @@
+"""What people may call a class."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trompe_server.spec.labels import resolve_label, resolve_labels
+from trompe_shared.errors import LabelError, SpecError
+
+CLASSES = ["crane", "toilet tissue, toilet paper, bathroom tissue", "Crane, bird", "wall clock", "2", "toilet seat"]
+
+
+@pytest.mark.parametrize(
+    ("label", "index"),
+    [
+        pytest.param(1, 1, id="index"),
+        pytest.param("3", 3, id="digits are an index"),
+        pytest.param("2", 2, id="digits are an index even where a class is called so"),
+        pytest.param("toilet tissue, toilet paper, bathroom tissue", 1, id="full name"),
+        pytest.param("Toilet Paper", 1, id="synonym, whatever its case"),
+        pytest.param(" wall clock ", 3, id="spaces around"),
+        pytest.param("crane", 0, id="a full name goes before a synonym"),
+    ],
+)
+def test_a_label_is_an_index_a_name_or_a_synonym(label: str | int, index: int) -> None:
+    assert resolve_label(label, CLASSES, len(CLASSES), classifier="net") == index
+
+
+@pytest.mark.parametrize(
+    ("label", "words"),
+    [
+        pytest.param(6, r"6 is not a class of 'net'; its indices are 0\.\.5", id="index too large"),
+        pytest.param(-1, r"indices are 0\.\.5", id="index negative"),
+        pytest.param("toilet", "did you mean 'toilet", id="unknown with close matches"),
+        pytest.param("zzz", "example of a class is 'crane'", id="unknown without"),
+        pytest.param("zzz", "^'net' has no class 'zzz'.* or another network by `classifier`", id="network"),
+        pytest.param("", "no class ''", id="empty"),
+    ],
+)
+def test_a_label_that_fits_nothing_is_refused_with_help(label: str | int, words: str) -> None:
+    with pytest.raises(LabelError, match=words):
+        resolve_label(label, CLASSES, len(CLASSES), classifier="net")
+
+
+def test_a_label_that_fits_two_classes_is_refused_with_both() -> None:
+    with pytest.raises(LabelError, match=r"0 \(jug, cup\); 1 \(mug, cup\)"):
+        resolve_label("cup", ["jug, cup", "mug, cup"], 2, classifier="net")
+
+
+def test_one_label_or_several_are_distinct_classes_in_their_order() -> None:
+    assert resolve_labels("toilet paper", CLASSES, len(CLASSES), "net") == (1,)
+    assert resolve_labels(["wall clock", 0], CLASSES, len(CLASSES), "net") == (3, 0)
+    with pytest.raises(
+        SpecError, match="'toilet paper' and 'toilet tissue' are the same class, 1: name each `label` once"
+    ):
+        resolve_labels(["toilet paper", 3, "toilet tissue"], CLASSES, len(CLASSES), "net")
+    with pytest.raises(SpecError, match="6 of the classifier's 6 classes count as the object"):
+        resolve_labels(range(6), CLASSES, len(CLASSES), "net")
+    with pytest.raises(LabelError, match="no class 'wall'"):
+        resolve_labels([1, "wall"], CLASSES, len(CLASSES), "net")
+
+
+def test_a_name_means_nothing_to_a_classifier_without_names() -> None:
+    assert resolve_label("7", None, 10, classifier="net") == 7
+    with pytest.raises(LabelError, match=r"give an index in 0\.\.9"):
+        resolve_label("mug", None, 10, classifier="net")
+
+
+@given(st.lists(st.text("abc", min_size=1, max_size=3), unique=True, min_size=1))
+def test_every_unique_name_resolves_to_its_place(classes: list[str]) -> None:
+    found = [resolve_label(name, classes, len(classes), classifier="net") for name in classes]
+    assert found == list(range(len(classes)))

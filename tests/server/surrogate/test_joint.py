@@ -1,0 +1,91 @@
+"""Surrogates of several renderers as one: the joint one is what its parts are, side by side."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.attack_runs import LABEL, random_state, run, surrogate_of
+from tests.fakes import fake_classifier
+from trompe_server.attack import Backgrounds, Budget, Goal, movable
+from trompe_server.attack.objective import Objective
+from trompe_server.surrogate import AnySurrogate, SamplingModel, Surrogate, diffuse_surrogate, joined, textures_of
+from trompe_shared.geometry import Camera, View
+from trompe_shared.object3d import Object3D
+
+VIEWS = [View(Camera(0.3, azimuth, elevation)) for azimuth in (-40, -10, 20, 45) for elevation in (-20, 0, 30)]
+LINEAR = SamplingModel(filtered="linear", samples="centre", lod="area")
+
+
+@pytest.fixture(scope="module")
+def parts(square: Object3D) -> tuple[Surrogate, Surrogate, Surrogate]:
+    """Three renderers: one, one with another sampling, and one with the sampling of the first before black."""
+    first = surrogate_of(square, VIEWS)
+    black = [replace(view, background=(0, 0, 0)) for view in VIEWS]
+    return first, surrogate_of(square, VIEWS, sampling=LINEAR), diffuse_surrogate(first.geometry, black)
+
+
+def objective(obj: Object3D, surrogate: AnySurrogate, masks: torch.Tensor | None = None) -> Objective:
+    return Objective(textures_of(obj), surrogate, (fake_classifier(),), Goal(LABEL, loss="cross_entropy"), masks)
+
+
+def test_loss_and_gradient_are_those_of_all_parts(square: Object3D, parts: Sequence[Surrogate]) -> None:
+    joint, random = joined(parts), np.random.default_rng(0)
+    masks = torch.from_numpy(random.random((joint.n_views, 32, 32)) < 0.7)
+    deltas = random_state(square, Budget(0.06, 0.02), seed=1).deltas
+
+    def evaluated(surrogate: AnySurrogate, masks: torch.Tensor) -> tuple[float, dict[str, torch.Tensor]]:
+        one = objective(square, surrogate, masks)
+        active = torch.ones(surrogate.n_views, dtype=torch.bool)
+        found = one.evaluate(one.join(deltas), range(len(surrogate.batches)), active)
+        assert found.images == surrogate.n_views
+        return found.loss, one.split(found.gradient)
+
+    loss, gradient = evaluated(joint, masks)
+    alone = [evaluated(part, masks[12 * number :][:12]) for number, part in enumerate(parts)]
+    assert loss == pytest.approx(np.mean([each for each, _ in alone]))
+    for name, value in gradient.items():
+        torch.testing.assert_close(value, sum(each[name] for _, each in alone), atol=1e-5, rtol=1e-4)
+    influence = joint.influence(masks)
+    for name, weight in influence.items():
+        own = [part.influence(masks[12 * number :][:12])[name] for number, part in enumerate(parts)]
+        torch.testing.assert_close(weight, torch.stack(own).sum(0))
+
+
+def test_parts_with_one_geometry_share_their_texels(square: Object3D, parts: Sequence[Surrogate]) -> None:
+    joint, textures = joined(parts), textures_of(square)
+    assert len(joint.texels(textures)) == sum(part.n_texels for part in parts[:2])
+    for batch, views in enumerate(joint.batches):
+        part, first = parts[views.start // 12], views.start // 12 * 12
+        own = part.batches.index(range(views.start - first, views.stop - first))
+        torch.testing.assert_close(joint.render(joint.texels(textures), batch), part.render(part.texels(textures), own))
+
+
+def test_one_part_is_itself_and_twice_the_same_takes_the_same_steps(
+    square: Object3D, parts: Sequence[Surrogate]
+) -> None:
+    assert joined(parts[:1]) is parts[0]
+    twice = joined([parts[0], parts[0]])
+    once, both = (run(square, each, texels=movable(parts[0], Budget(0.06, 0.02))) for each in (parts[0], twice))
+    assert all(torch.equal(once.deltas[name], both.deltas[name]) for name in once.deltas)
+
+
+def test_the_bound_on_images_holds_in_each_part(square: Object3D, parts: Sequence[Surrogate]) -> None:
+    budget = Budget(0.06, 0.02, epsilon_view=0.02)
+    painted = budget.repaint(square, run(square, joined(parts), budget=budget).deltas)
+    for part in parts:
+        before, after = (part.render_all(part.texels(textures_of(each))) for each in (square, painted))
+        assert 0.005 < (after - before).abs().max() <= 0.02 + 1e-5
+
+
+def test_backgrounds_are_drawn_in_each_part(square: Object3D, parts: Sequence[Surrogate]) -> None:
+    joint = joined(parts)
+    pictures = torch.stack([torch.full((32, 32, 3), grey, dtype=torch.uint8) for grey in (255, 0)])
+    backgrounds = Backgrounds(pictures, [0] * 24 + [1] * 12)
+    moved, drawn = backgrounds.behind(joint, seed=0, step=0), backgrounds.drawn(seed=0, step=0)
+    texels = joint.texels(textures_of(square))
+    corner = torch.cat([moved.render(texels, batch)[:, 0, 0, 0] for batch in range(len(joint.batches))])
+    assert torch.equal(corner, 1 - drawn.float())
+    assert set(drawn.tolist()) == {0, 1}

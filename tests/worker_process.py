@@ -1,0 +1,53 @@
+"""Renderer worker processes for tests."""
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+SHARP, SHARP_SETTINGS = ("--set", "msaa=1"), "msaa=1"
+FLAT, FLAT_SETTINGS = ("--set", "shadows=no"), "shadows=False"
+"""Words that start a worker with other pictures, and the settings it tells."""
+
+READY = re.compile(r"trompe renderer listening on (127\.0\.0\.1):(\d+), (.+)\n")
+
+
+@dataclass(frozen=True)
+class Worker:
+    """A renderer worker on a free port."""
+
+    process: "subprocess.Popen[str]"
+    address: tuple[str, int]
+
+    @property
+    def memory(self) -> int:
+        """Resident bytes."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text(encoding="ascii")
+        return 1024 * int(re.search(r"VmRSS:\s+(\d+)", status)[1])  # type: ignore[index]
+
+    @property
+    def open(self) -> tuple[int, int]:
+        """Numbers of threads and of file descriptors."""
+        threads, files = (len(list(Path(f"/proc/{self.process.pid}/{name}").iterdir())) for name in ("task", "fd"))
+        return threads, files
+
+
+@contextmanager
+def started(*options: str, code: str | None = None, log: IO[str] | None = None) -> Iterator[Worker]:
+    """A worker for the time of a ``with``: ``trompe render`` with ``options``, or Python ``code`` in its place.
+
+    ``log`` receives its standard error.
+    """
+    program = ["-m", "trompe_renderer", "--port", "0", *options] if code is None else ["-c", code]
+    with subprocess.Popen([sys.executable, *program], stdout=subprocess.PIPE, stderr=log, text=True) as process:
+        try:
+            assert process.stdout is not None
+            ready = READY.fullmatch(process.stdout.readline())
+            assert ready, "the worker did not start"
+            yield Worker(process, (ready[1], int(ready[2])))
+        finally:
+            process.kill()
