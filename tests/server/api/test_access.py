@@ -3,6 +3,7 @@
 import asyncio
 import re
 from dataclasses import replace
+from functools import partial
 from unittest.mock import Mock
 
 import httpx
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.server.api.conftest import Api
-from trompe_server.api import rate
+from trompe_server.api import guard, rate
 from trompe_server.api.guard import OPEN_PATHS
 from trompe_server.api.rate import BURST, RateLimit
 from trompe_server.errors import ConflictError, NotFoundError
@@ -128,15 +129,16 @@ def test_names_of_tokens_are_taken_for_good_and_are_plain(api: Api) -> None:
     assert [(each.name, each.right, each.revoked is None) for each in tokens.all()] == [("ci", Right.read, False)]
 
 
-def limit(api: Api, per_second: float) -> None:
-    """Limit the rate of requests."""
+def limit(api: Api, monkeypatch: pytest.MonkeyPatch, per_second: float) -> None:
+    """Limit the rate of requests; time stands still."""
+    monkeypatch.setattr(guard, "RateLimit", partial(RateLimit, clock=lambda: 0.0))
     settings = api.services.settings.model_copy(update={"rate_limit": per_second})
     api.services = replace(api.services, settings=settings)
     api.app = create_app(api.services)
 
 
-def test_a_client_that_asks_too_often_is_told_when_to_come_back(api: Api) -> None:
-    limit(api, 0.5)
+def test_a_client_that_asks_too_often_is_told_when_to_come_back(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    limit(api, monkeypatch, 0.5)
     answers = [api.get("/v1/jobs") for _ in range(int(0.5 * BURST) + 1)]
     assert [answer.status_code for answer in answers[:-1]] == [200] * (len(answers) - 1)
     assert "Too many requests; retry in" in api.problem(answers[-1], 429)["detail"]
@@ -146,9 +148,9 @@ def test_a_client_that_asks_too_often_is_told_when_to_come_back(api: Api) -> Non
     assert api.get("/v1/jobs").status_code == 200
 
 
-def test_guessing_tokens_is_limited_by_address(api: Api) -> None:
+def test_guessing_tokens_is_limited_by_address(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     api.token("ci", Right.read)
-    limit(api, 0.1)
+    limit(api, monkeypatch, 0.1)
     guesses = [api.get("/v1/jobs", headers={"Authorization": f"Bearer trompe_{n}"}).status_code for n in range(4)]
     assert guesses == [401, 401, 429, 429]
 
