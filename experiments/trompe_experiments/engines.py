@@ -1,7 +1,7 @@
 """Renderers side by side: how well the surrogate agrees with each, and what the paint keeps in it."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Final
 
 from trompe_experiments.markdown import figure_words, markdown_table
 from trompe_experiments.style import MARKERS, PALETTE, Drawing, drawing
@@ -9,6 +9,9 @@ from trompe_experiments.table import ResultRow
 from trompe_shared.comparison import average, grouped
 
 __all__ = ["engines_chart", "engines_markdown"]
+
+OWN: Final = "the service's own"
+"""Renderers of jobs that named none."""
 
 
 def engines_chart(rows: Sequence[ResultRow]) -> Drawing:
@@ -22,7 +25,8 @@ def engines_chart(rows: Sequence[ResultRow]) -> Drawing:
             own = [row for row in rows if row.renderers == engine]
             look: Any = {"marker": MARKERS[number], "color": PALETTE[number], "ls": "", "mec": "white", "mew": 0.6}
             places = [objects.index(_what(row)) + 0.12 * (number - (len(engines) - 1) / 2) for row in own]
-            for axes, column, label in zip(made.panels, ("judged_drop", "margin_error"), (engine, None), strict=True):
+            labels = (engine or OWN, None)
+            for axes, column, label in zip(made.panels, ("judged_drop", "margin_error"), labels, strict=True):
                 axes.plot([getattr(row, column) for row in own], places, ms=7, clip_on=False, label=label, **look)
         drops, errors = made.panels
         drops.set_yticks(range(len(objects)), objects)
@@ -40,7 +44,7 @@ def engines_markdown(rows: Sequence[ResultRow]) -> str:
     head = ["renderer", "epsilon", "jobs", "surrogate and target disagree", "margin error, worst", "held-out A_drop"]
     lines = [
         [
-            _engine(engine),
+            engine or OWN,
             f"{epsilon:g}",
             str(len(some)),
             figure_words(average(row.disagreement for row in some), ".1%"),
@@ -54,10 +58,6 @@ def engines_markdown(rows: Sequence[ResultRow]) -> str:
 
 def _what(row: ResultRow) -> str:
     return f"{row.object}, ε {row.epsilon:g}"
-
-
-def _engine(names: str) -> str:
-    return names or "the service's own"
 
 
 def _known(values: Iterable[float | None]) -> list[float]:

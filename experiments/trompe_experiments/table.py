@@ -14,7 +14,7 @@ from typing import Any, Final, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from trompe_experiments.markdown import figure_words
-from trompe_shared.api import OPTIONS, Accuracy, JobSpec, JobState, Judgement, Option, Result
+from trompe_shared.api import OPTIONS, Accuracy, JobSpec, JobState, Option, Result
 from trompe_shared.errors import SpecError
 
 __all__ = [
@@ -172,10 +172,8 @@ class ResultRow(_Options):  # type: ignore[misc]
             "held_out_views": result.held_out.views if result.held_out else 0,
             **{f"fidelity_{name}": value for name, value in result.fidelity.items()},
             **_seconds(result),
-            "judge_drops": SEPARATOR.join(map(_judge_words, result.judges)),
-            "pipeline_drops": SEPARATOR.join(
-                f"{each.pipeline} {figure_words(each.held_out.a_drop, '.3f')}" for each in result.image_pipelines
-            ),
+            "judge_drops": SEPARATOR.join(_drop_words(it.classifier, it.held_out or it.target) for it in result.judges),
+            "pipeline_drops": SEPARATOR.join(_drop_words(it.pipeline, it.held_out) for it in result.image_pipelines),
             "warnings": SEPARATOR.join(result.warnings),
         }
         return cls.of_spec(place, result.spec, state=state, **(found | more))
@@ -219,10 +217,8 @@ def _accuracy(views: str, found: Accuracy | None, *, interval: bool = True) -> d
     return shares | ({f"{views}_a_drop_low": low, f"{views}_a_drop_high": high} if interval else {})
 
 
-def _judge_words(judge: Judgement) -> str:
-    """Name of a judge and its ``A_drop`` on held-out views; on the attacked ones if there are none."""
-    drop = (judge.held_out or judge.target).a_drop
-    return f"{judge.classifier} {figure_words(drop, '.3f')}"
+def _drop_words(name: str, judged: Accuracy) -> str:
+    return f"{name} {figure_words(judged.a_drop, '.3f')}"
 
 
 def _seconds(result: Result) -> dict[str, float]:

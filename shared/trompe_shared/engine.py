@@ -3,12 +3,13 @@
 import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from typing import Final
 
 from trompe_shared.errors import ProtocolError
 
 __all__ = ["DEFAULT_ENGINE", "EngineInfo"]
 
-DEFAULT_ENGINE = "pyrender"
+DEFAULT_ENGINE: Final = "pyrender"
 """The engine of a renderer worker that is not told one."""
 
 

@@ -29,6 +29,7 @@ from trompe_client.cli import connection
 from trompe_client.cli.attack import attack, flag_of
 from trompe_server.pages.present import command
 from trompe_shared.api import OPTIONS, PARTS, JobSpec, JobState, Option, SearchOptions, in_flags
+from trompe_shared.api.jobs import CONDITIONS
 from trompe_shared.api.jobs import _option as option
 
 
@@ -164,6 +165,19 @@ def test_every_option_is_a_flag_a_keyword_and_a_word_of_the_printed_command(
     if keyword != "masks":  # their pictures are on the server
         assert trompe(*printed[1:-2], "--server", server.url, "--detach").exit_code == 0
         assert server.jobs["job-3"].spec == spec
+
+
+def test_a_given_range_takes_the_place_of_that_of_the_conditions_even_if_it_is_the_usual_one(
+    server: FakeServer,
+) -> None:
+    words = ["--conditions", "wide", "--range", "roll", "0", "0", "--range", "ambient", "0.1", "0.2"]
+    assert trompe("attack", "mug", "--label", "mug", *words, "--server", server.url, "--detach").exit_code == 0
+    spec = server.jobs["job-1"].spec
+    given = {"roll": (0.0, 0.0), "ambient": (0.1, 0.2)}
+    assert spec.views.ranges == CONDITIONS["wide"].model_copy(update=given)
+    assert spec.changed()["ranges"] == given
+    assert JobSpec.model_validate_json(spec.model_dump_json()) == spec
+    assert command(spec, object="mug", classifier="tiny").count("--range") == 2
 
 
 def test_an_option_is_added_by_its_field_alone() -> None:

@@ -30,8 +30,8 @@ def engine_maker(name: str, settings: Mapping[str, str]) -> Callable[[], Engine]
 
     The engine's ``info`` then has this name, and the settings that differ from the defaults. Options are the fields of
     the frozen dataclass that the class takes as its only parameter, or else the class's parameters; a field that is not
-    compared changes no picture and is no setting. Raises
-    ``RendererError`` for an unknown engine, a missing package, an unknown option and a wrong value.
+    compared changes no picture and is no setting. Raises ``RendererError`` for an unknown engine, a missing package, an
+    unknown option and a wrong value.
     """
     kind = _engine_class(name)
     options = _options_class(kind)

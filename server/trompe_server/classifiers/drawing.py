@@ -5,7 +5,7 @@ from hashlib import blake2b
 import torch
 from torch import Tensor
 
-__all__ = ["generator_for"]
+__all__ = ["generator_for", "seeded_generator"]
 
 
 def generator_for(images: Tensor, seed: int) -> torch.Generator:
@@ -13,6 +13,11 @@ def generator_for(images: Tensor, seed: int) -> torch.Generator:
 
     A resumed attack therefore draws the same numbers as an uninterrupted one.
     """
-    key = seed.to_bytes(8, "little", signed=True)
-    digest = blake2b(images.detach().cpu().numpy().tobytes(), digest_size=8, key=key).digest()
+    data = images.detach().cpu().numpy().tobytes()
+    return seeded_generator(data, key=seed.to_bytes(8, "little", signed=True))
+
+
+def seeded_generator(data: bytes, *, key: bytes = b"") -> torch.Generator:
+    """A CPU generator seeded by every bit of ``data`` and ``key``."""
+    digest = blake2b(data, digest_size=8, key=key).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest, "little") >> 1)

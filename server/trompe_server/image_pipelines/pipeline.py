@@ -1,29 +1,32 @@
 """Random chains of operations on images, differentiable, and drawn anew for each image.
 
-The expectation over them makes paint that survives them (Athalye et al., 2018, expectation over transformation). What
-is linear in the image is applied first: rendering and resampling are linear in light, an encoder and a tone curve see
-what is left.
+The expectation over them makes paint that survives them (Athalye et al., 2018, expectation over transformation). All
+act on encoded levels, as programs that resize pictures do. What is linear in the image comes first and is one matrix
+per axis.
 """
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from hashlib import blake2b
+from functools import reduce
 from typing import Final
 
 import numpy as np
+import PIL.Image
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
-from trompe_server.image_pipelines.resampling import blurred, placed, resampled, resized
+from trompe_server.classifiers.drawing import seeded_generator
+from trompe_server.classifiers.protocol import fit_images
+from trompe_server.image_pipelines.resampling import Axis, blurred, placed, resampled, resized
 
 __all__ = ["Drawn", "ImagePipeline"]
 
 Range = tuple[float, float]
 Images = Float[Tensor, "n 3 H W"]
+Image = Float[Tensor, "3 H W"]
 Image8 = NDArray[np.uint8]
 
 DARKEST: Final = 1e-4
@@ -55,30 +58,47 @@ class ImagePipeline:
     noise: Range | None = None
     jpeg: Range | None = None
 
-    def apply(self, images: Images, luck: "list[torch.Generator]") -> Images:
-        """sRGB images in [0, 1], each through its own draws from its generator of ``luck``. Differentiable in them."""
-        drawn = [_Draws(self, each) for each in luck]
-        if any((self.zoom, self.shift, self.resize, self.blur)):
-            axes = [draws.axes(*images.shape[2:]) for draws in drawn]
-            images = resampled(images, *(list(each) for each in zip(*axes, strict=True)))
-        if any((self.gamma, self.gain, self.filmic)):
-            images = torch.stack([draws.toned(image) for draws, image in zip(drawn, images, strict=True)])
-        if self.noise:
-            images = images + torch.stack([draws.grain(images[0]) for draws in drawn]).to(images)
-        if self.jpeg:
-            images = images + torch.stack(
-                [draws.compressed(image) for draws, image in zip(drawn, images.detach(), strict=True)]
-            )
-        return images
+    def apply(self, images: Images, generators: Sequence[torch.Generator]) -> Images:
+        """sRGB images in [0, 1], each through its own draws from its generator. Differentiable in the images."""
+        drawn = [self._strengths(each) for each in generators]
+        if not any(drawn):
+            return images
+        return torch.stack([_through(*each) for each in zip(images, drawn, generators, strict=True)])
 
     def shown(self, images: Image8) -> Image8:
         """8-bit images (N, H, W, 3) through the pipeline; an image's draws depend on its number only."""
-        batch = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
-        out = np.empty_like(images)
-        for number, image in enumerate(batch):
-            (changed,) = self.apply(image[None], [luck_of(number)])
-            out[number] = _levels(changed)
-        return out
+        batch = fit_images(images, images.shape[1:3])
+        changed = (self.apply(image[None], [_generator(number)]) for number, image in enumerate(batch))
+        return np.stack([_levels(image) for (image,) in changed]) if len(images) else images
+
+    def _strengths(self, generator: torch.Generator) -> Mapping[str, float]:
+        """Operations of one image with their strengths. Each takes its numbers whether it is used or not."""
+        *drawn, (spared, _) = torch.rand(len(_OPERATIONS) + 1, 2, generator=generator).tolist()
+        if spared < self.spared:
+            return {}
+        found = {}
+        for (name, field), (used, share) in zip(_OPERATIONS.items(), drawn, strict=True):
+            chance, between = (self.mirrored, (1, 1)) if name == "mirrored" else (self.often, getattr(self, field))
+            if between and used < chance:
+                low, high = between
+                found[name] = low + (high - low) * share
+        return found
+
+
+_OPERATIONS: Final = {
+    "zoom": "zoom",
+    "shift of rows": "shift",
+    "shift of columns": "shift",
+    "mirrored": "mirrored",
+    "resize": "resize",
+    "blur": "blur",
+    "gamma": "gamma",
+    "gain": "gain",
+    "filmic": "filmic",
+    "noise": "noise",
+    "jpeg": "jpeg",
+}
+"""Operations in their order, each with its field of ``ImagePipeline``."""
 
 
 @dataclass(frozen=True)
@@ -91,75 +111,55 @@ class Drawn:
 
     def apply(self, images: Images, views: Iterable[int]) -> Images:
         """Images of the ``views``; the draws depend on seed, step and view alone, so that a resumed attack is equal."""
-        return self.pipeline.apply(images, [luck_of(self.seed, self.step, view) for view in views])
+        return self.pipeline.apply(images, [_generator(self.seed, self.step, view) for view in views])
 
 
-def luck_of(*numbers: int) -> torch.Generator:
-    """A generator determined by ``numbers``."""
-    digest = blake2b(",".join(map(str, numbers)).encode(), digest_size=8).digest()
-    return torch.Generator().manual_seed(int.from_bytes(digest, "little") >> 1)
+def _generator(*numbers: int) -> torch.Generator:
+    return seeded_generator(",".join(map(str, numbers)).encode())
 
 
-class _Draws:
-    """The draws of one image. Each operation takes its numbers whether it is used or not."""
+def _through(image: Image, strengths: Mapping[str, float], generator: torch.Generator) -> Image:
+    image = _toned(_resampled(image, strengths), strengths)
+    if "noise" in strengths:
+        image = image + strengths["noise"] * (2 * torch.rand(image.shape, generator=generator) - 1).to(image)
+    return image + _change_by_jpeg(image.detach(), strengths["jpeg"]) if "jpeg" in strengths else image
 
-    def __init__(self, pipeline: ImagePipeline, luck: torch.Generator) -> None:
-        self._luck, self._pipeline = luck, pipeline
-        self._drawn: list[list[float]] = torch.rand(12, 2, generator=luck).tolist()
-        self._spared = self._drawn[11][0] < pipeline.spared
 
-    def _strength(self, number: int, between: Range | None) -> float | None:
-        used, share = self._drawn[number]
-        if between is None or self._spared or used >= self._pipeline.often:
-            return None
-        low, high = between
-        return low + (high - low) * share
-
-    def axes(self, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """Matrices of rows and columns."""
-        of = self._pipeline
-        zoom = self._strength(0, of.zoom) or 1.0
-        shifts = [self._strength(number, of.shift) or 0.0 for number in (1, 2)]
-        mirrored = self._drawn[3][0] < of.mirrored and not self._spared
-        size, sigma = self._strength(4, of.resize), self._strength(5, of.blur)
-        rows, columns = (
-            placed(height, zoom=zoom, shift=shifts[0]),
-            placed(width, zoom=zoom, shift=shifts[1], mirrored=mirrored),
-        )
-        if size is not None and size < 1:
-            rows = resized(height, max(1, round(size * height))) @ rows
-            columns = resized(width, max(1, round(size * width))) @ columns
-        if sigma is not None:
-            rows, columns = blurred(height, sigma) @ rows, blurred(width, sigma) @ columns
-        return rows, columns
-
-    def toned(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-        """The image through its tone curve."""
-        of = self._pipeline
-        gamma, gain = self._strength(6, of.gamma), self._strength(7, of.gain)
-        filmic = self._strength(8, of.filmic)
-        if gamma is not None:
-            image = image.clamp(DARKEST, 1) ** gamma
-        if gain is not None:
-            image = (image * gain).clamp(0, 1)
-        if filmic is not None:
-            image = torch.lerp(image, _filmic(image), filmic)
+def _resampled(image: Image, strengths: Mapping[str, float]) -> Image:
+    """The image placed, reduced and enlarged, and blurred."""
+    height, width = sides = image.shape[1:]
+    stages: list[tuple[Axis, ...]] = []
+    if strengths.keys() & {"zoom", "shift of rows", "shift of columns", "mirrored"}:
+        zoom, mirrored = strengths.get("zoom", 1.0), "mirrored" in strengths
+        down, right = (strengths.get(f"shift of {axis}", 0.0) for axis in ("rows", "columns"))
+        stages.append((placed(height, zoom=zoom, shift=down), placed(width, zoom=zoom, shift=right, mirrored=mirrored)))
+    if strengths.get("resize", 1) < 1:
+        factor = strengths["resize"]
+        stages.append(tuple(resized(side, max(1, round(factor * side))) for side in sides))
+    if "blur" in strengths:
+        stages.append(tuple(blurred(side, strengths["blur"]) for side in sides))
+    if not stages:
         return image
+    rows, columns = (reduce(lambda done, then: then @ done, axis) for axis in zip(*stages, strict=True))
+    return resampled(image, rows, columns)
 
-    def grain(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-        """Noise."""
-        most = self._strength(9, self._pipeline.noise) or 0.0
-        return most * (2 * torch.rand(image.shape, generator=self._luck) - 1)
 
-    def compressed(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-        """The change by JPEG."""
-        quality = self._strength(10, self._pipeline.jpeg)
-        if quality is None:
-            return torch.zeros_like(image)
-        packed = io.BytesIO()
-        Image.fromarray(_levels(image)).save(packed, "JPEG", quality=round(quality))
-        read = torch.from_numpy(np.array(Image.open(packed)))
-        return read.permute(2, 0, 1).to(image) / 255 - image
+def _toned(image: Image, strengths: Mapping[str, float]) -> Image:
+    """The image through its tone curve."""
+    if "gamma" in strengths:
+        image = image.clamp(DARKEST, 1) ** strengths["gamma"]
+    if "gain" in strengths:
+        image = (image * strengths["gain"]).clamp(0, 1)
+    if "filmic" in strengths:
+        image = torch.lerp(image, _filmic(image), strengths["filmic"])
+    return image
+
+
+def _change_by_jpeg(image: Image, quality: float) -> Image:
+    packed = io.BytesIO()
+    PIL.Image.fromarray(_levels(image)).save(packed, "JPEG", quality=round(quality))
+    read = torch.from_numpy(np.array(PIL.Image.open(packed)))
+    return read.permute(2, 0, 1).to(image) / 255 - image
 
 
 def _filmic(image: Tensor) -> Tensor:
@@ -168,6 +168,6 @@ def _filmic(image: Tensor) -> Tensor:
     return curve.clamp(DARKEST, 1) ** (1 / 2.2)
 
 
-def _levels(image: Float[Tensor, "3 H W"]) -> Image8:
+def _levels(image: Image) -> Image8:
     found: Image8 = (255 * image.detach().cpu().clamp(0, 1)).round().byte().permute(1, 2, 0).contiguous().numpy()
     return found

@@ -11,16 +11,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-__all__ = ["blurred", "placed", "resampled", "resized"]
+__all__ = ["Axis", "blurred", "placed", "resampled", "resized"]
 
 Axis = Float[Tensor, "n n"]
 """Matrix from the pixels along an axis to as many new ones; its rows sum to 1."""
 
 
-def resampled(images: Float[Tensor, "n 3 H W"], rows: list[Axis], columns: list[Axis]) -> Float[Tensor, "n 3 H W"]:
-    """The images with their rows and columns resampled, each by its own matrix. Differentiable in the images."""
-    left, right = (torch.stack(each)[:, None].to(images) for each in (rows, columns))
-    return left @ images @ right.mT
+def resampled(image: Float[Tensor, "*n H W"], rows: Axis, columns: Axis) -> Float[Tensor, "*n H W"]:
+    """Images with their rows and columns resampled. Differentiable in the images."""
+    return rows.to(image) @ image @ columns.to(image).mT
 
 
 def placed(side: int, *, zoom: float = 1.0, shift: float = 0.0, mirrored: bool = False) -> Axis:

@@ -57,9 +57,9 @@ def attack_object(
 
     Each of several labels counts as the object. ``obj`` and ``classifier`` can be paths or names of shipped ones, such
     as ``mug`` and ``tiny``. ``views`` and ``held_out`` default to random cameras and lights that frame the object.
-    ``budget`` defaults to epsilon 0.05, alpha 0.01. ``pipeline``: what happens to the images of the attack
-    before the classifier. The same arguments give the same bytes. Raises ``TrompeError`` for
-    inputs that cannot be read or do not fit together.
+    ``budget`` defaults to epsilon 0.05, alpha 0.01. ``pipeline``: random changes of the attack's images before the
+    classifier. The same arguments give the same bytes. Raises ``TrompeError`` for inputs that cannot be read or do not
+    fit together.
     """
     obj = obj if isinstance(obj, Object3D) else _load(obj)
     network = load_classifier(classifier) if isinstance(classifier, str | Path) else classifier
@@ -80,8 +80,17 @@ def attack_object(
     clean = ask(obj, own)
     calibration = calibrate(obj, own, clean, ask, wanted="auto", generator=np.random.default_rng([seed, PROBE_STREAM]))
     surrogate, textures = build_surrogate(calibration, obj, own, clean), textures_of(obj)
-    run = partial(attack, goal=goal, budget=budget, steps=steps, seed=seed, pipeline=pipeline)
-    state = run(start(textures), textures, surrogate, network)
+    state = attack(
+        start(textures),
+        textures,
+        surrogate,
+        network,
+        goal=goal,
+        budget=budget,
+        steps=steps,
+        seed=seed,
+        pipeline=pipeline,
+    )
     painted = budget.repaint(obj, state.deltas)
 
     images = [

@@ -157,7 +157,7 @@ def open_setup(
     stored = partial(_stored_classifier, library=library, device=device)
     classifier = stored(spec.victim.classifier)
     framing = framing_of(obj, spec.views, shipped=info.name if info.shipped else None)
-    distribution = ViewDistribution(framing.distance, framing.elevation, spec.views.drawn_from, centre=framing.centre)
+    distribution = ViewDistribution(framing.distance, framing.elevation, spec.views.ranges, centre=framing.centre)
     drawn = partial(_drawn, spec, distribution)
     grid, count = spec.views.grid, spec.views.count
     pictures = {name: _picture(name, library) for name in spec.views.background if colour_of(name) is None}

@@ -17,7 +17,6 @@ from trompe_shared.api import (
     Progress,
     Result,
     ViewPrediction,
-    ViewRanges,
 )
 
 __all__ = [
@@ -305,9 +304,8 @@ def _flags(option: Option, value: Any) -> list[str]:
     if isinstance(value, bool):
         return [option.flag if value else f"--no{option.flag[1:]}"]
     given: Iterable[Any] = [value]
-    if isinstance(value, ViewRanges):
-        ranges = value.model_dump(include=set(VIEW_LIMITS), exclude_defaults=True)
-        given = [(name, *ends) for name, ends in ranges.items()]
+    if isinstance(value, dict):
+        given = [(name, *ends) for name, ends in value.items() if name in VIEW_LIMITS]
     elif isinstance(value, list):
         given = value
     rows = (each if isinstance(each, tuple) else (each,) for each in given)

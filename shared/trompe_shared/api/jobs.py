@@ -237,8 +237,8 @@ class SearchOptions(_Part):
     optimiser: OptimiserName = _option("nesterov", "rule of a step; pgd is the paper's")
     image_pipeline: PipelineName | None = _option(
         None,
-        "what to expect between renderer and network, drawn anew for each image: robust (sizes, tone, noise, JPEG), "
-        "transfer (places too, for other networks) or none; default: none, for an ensemble on random views transfer",
+        "random changes of each image before the networks: robust (size, tone, noise, JPEG), transfer (placement too, "
+        "for networks left out) or none; default: transfer for an ensemble on random views, else none",
     )
     views_per_step: Annotated[int, Field(ge=1, le=MOST_VIEWS)] | None = _option(
         None, f"views in one step; default: {VIEWS_PER_STEP} of a pool, all of the grid"
@@ -298,15 +298,22 @@ class ViewOptions(_Part):
         return (self.azimuths or PAPER_AZIMUTHS) * self.elevations if self.grid else self.pool
 
     @property
-    def drawn_from(self) -> ViewRanges:
-        """The ranges of random views: those of ``conditions``, except the given ones."""
-        given = self.ranges.model_dump(exclude_defaults=True)
-        return CONDITIONS[self.conditions].model_copy(update=given)
-
-    @property
     def looks_at(self) -> Literal["object", "origin"]:
         """The point that cameras look at."""
         return self.centre or ("origin" if self.grid else "object")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _ranges_of_conditions(cls, given: Any) -> Any:
+        named = given.get("conditions") if isinstance(given, Mapping) else None
+        if not (isinstance(named, str) and named in CONDITIONS):
+            return given
+        ranges = given.get("ranges", {})
+        if isinstance(ranges, ViewRanges):
+            ranges = ranges.model_dump(exclude_unset=True)
+        if not isinstance(ranges, Mapping):
+            return given
+        return {**given, "ranges": CONDITIONS[named].model_dump() | dict(ranges)}
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -320,8 +327,8 @@ class ViewOptions(_Part):
                 "`azimuths` and `elevations` shape the paper's grid, but random views are attacked: add `grid`, or "
                 "leave them out"
             )
-        for name in ("conditions", "ranges"):
-            if self.grid and not self.held_out and self._changed(name):
+        if self.grid and not self.held_out:
+            for name in filter(self._changed, ("conditions", "ranges")):
                 raise ValueError(
                     f"`{name}` is for random views, and there are none: leave it out, or ask for `held_out`"
                 )
@@ -379,8 +386,12 @@ class JobSpec(_Part):
         return {keyword: option.of(self) for keyword, option in OPTIONS.items()}
 
     def changed(self) -> dict[str, Any]:
-        """Options that differ from their defaults, by keyword."""
-        return {name: value for name, value in self.options().items() if value != OPTIONS[name].default}
+        """Options that differ from their defaults, by keyword; of ``ranges`` those that differ from ``conditions``."""
+        usual = CONDITIONS[self.views.conditions]
+        ranges = {name: value for name, value in self.views.ranges if value != getattr(usual, name)}
+        found = {name: value for name, value in self.options().items() if value != OPTIONS[name].default}
+        found.pop("ranges", None)
+        return found | ({"ranges": ranges} if ranges else {})
 
     @property
     def alpha(self) -> float:
