@@ -63,7 +63,7 @@ class JobCalibrations:
         surrogate = build_surrogate(
             calibration,
             setup.obj,
-            setup.attacked[number].shown(setup.views, judging=False),
+            setup.attacked[number].shown(setup.views),
             clean,
             geometry=known.result() if known is not None else None,
             backdrops=setup.backdrops,
@@ -78,7 +78,7 @@ class JobCalibrations:
         setup, search, renderer = self._setup, self._search, self._setup.attacked[number]
         return calibration_key(
             setup.obj,
-            renderer.shown(setup.views, judging=False),
+            renderer.shown(setup.views),
             clean,
             engine=renderer.engine,
             wanted=search.surrogate,
@@ -107,7 +107,7 @@ class JobCalibrations:
         setup, search = self._setup, self._search
         return calibrate(
             setup.obj,
-            setup.attacked[number].shown(setup.views, judging=False),
+            setup.attacked[number].shown(setup.views),
             clean,
             ask,
             wanted=search.surrogate,

@@ -56,7 +56,7 @@ Image8 = NDArray[np.uint8]
 class JobRenderer:
     """A renderer of a job, attacked or only judging.
 
-    noise: numbers of the noise in its pictures for the attack and in those that judge; 0 if it is deterministic.
+    noise: numbers of the noise in pictures of own and of held-out views; 0 if it is deterministic.
     """
 
     target: TargetRenderer
@@ -64,9 +64,9 @@ class JobRenderer:
     attacked: bool
     noise: tuple[int, int]
 
-    def shown(self, views: Sequence[View], *, judging: bool) -> list[View]:
+    def shown(self, views: Sequence[View], *, held_out: bool = False) -> list[View]:
         """``views`` with the number of their noise."""
-        return [replace(view, noise=self.noise[judging]) for view in views]
+        return [replace(view, noise=self.noise[held_out]) for view in views]
 
 
 @dataclass(frozen=True)
@@ -185,8 +185,8 @@ def open_setup(
 def _renderer(spec: JobSpec, target: TargetRenderer, pictures: Mapping[str, Image8], *, attacked: bool) -> JobRenderer:
     engine, noise = target.engine, (0, 0)
     if not engine.deterministic:
-        attack, judge = np.random.default_rng([spec.search.seed, NOISE_STREAM]).integers(2**31, size=2).tolist()
-        noise = attack, judge
+        own, held_out = np.random.default_rng([spec.search.seed, NOISE_STREAM]).integers(2**31, size=2).tolist()
+        noise = own, held_out
     return JobRenderer(BackdropTarget(target, pictures) if pictures else target, engine, attacked, noise)
 
 

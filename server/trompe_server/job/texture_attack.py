@@ -141,8 +141,8 @@ class TextureAttack:
         count = len(setup.views) + len(setup.held_out)
         ask = self._asker("prepare", count * len(setup.renderers), on_progress)
         for number, renderer in enumerate(setup.renderers):
-            own = ask(renderer, setup.obj, renderer.shown(setup.views, judging=False))
-            held_out = ask(renderer, setup.obj, renderer.shown(setup.held_out, judging=True))
+            own = ask(renderer, setup.obj, renderer.shown(setup.views))
+            held_out = ask(renderer, setup.obj, renderer.shown(setup.held_out, held_out=True))
             self.files.save(numbered(VIEWS_BEFORE, number), own=own, held_out=held_out)
         clean = self._clean
         if setup.white_box:
@@ -217,7 +217,7 @@ class TextureAttack:
         texels = surrogate.texels(textures_of(painted, device=setup.device))
         with torch.no_grad():
             expected = surrogate.render(texels, 0)[0].permute(1, 2, 0).cpu().numpy()
-        shown = first.target.render(painted, first.shown(setup.views[:1], judging=False), size=setup.size)[0]
+        shown = first.target.render(painted, first.shown(setup.views[:1]), size=setup.size)[0]
         self._counts["target_renders"] += 1
         picture = np.concatenate([(255 * expected).round().astype(np.uint8), shown], 1)
         self.artifacts.write("preview.png", encode_png(picture))
@@ -251,16 +251,16 @@ class TextureAttack:
         count = len(setup.views) + len(setup.held_out)
         ask = self._asker("judge", 2 * count * len(setup.renderers), on_progress)
         for number, renderer in enumerate(setup.renderers):
-            views = {"own": setup.views, "held_out": setup.held_out}
-            after = {name: ask(renderer, painted, renderer.shown(some, judging=True)) for name, some in views.items()}
-            self.files.save(numbered(VIEWS_AFTER, number), **after)
+            own = ask(renderer, painted, renderer.shown(setup.views))
+            held_out = ask(renderer, painted, renderer.shown(setup.held_out, held_out=True))
+            self.files.save(numbered(VIEWS_AFTER, number), own=own, held_out=held_out)
         scores = None if self._scores is None else _numpy(self._scores)
         seen = [replace(each, painted=painted, scores=scores, **self._attacked(each)) for each in self._seen()]
         headline = worst(seen)
         if scores is not None:
             hot, views_shown = setup.obj.with_textures(heat_textures(setup.obj.textures, scores)), saliency_views(setup)
             renderer = headline.renderer
-            heated = ask(renderer, hot, renderer.shown([setup.views[k] for k in views_shown], judging=True))
+            heated = ask(renderer, hot, renderer.shown([setup.views[k] for k in views_shown]))
             seen[headline.number] = replace(headline, heated=heated)
         public = write_report(seen, self.artifacts, seconds=self._seconds)
         return PhaseReport(DONE, JobState.succeeded, None, public)

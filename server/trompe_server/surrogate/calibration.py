@@ -337,9 +337,10 @@ def calibrate(
     Otherwise ``auto`` takes the best: the two probes under other shading, filters and tone curves, or five probes.
 
     clean: the target's images of ``obj``, (views, H, W, 3) uint8. on_sampling: receives the sampling model as soon as
-    it is known, before most of the probes. deterministic: equal requests give equal images; otherwise the noise is
-    measured and fidelity is judged above it. tone_map: gives the target's tone curve, if it is needed. A few trial
-    views decide; the other views are probed afterwards.
+    it is known, before most of the probes. deterministic: equal views give equal images whatever the number of their
+    noise; otherwise the noise is measured. All images of a view share it, so that they differ by the paint alone.
+    tone_map: gives the target's tone curve, if it is needed. A few trial views decide; the other views are probed
+    afterwards.
     """
     trial = _Trial.of(obj, views, clean, ask, generator, backdrops, deterministic=deterministic, tone_map=tone_map)
     if wanted in {"auto", "diffuse"}:
@@ -399,9 +400,8 @@ class _Trial:
         index = tuple(sorted({round(k) for k in np.linspace(0, len(views) - 1, TRIAL_VIEWS + 2)[1:-1]}))
         few = tuple(views[k] for k in index)
         repainted = painted_noise(obj, generator)
-        other = few if deterministic else tuple(replace(view, noise=view.noise + 1) for view in few)
-        again = None if deterministic else ask(obj, other)
-        images = ask(repainted, other)
+        images = ask(repainted, few)
+        again = None if deterministic else ask(obj, [replace(view, noise=view.noise + 1) for view in few])
         return cls(obj, index, few, clean[list(index)], repainted, images, backdrops, ask, again, tone_map)
 
     @property
@@ -451,7 +451,7 @@ class _Trial:
         calibration = Calibration(model, "", sampling, greys, probes, nothing, 0, tone)
         geometry = replace(self._geometry(sampling), sampling=sampling)
         surrogate = _shaded(calibration, geometry, self.obj, self.views, self.clean, self.backdrops)
-        return measure_fidelity(surrogate, self.obj, self.clean, self.repainted, self.images, noise=self.noise)
+        return measure_fidelity(surrogate, self.obj, self.clean, self.repainted, self.images)
 
     def _geometry(self, sampling: SamplingModel) -> Geometry:
         key = sampling.but(**{name: getattr(SamplingModel(), name) for name in (*_COLOURS, "kernel")})

@@ -54,13 +54,10 @@ class Fidelity:
 
 
 def measure_fidelity(
-    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8, *, noise: float = 0.0
+    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8
 ) -> Fidelity:
-    """Compare ``surrogate`` with the target's images (views, H, W, 3) of ``obj`` (clean) and of ``repainted``.
-
-    noise: as for ``compare_views``.
-    """
-    told = [fit for fit in compare_views(surrogate, obj, clean, repainted, images, noise=noise) if fit is not None]
+    """Compare ``surrogate`` with the target's images (views, H, W, 3) of ``obj`` (clean) and of ``repainted``."""
+    told = [fit for fit in compare_views(surrogate, obj, clean, repainted, images) if fit is not None]
     error, correlation, slope, explained, _ = zip(*(told or [NOTHING_SEEN]), strict=True)
     return Fidelity(error, correlation, slope, explained)
 
@@ -82,11 +79,11 @@ class ViewFit(NamedTuple):
 
 
 def compare_views(
-    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8, *, noise: float = 0.0
+    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8
 ) -> list[ViewFit | None]:
     """The fidelity of each view; ``None`` if neither target nor prediction shows a change.
 
-    noise: root mean square of each image's own noise, sRGB in [0, 1] units; change and residual are judged above it.
+    Images of a renderer that is not deterministic should share their noise: its number is the view's.
     """
     device = surrogate.base.device
     true = [torch.from_numpy(each).to(device) for each in (clean, images)]
@@ -102,8 +99,7 @@ def compare_views(
                 columns = (after - shown, shown - surrogate.missed[number], shown, repainted_shown)
             seen = [torch.split(column, list(batch.counts)) for column in columns]
             by_view = zip(*seen, _unforeseen(batch, *true), strict=True)
-            floor = 2 * noise**2
-            fits += [_compare(*pixels, floor=floor) if _telling(*pixels) else None for pixels in by_view]
+            fits += [_compare(*pixels) if _telling(*pixels) else None for pixels in by_view]
     return fits
 
 
@@ -129,16 +125,12 @@ ROUNDED: Final = 1 / 255**2 / 12
 """Variance of rounding to 8 bits; smaller changes count as this much."""
 
 
-def _compare(
-    predicted_change: Tensor, predicted: Tensor, clean: Tensor, after: Tensor, unforeseen: Tensor, *, floor: float
-) -> ViewFit:
-    """``floor``: variance of the difference of two images by noise alone."""
+def _compare(predicted_change: Tensor, predicted: Tensor, clean: Tensor, after: Tensor, unforeseen: Tensor) -> ViewFit:
     change = torch.cat([(after - clean).flatten(), unforeseen]).double()
     guess = torch.cat([predicted_change.flatten(), torch.zeros_like(unforeseen)]).double()
-    variance, power = max(float(change.square().mean()) - floor, 0.0), float(guess.square().mean())
+    variance, power = float(change.square().mean()), float(guess.square().mean())
     product = float((change * guess).mean())
     correlation = product / max((variance * power) ** 0.5, 1e-12)
-    missed = max(float((change - guess).square().mean()) - floor, 0.0)
-    explained = 1 - missed / max(variance, ROUNDED)
+    explained = 1 - float((change - guess).square().mean()) / max(variance, ROUNDED)
     error = float((predicted - clean).abs().mean()) if len(clean) else 0.0
     return ViewFit(error, correlation, product / max(power, 1e-12), explained, variance**0.5)

@@ -347,7 +347,7 @@ def test_charts_are_asked_for_once_and_counted(mug: Object3D) -> None:
 
 
 @pytest.mark.parametrize("noise", [1.0, 4.0])
-def test_fidelity_is_judged_above_the_targets_noise(mug: Object3D, noise: float) -> None:
+def test_noise_that_all_images_of_a_view_share_disturbs_no_fidelity(mug: Object3D, noise: float) -> None:
     target = KnownTarget(SamplingModel(), noise=noise)
 
     def calibrated(deterministic: bool) -> Calibration:

@@ -116,9 +116,7 @@ class ReportData:
         """Agreement of surrogate and target in each own view; empty without an attack."""
         if self.surrogate is None or self.painted is None or self.after is None:
             return ()
-        noise = 0.0 if self.calibration is None else self.calibration.noise
-        shown = self.before["own"], self.painted, self.after["own"]
-        return compare_views(self.surrogate, self.setup.obj, *shown, noise=noise)
+        return compare_views(self.surrogate, self.setup.obj, self.before["own"], self.painted, self.after["own"])
 
 
 def distinct_views(setup: JobSetup) -> NDArray[np.int64]:

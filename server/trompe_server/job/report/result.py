@@ -175,19 +175,12 @@ def _rounded(figures: Mapping[str, float]) -> dict[str, float]:
 
 
 def _changes(data: ReportData) -> dict[str, Any]:
-    """Change of the textures, and of the target's images over all views: by the paper's constraint and as perceived.
-
-    Own views of a random renderer are left out if there are others: their noise differs before and after.
-    """
+    """Change of the textures, and of the target's images over all views: by the paper's constraint and as perceived."""
     if data.after is None or data.painted is None:
         return {"texels_altered": None, "mean_texel_change": None, "max_view_change": None}
     setup, clean, painted = data.setup, data.setup.obj.textures, data.painted.textures
-    sets = {"own": setup.views, "held_out": setup.held_out}
-    if not data.renderer.engine.deterministic and setup.held_out:
-        del sets["own"]
-    before, after = (np.concatenate([each[name] for name in sets]) for each in (data.before, data.after))
-    views = [view for some in sets.values() for view in some]
-    pixels = object_pixels(before, after, behind(views, setup.backdrops, setup.size))
+    before, after = (np.concatenate([each["own"], each["held_out"]]) for each in (data.before, data.after))
+    pixels = object_pixels(before, after, behind([*setup.views, *setup.held_out], setup.backdrops, setup.size))
     pixels_beyond, views_beyond = share_beyond(before, after, pixels, epsilon=data.spec.paint.epsilon)
     seen = perceived_change(before, after, pixels)
     return {

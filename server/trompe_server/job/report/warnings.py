@@ -59,8 +59,8 @@ def _noise(data: ReportData) -> Iterator[str]:
     if not engine.deterministic and measured != 0:
         by = f" of {measured:.1f}/255 (RMS)" if measured else ""
         yield (
-            f"{engine} is not deterministic: pictures of the same view differ by random noise{by}. The pictures that "
-            "judge have noise that the attack has not seen."
+            f"{engine} is not deterministic: pictures of the same view differ by random noise{by}. Only pictures of "
+            "held-out views have noise that the attack has not seen."
         )
 
 
