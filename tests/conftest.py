@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from numpy.typing import ArrayLike, NDArray
 
 from tests.pretend_device import register
@@ -28,8 +28,10 @@ INSTALLABLE = re.compile("install|NOT TESTED")
 """Matches the reason of a test skipped because something is not installed."""
 
 
-settings.register_profile("untimed", deadline=None)
-settings.load_profile("untimed")
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("repeated", settings.get_profile("untimed"), derandomize=True)
+settings.load_profile("repeated")
+"""The same examples in every run; ``--hypothesis-profile=untimed`` looks for others."""
 
 
 def pytest_configure() -> None:
@@ -83,7 +85,7 @@ def worker() -> Iterator[tuple[str, int]]:
 
 @pytest.fixture
 def target(worker: tuple[str, int]) -> Iterator[SailenvTarget]:
-    target = SailenvTarget(*worker, timeout=60)
+    target = SailenvTarget(*worker, timeout=240)
     yield target
     target.close()
 

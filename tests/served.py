@@ -6,7 +6,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -30,8 +31,17 @@ def free_port() -> int:
         return port
 
 
+@contextmanager
+def reserved_port() -> Iterator[int]:
+    """A port at which nobody listens, and which within the block nobody gets who does not ask for it by its number."""
+    with socket.socket() as bound:
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do, so that one may listen there
+        bound.bind(("127.0.0.1", 0))
+        yield bound.getsockname()[1]
+
+
 def wait_until(
-    condition: Callable[[], Any], *, seconds: float = 60.0, pause: float = 0.02, story: Callable[[], str] = str
+    condition: Callable[[], Any], *, seconds: float = 120.0, pause: float = 0.02, story: Callable[[], str] = str
 ) -> Any:
     """Wait for ``condition``, checked every ``pause`` seconds; return its value. Fails after ``seconds``."""
     deadline = time.monotonic() + seconds
@@ -100,7 +110,7 @@ class Served(Queue):
         """End it and return its exit status."""
         self.http.close()
         self.process.send_signal(number)
-        status = self.process.wait(60)
+        status = self.process.wait(120)
         for pipe in (self.process.stdin, self.process.stdout):
             assert pipe is not None
             pipe.close()
@@ -117,20 +127,32 @@ class Served(Queue):
         """An HTTP client, with a token or without."""
         headers = {"Authorization": f"Bearer {secret}"} if secret else {}
         limits = httpx.Limits(max_connections=None)
-        return httpx.Client(base_url=self.url, headers=headers, timeout=60, limits=limits, trust_env=False)
+        return httpx.Client(base_url=self.url, headers=headers, timeout=240, limits=limits, trust_env=False)
 
     def get(self, path: str) -> Any:
         return self.http.get(path).raise_for_status().json()
+
+    def engines(self) -> list[dict[str, Any]]:
+        """Its renderers; none unless all tell their engines, for which a busy one has too little time."""
+        found: list[dict[str, Any]] = self.get("/v1/renderers")
+        return found if all(each["engine"] for each in found) else []
 
     def children(self) -> dict[str, int]:
         """Process ids of the supervised children, by command."""
         found = {}
         for entry in Path("/proc").iterdir():
             if entry.name.isdecimal() and self.process.pid == parent(int(entry.name)):
-                words = (entry / "cmdline").read_text().split("\0")
+                words = command_line(entry)
                 if CHILD[-1] in words:
                     found[words[words.index(CHILD[-1]) + 1]] = int(entry.name)
         return found
+
+
+def command_line(process: Path) -> list[str]:
+    """Words of a process by its folder in /proc; none if it has ended."""
+    with suppress(FileNotFoundError, ProcessLookupError):
+        return (process / "cmdline").read_text().split("\0")
+    return []
 
 
 def parent(pid: int) -> int | None:

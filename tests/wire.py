@@ -98,7 +98,7 @@ class Wire:
     def __init__(
         self, address: tuple[str, int], *, size: tuple[int, int] = (32, 48), gzip: bool = False, long: bool = False
     ) -> None:
-        self.socket = socket.create_connection(address, timeout=60)
+        self.socket = socket.create_connection(address, timeout=240)
         self.gzip, self.size = gzip, size
         self.tail = {"frustum_limited": True, "dynamic": None} if long else {}
         try:

@@ -14,6 +14,7 @@ from email import message_from_bytes
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 
@@ -436,10 +437,17 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(f"{len(text):x}\r\n{text}\r\n".encode())
 
 
+class Http(ThreadingHTTPServer):
+    """Clients may hang up at any time: a trace of that would come up in the output of whichever test runs by then."""
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Say nothing."""
+
+
 @pytest.fixture
 def server() -> Iterator[FakeServer]:
     fake = FakeServer()
-    http = ThreadingHTTPServer(("127.0.0.1", 0), type("BoundHandler", (Handler,), {"fake": fake}))
+    http = Http(("127.0.0.1", 0), type("BoundHandler", (Handler,), {"fake": fake}))
     thread = threading.Thread(target=http.serve_forever, kwargs={"poll_interval": 0.02})
     thread.start()
     fake.url = f"http://127.0.0.1:{http.server_port}"
@@ -457,7 +465,10 @@ def client(server: FakeServer) -> Iterator[Client]:
 
 @pytest.fixture(autouse=True)
 def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """How long the clients would have slept: no test waits for politeness, and none sees the caller's server."""
+    """How long the clients would have slept: no test waits for politeness, and none sees the caller's server.
+
+    While they follow a job, the time that passes for them is that of their sleep.
+    """
     pauses: list[float] = []
 
     async def block(_port: BlockingPort, seconds: float) -> None:
@@ -471,6 +482,7 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     monkeypatch.setattr(BlockingPort, "sleep", block)
     monkeypatch.setattr(AsyncPort, "sleep", suspend)
     monkeypatch.setattr(_following, "PATIENCE", 2.0)
+    monkeypatch.setattr(_following, "time", SimpleNamespace(monotonic=lambda: sum(pauses)))
     for name in ("TROMPE_SERVER", "TROMPE_TOKEN", "TROMPE_DATA"):
         monkeypatch.delenv(name, raising=False)
     return pauses

@@ -27,7 +27,8 @@ from trompe_shared.api import JobRequest, JobSpec, JobState
 
 FEW: dict[str, Any] = {"grid": True, "azimuths": 2, "elevations": 1, "held_out": 1, "steps": 1}
 """Options of a job of seconds."""
-ENDLESS = FEW | {"steps": 10_000}
+ENDLESS = FEW | {"steps": 10_000, "epsilon": 0.004}
+"""With so little that it does not win all views and end early."""
 
 
 class Blocking:

@@ -54,7 +54,7 @@ def test_a_service_that_never_comes_up_is_given_up() -> None:
 
 
 def test_a_service_that_dies_is_told_apart_from_a_server_elsewhere() -> None:
-    code = "print('trompe serving on http://127.0.0.1:1'); print('out of memory')"
+    code = "print('out of memory\\ntrompe serving on http://127.0.0.1:1')"
     with (
         pytest.raises(EmbeddedServerError, match=r"(?s)has ended.*out of memory"),
         embedded_server(command=script(f"{code}; import time; time.sleep(60)")),

@@ -96,13 +96,14 @@ def test_a_pipe_gets_the_latest_progress_again_while_the_job_is_silent(
         time.sleep(0.2)  # nothing is known
         show(Event(**RUNNING, progress=Progress(**attack, step=1), message="started"))
         show(Event(**RUNNING, progress=Progress(**attack, step=2)))
-        while printed.count("\n") < 4 and time.monotonic() < deadline:
+        while printed.count("step 2/90") < 3 and time.monotonic() < deadline:
             time.sleep(0.05)
             printed += capsys.readouterr().err
     said, *again = lines(printed)
-    assert said == "50%  attack  step 1/90  3:20 to 16:40 left  started"
-    assert len(again) >= 3
-    assert all(re.fullmatch(r"50%  attack  step 2/90  [23]:\d\d to 1[56]:\d\d left", line) for line in again)
+    left = r"[23]:\d\d to 1[56]:\d\d left"
+    assert re.fullmatch(rf"50%  attack  step 1/90  {left}  started", said)
+    assert sum("step 2/90" in line for line in again) >= 3
+    assert all(re.fullmatch(rf"50%  attack  step [12]/90  {left}", line) for line in again)
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ figures: list[str] = []
 """What was measured, for the end of the log."""
 
 
-def docker(*arguments: str, timeout: float = 60, check: bool = True, **options: Any) -> str:
+def docker(*arguments: str, timeout: float = 240, check: bool = True, **options: Any) -> str:
     """What ``docker`` prints. Fails with what it said."""
     command = ["docker", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, **options)
@@ -73,7 +73,7 @@ class Stack:
     project: str = field(default_factory=lambda: f"trompe-test-{os.getpid()}")
     _token: str = ""
 
-    def compose(self, *arguments: str, timeout: float = 300) -> str:
+    def compose(self, *arguments: str, timeout: float = 900) -> str:
         """Run ``docker compose``; what it prints."""
         files = [word for file in self.files for word in ("--file", str(file))]
         command = ["compose", "--project-directory", str(ROOT), "--project-name", self.project, *files, *arguments]

@@ -111,9 +111,9 @@ def test_the_images_are_small_and_hold_no_tools_and_the_renderer_no_torch(built:
 
 def test_the_api_wants_a_token_and_says_without_one_only_whether_it_is_up(stack: Stack) -> None:
     url = f"http://127.0.0.1:{stack.environment['TROMPE_PORT']}"
-    assert httpx.get(f"{url}/healthz").status_code == 200
+    assert httpx.get(f"{url}/healthz", timeout=60).status_code == 200
     for path in ("/v1/jobs", "/v1/objects", "/v1/workers", "/metrics"):
-        assert httpx.get(url + path).status_code == 401, path
+        assert httpx.get(url + path, timeout=60).status_code == 401, path
     with stack.client(token="trompe_wrong") as stranger, pytest.raises(Unauthorized):
         stranger.attack("mug", **QUICK)
     assert re.fullmatch(r"trompe_[\w-]{40,}", stack.token)
@@ -160,7 +160,7 @@ def test_nothing_runs_as_root_or_can_become_root_or_write_the_root_of_its_contai
     assert host["ReadonlyRootfs"]
 
 
-CONNECT: Final = "import socket, sys; socket.create_connection((sys.argv[1], int(sys.argv[2])), 3)"
+CONNECT: Final = "import socket, sys; socket.create_connection((sys.argv[1], int(sys.argv[2])), 10)"
 
 
 def reaches(stack: Stack, container: str, host: str, port: int) -> bool:

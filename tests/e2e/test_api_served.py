@@ -24,6 +24,7 @@ import pytest
 
 from tests.fake_job import PHASES, trace
 from tests.served import FAKE, Served, wait_until
+from trompe_server.api.guard import FRESH
 from trompe_server.executor.worker import prepare_data
 from trompe_server.storage.tokens import Right, Tokens
 from trompe_shared.api import JobState, in_parts
@@ -70,7 +71,7 @@ def test_a_thousand_jobs_submitted_at_once_are_all_there_and_none_twice(serve: S
     start = threading.Barrier(len(numbers))
 
     def submit(number: int) -> tuple[int, int, str]:
-        start.wait(60)
+        start.wait(240)
         body = JOB | in_parts({"label": "mug", "seed": number}) | {"labels": {"experiment": "thousand"}}
         answer = serve.http.post("/v1/jobs", json=body, headers={"Idempotency-Key": f"thousand {number}"})
         return number, answer.status_code, answer.json()["id"]
@@ -93,7 +94,7 @@ def test_a_thousand_jobs_submitted_at_once_are_all_there_and_none_twice(serve: S
     with ThreadPoolExecutor(4) as pool:
         cancel = [f"/v1/jobs/{job['id']}/cancel" for job in listed[:-20]]
         assert all(answer.is_success for answer in pool.map(serve.http.post, cancel))
-    wait_until(lambda: all_ended(serve))
+    wait_until(lambda: all_ended(serve), seconds=240)
     for job in listed[-20:]:
         folder = serve.settings.data / "jobs" / job["id"]
         assert serve.store.get(job["id"]).state is JobState.succeeded
@@ -103,7 +104,7 @@ def test_a_thousand_jobs_submitted_at_once_are_all_there_and_none_twice(serve: S
 def test_an_idle_connection_outlives_the_time_that_clients_keep_theirs(serve: Serve) -> None:
     """A server that closes first, or after the same 5 s as httpx, loses the request that is sent at that moment."""
     url = httpx.URL(serve.url)
-    connection = HTTPConnection(url.host, url.port, timeout=60)
+    connection = HTTPConnection(url.host, url.port, timeout=240)
 
     def answered() -> bool:
         connection.request("GET", "/healthz")
@@ -121,9 +122,11 @@ def test_an_idle_connection_outlives_the_time_that_clients_keep_theirs(serve: Se
 
 def test_a_revoked_token_is_worthless_within_moments(serve: Serve) -> None:
     with serve.client_of(serve.tokens.create("guest", Right.read)) as guest:
-        wait_until(lambda: guest.get("/v1/jobs").status_code == 200, seconds=3)
+        time.sleep(FRESH + 0.1)
+        assert guest.get("/v1/jobs").status_code == 200
         serve.tokens.revoke("guest")
-        wait_until(lambda: guest.get("/v1/jobs").status_code == 401, seconds=3)
+        time.sleep(FRESH + 0.1)
+        assert guest.get("/v1/jobs").status_code == 401
 
 
 def test_a_stream_of_events_is_taken_up_again_where_it_broke_off(serve: Serve) -> None:
@@ -152,12 +155,11 @@ def test_streams_end_when_the_server_stops_and_it_stops_at_once(tmp_path: Path) 
         with serve.reader.stream("GET", f"/v1/jobs/{job}/events") as stream:
             events = stream.iter_lines()
             next(events)
-            asked = time.monotonic()
             serve.process.send_signal(signal.SIGTERM)
             rest = list(events)
-            assert time.monotonic() - asked < 4, "the stream is closed before the server gives up waiting for it"
         assert not any("succeeded" in line for line in rest)
-        assert serve.process.wait(30) == 0
+        assert serve.process.wait(120) == 0
+        assert "shutdown exceeded" not in serve.log.read_text(), "the server gave up waiting for the stream"
 
 
 def test_a_large_upload_does_not_fill_the_memory_of_the_server(serve: Serve) -> None:

@@ -3,12 +3,12 @@
 import csv
 import json
 import shutil
-import time
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from io import StringIO
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,7 +18,16 @@ from rich.console import Console
 from trompe_client import ServerUnreachable
 from trompe_client._errors import BadRequest
 from trompe_client._plan import Upload
-from trompe_experiments import Experiment, Plan, cli, plan_experiment, run, run_experiment, shipped_experiments
+from trompe_experiments import (
+    Experiment,
+    Plan,
+    cli,
+    plan_experiment,
+    progress,
+    run,
+    run_experiment,
+    shipped_experiments,
+)
 from trompe_experiments.about import ABOUT, estimated_seconds, write_about
 from trompe_experiments.cli import experiment
 from trompe_experiments.plan import Row
@@ -435,7 +444,7 @@ def test_jobs_that_the_server_did_long_ago_promise_nothing_on_the_time_that_is_l
     ran(plan_of(grid={"epsilon": [0.05]}), service, tmp_path / "before")
     service.by_key = {key: service.job(job.id) for key, job in service.by_key.items()}
     now = count(step=20)
-    monkeypatch.setattr(time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: next(now)))
     told = displayed(plan_of(grid={"epsilon": [0.02, 0.03, 0.05]}), service, tmp_path / "now")
     ends = [line.partition("seed 0  ")[2].partition("  ")[2] for line in told.splitlines()[1:]]
     assert ends == ["", "", "about 60 s left", "about 40 s left", "about 20 s left", ""]

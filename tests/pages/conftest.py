@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, expect, sync_playwright
 
 from tests.served import Served
 from trompe_client import Client
@@ -22,6 +22,9 @@ FLAGS = [
 OTHERS = "ERR_NETWORK_CHANGED"
 """What Chromium reports when something else on the machine adds or removes a network, such as a container's."""
 
+
+LIMIT = 120_000
+"""Milliseconds that a busy machine has for anything."""
 
 SMALL = {"grid": True, "azimuths": 3, "elevations": 2, "held_out": 4, "steps": 5}
 """A job of some seconds."""
@@ -44,7 +47,7 @@ class Service(Served):
         """The id of a small job that has succeeded."""
         job = self.submit(**options)
         with self.client() as client:
-            client.job(job).wait(timeout=240)
+            client.job(job).wait(timeout=480)
         return job
 
 
@@ -54,8 +57,9 @@ def browser() -> Iterator[Browser]:
     path = shutil.which("chromium") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("There is no Chromium here: apt-get install chromium")
+    expect.set_options(timeout=LIMIT)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS, timeout=LIMIT)
         yield browser
         browser.close()
 
@@ -75,6 +79,7 @@ def service(new_service: Callable[[], Service]) -> Iterator[Service]:
 @pytest.fixture
 def context(browser: Browser) -> Iterator[BrowserContext]:
     context = browser.new_context(viewport={"width": 1200, "height": 900}, accept_downloads=True)
+    context.set_default_timeout(LIMIT)
     yield context
     context.close()
 

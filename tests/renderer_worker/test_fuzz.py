@@ -143,7 +143,7 @@ class Fuzzer:
 
 def send(address: tuple[str, int], data: bytes) -> None:
     """Send an input and nothing more, and wait until the worker has hung up."""
-    with socket.create_connection(address, timeout=60) as connection:
+    with socket.create_connection(address, timeout=240) as connection:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # no port waits
         try:
             connection.sendall(data)
@@ -226,7 +226,7 @@ def test_no_input_crashes_hangs_or_fills_a_worker_or_disturbs_another_agent(inpu
     assert witness.frames > 10
     assert witness.wrong == 0
     assert worker.process.poll() is None, "the worker crashed"
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 120
     while worker.open > before and time.monotonic() < deadline:
         time.sleep(0.05)
     assert worker.open <= before

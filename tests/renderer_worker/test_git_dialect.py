@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.wire import ORIGIN, Wire, received
+from tests.worker_process import started
 from trompe_shared.sailenv import COMMANDS
 
 TRANSCRIPT = Path(__file__).parent / "git_dialect.txt"
@@ -27,7 +28,7 @@ class Replay:
     """Sends a client's lines and compares the answers."""
 
     def __init__(self, address: tuple[str, int]) -> None:
-        self.socket = socket.create_connection(address, timeout=60)
+        self.socket = socket.create_connection(address, timeout=240)
         self.remembered: dict[str, str] = {}
 
     def say(self, tokens: list[str]) -> None:
@@ -72,18 +73,41 @@ def test_the_recorded_session_holds_every_command_of_the_git_client() -> None:
 
 
 def test_a_short_spawn_is_waited_on_once_and_then_no_more(wire: Callable[..., Wire]) -> None:
-    agent, seconds = wire(), []
-    for _ in range(3):
-        start = time.monotonic()
-        assert agent.ask("spawn_object", **SHORT)
-        seconds.append(time.monotonic() - start)
-    assert seconds[0] > 0.25
-    assert max(seconds[1:]) < 0.2
+    later = []
+    for _ in range(5):  # on a busy machine some of them last longer for another reason
+        agent, seconds = wire(), []
+        for _ in range(3):
+            start = time.monotonic()
+            assert agent.ask("spawn_object", **SHORT)
+            seconds.append(time.monotonic() - start)
+        assert seconds[0] > 0.25
+        later.append(max(seconds[1:]))
+        if later[-1] < 0.2:
+            break
+    assert min(later) < 0.2
+
+
+_PATIENT = """
+from trompe_renderer.command import render
+from trompe_renderer.protocol import agent
+
+agent.DIALECT_WAIT = 120.0
+render(["--port", "0"])
+"""
+
+
+@pytest.fixture(scope="module")
+def patient_worker() -> Iterator[tuple[str, int]]:
+    """A worker that waits for the tail of a spawn for longer than a busy machine keeps it back."""
+    with started(code=_PATIENT) as worker:
+        yield worker.address
 
 
 @pytest.mark.parametrize("pause", [0.0, 0.1], ids=["at once", "after a moment"])
-def test_a_long_spawn_is_known_by_its_tail(wire: Callable[..., Wire], pause: float) -> None:
-    agent, spawn = wire(), COMMANDS["spawn_object"]
+def test_a_long_spawn_is_known_by_its_tail(
+    wire: Callable[..., Wire], patient_worker: tuple[str, int], pause: float
+) -> None:
+    agent, spawn = wire(patient_worker), COMMANDS["spawn_object"]
     short = spawn.encode_request(**SHORT)
     agent.socket.sendall(short)
     time.sleep(pause)

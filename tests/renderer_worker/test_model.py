@@ -123,7 +123,7 @@ def test_large_archives_are_parsed_one_after_the_other_and_small_ones_beside_the
     def slowly(files: dict[str, bytes]) -> Object3D:
         reading.append(len(files))
         most.append(len(reading))
-        both.set() if len(reading) == 2 else both.wait(0.2)
+        both.set() if len(reading) == 2 else both.wait(0.2 if together == 1 else 120)
         reading.pop()
         return box
 

@@ -93,7 +93,7 @@ def area_and_middle(polygon: NDArray[np.float64]) -> tuple[float, NDArray[np.flo
     return float(cross.sum() / 2), ((polygon + following) * cross[:, None]).sum(axis=0) / (3 * cross.sum())
 
 
-@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(st.floats(0.25, 0.6), st.floats(-180, 180), st.floats(-90, 90))
 @example(0.5, 0.0, 0.0)
 def test_a_box_is_where_the_camera_puts_it_to_a_fraction_of_a_pixel(
@@ -113,7 +113,7 @@ def test_a_box_is_where_the_camera_puts_it_to_a_fraction_of_a_pixel(
     assert np.abs(np.array([(cover * x).sum(), (cover * y).sum()]) / cover.sum() - middle).max() <= 0.13
 
 
-@settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(st.tuples(*[st.integers(0, 255)] * 3))
 def test_the_background_is_exactly_the_colour_asked_for(target: SailenvTarget, color: tuple[int, int, int]) -> None:
     picture = show(target, boxes(), Camera(0.5, 10, 10), background=color)

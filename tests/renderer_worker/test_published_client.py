@@ -29,7 +29,7 @@ def connect(worker: tuple[str, int]) -> Iterator[Callable[..., Any]]:
 
     def register(**options: Any) -> Any:
         agent = module.Agent(host=worker[0], port=worker[1], **({"width": 48, "height": 32} | options))
-        agent.socket.settimeout(60)
+        agent.socket.settimeout(240)
         agent.register()
         agents.append(agent)
         return agent
@@ -164,10 +164,9 @@ def test_the_published_client_receives_the_same_picture_as_ours(
 
 def test_the_many_small_sends_of_the_published_client_do_not_wait_for_acknowledgements(agent: Any) -> None:
     seconds = []
-    for angle in range(50):
+    for angle in range(200):
         start = time.monotonic()
         agent.set_position((0, 0, 1))
         agent.set_rotation((180, angle, 180))
         seconds.append(time.monotonic() - start)
-    assert min(seconds) < 0.001
-    assert np.median(seconds) < 0.02  # on a busy machine too; a wait is one of 40 ms
+    assert np.percentile(seconds, 10) < 0.02  # on a busy machine too; each wait would be one of 40 ms

@@ -93,7 +93,7 @@ def test_a_worker_that_cannot_start_says_why(worker: tuple[str, int]) -> None:
     }
     for options, reason in wrong.items():
         command = [sys.executable, "-m", "trompe_renderer", *options]
-        ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
         assert ended.returncode == 1
         assert ended.stdout == ""
         assert reason in ended.stderr

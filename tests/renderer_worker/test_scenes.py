@@ -120,7 +120,7 @@ def test_furniture_casts_shadows_in_the_room_and_its_walls_do_not(
 def test_the_script_makes_the_room_that_is_shipped(tmp_path: Path) -> None:
     root = Path(__file__).parents[2]
     script = [sys.executable, str(root / "scripts" / "make_room.py"), "--out", str(tmp_path)]
-    subprocess.run(script, check=True, capture_output=True, timeout=120)
+    subprocess.run(script, check=True, capture_output=True, timeout=240)
     shipped = root / "renderer_worker" / "trompe_renderer" / "world" / "room_01"
     assert sorted(p.name for p in shipped.iterdir()) == sorted(p.name for p in tmp_path.iterdir())
     assert json.loads((shipped / "scene.json").read_text()) == json.loads((tmp_path / "scene.json").read_text())

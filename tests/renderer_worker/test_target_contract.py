@@ -22,8 +22,8 @@ VIEWS = [View(Camera(0.3, azimuth, elevation)) for azimuth, elevation in ((0, 0)
 def renderer(request: pytest.FixtureRequest) -> Iterator[TargetRenderer]:
     makers: dict[str, Callable[[], TargetRenderer]] = {
         "fake": FakeTarget,
-        "one worker": lambda: SailenvTarget(*request.getfixturevalue("worker"), timeout=60),
-        "a worker without extensions": lambda: SailenvTarget(*request.getfixturevalue("plain_worker"), timeout=60),
+        "one worker": lambda: SailenvTarget(*request.getfixturevalue("worker"), timeout=240),
+        "a worker without extensions": lambda: SailenvTarget(*request.getfixturevalue("plain_worker"), timeout=240),
         "pool": lambda: RendererPool([request.getfixturevalue(name) for name in ("worker", "second_worker")]),
     }
     with closing(makers[request.param]()) as renderer:

@@ -75,7 +75,7 @@ def inside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 TURNED = Box((0.03, -0.02, 0.05), (20.0, 35.0, -50.0), (1.2, 0.8, 1.0))
 
 
-@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(st.builds(Camera, st.floats(0.25, 0.6), st.floats(-180, 180), st.floats(-85, 85)))
 def test_a_pixel_shows_the_object_at_its_centre_and_its_depth_along_the_cameras_axis(
     empty: Wire, camera: Camera

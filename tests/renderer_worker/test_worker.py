@@ -75,7 +75,7 @@ def test_every_command_is_answered_in_full(agent: Wire) -> None:
         agent.socket.setblocking(False)
         with pytest.raises(BlockingIOError):
             agent.socket.recv(1)
-        agent.socket.settimeout(60)
+        agent.socket.settimeout(240)
     assert agent.picture().shape == (32, 48, 3)
 
 
@@ -219,7 +219,7 @@ def test_agents_do_not_see_each_others_objects(wire: Connect) -> None:
 
 @pytest.mark.parametrize("hello", [struct.pack("<ii?", 0, 10, False), struct.pack("<ii?", 10, 100_000, False)])
 def test_a_handshake_for_images_of_impossible_size_is_closed(worker: tuple[str, int], hello: bytes) -> None:
-    with socket.create_connection(worker, timeout=60) as connection:
+    with socket.create_connection(worker, timeout=240) as connection:
         connection.sendall(hello)
         assert is_closed(connection)
 
@@ -242,7 +242,7 @@ def running_server(listener: Any = None, **limits: Any) -> Iterator[Server]:
         yield server
     finally:
         server.stop()
-        thread.join(timeout=30)
+        thread.join(timeout=240)
 
 
 @pytest.fixture
@@ -334,7 +334,7 @@ def test_a_large_frame_waits_until_there_is_memory_for_it_and_a_small_one_does_n
         with pytest.raises(TimeoutError):
             agent.socket.recv(1)
         memory.give_back(1)
-        agent.socket.settimeout(60)
+        agent.socket.settimeout(240)
         decode_frame(agent.read, flags=ALL_VIEWS, compressed=False)
         agent.views(ALL_VIEWS)  # the reservation has ended
 
@@ -376,7 +376,8 @@ def test_an_agent_that_cannot_be_accepted_does_not_end_the_worker(
 def test_a_malformed_request_closes_its_agent_and_no_other_and_is_logged(
     wire: Connect, caplog: pytest.LogCaptureFixture, sent: bytes, logged: str
 ) -> None:
-    with running_server(request_timeout=0.2) as server:
+    limits = {"request_timeout": 3.0} if "timed out" in logged else {}  # of the good one, too
+    with running_server(**limits) as server:
         good, bad = wire(server.address), wire(server.address)
         bad.socket.sendall(sent)
         assert is_closed(bad.socket)
@@ -414,7 +415,7 @@ def test_too_many_agents_are_refused_until_one_leaves(wire: Connect, caplog: pyt
         first.send("delete")
         assert is_closed(first.socket)
         with server._left:
-            assert server._left.wait_for(lambda: len(server._agents) == 1, timeout=30)
+            assert server._left.wait_for(lambda: len(server._agents) == 1, timeout=240)
         assert wire(server.address).ask("get_position") == (0, 0, 0)
 
 

@@ -13,13 +13,13 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
 from tests.fake_job import PHASES, trace
-from tests.served import CHILD, FAKE, free_port, wait_until
+from tests.served import CHILD, FAKE, reserved_port, wait_until
 from trompe_client import Client, Retries
 from trompe_client._job import JobHandle
 from trompe_server.executor.worker import prepare_data
@@ -113,15 +113,20 @@ class Site:
         }
         prepare_data(self.settings)
         self.store = JobStore(self.settings.database_url, silence=silence)
-        self.port = free_port()
+        self._reserved = ExitStack()
+        self.port = self._free_port()
         self._kept = self._scattered() if scattered else [self._serve(workers=WORKERS, renderers=RENDERERS)]
+
+    def _free_port(self) -> int:
+        """A port that nobody else gets while its process is started again."""
+        return self._reserved.enter_context(reserved_port())
 
     def _serve(self, *, workers: int, renderers: int) -> Kept:
         numbers = ["--workers", str(workers), "--renderers", str(renderers)]
         return self._keep("api", "serve", "--port", str(self.port), *numbers)
 
     def _scattered(self) -> list[Kept]:
-        ports = [free_port() for _ in range(RENDERERS)]
+        ports = [self._free_port() for _ in range(RENDERERS)]
         known = [word for port in ports for word in ("--renderer", f"127.0.0.1:{port}")]
         renderers = [self._keep(f"renderer-{port}", "render", "--port", str(port)) for port in ports]
         workers = [self._keep(f"worker-{number}", "worker", *known) for number in range(WORKERS)]
@@ -185,6 +190,7 @@ class Site:
         for thread in threads:
             thread.join()
         self.store.close()
+        self._reserved.close()
 
 
 class Faults:

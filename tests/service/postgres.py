@@ -6,11 +6,12 @@ import secrets
 import shutil
 import subprocess
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 import psycopg
 
-from tests.served import free_port
+from tests.served import reserved_port
 
 OPTIONS = "-c fsync=off -c full_page_writes=off -c max_connections=200"
 
@@ -33,7 +34,8 @@ class Postgres:
         self.folder = Path(tempfile.mkdtemp(prefix="trompe-pg-"))
         if self._user is not None:
             os.chown(self.folder, pwd.getpwnam(self._user).pw_uid, -1)
-        self.port = free_port()
+        self._open = ExitStack()
+        self.port = self._open.enter_context(reserved_port())
         self._do("initdb", "--username=trompe", "--auth=trust", "--encoding=UTF8", "--no-sync", "-D", self._data)
 
     @property
@@ -42,7 +44,18 @@ class Postgres:
 
     def start(self) -> None:
         options = f"-p {self.port} -k {self.folder} -c listen_addresses=127.0.0.1 {OPTIONS}"
-        self._do("pg_ctl", "start", "--wait", "-D", self._data, "-l", str(self.folder / "log"), "-o", options)
+        self._do(
+            "pg_ctl",
+            "start",
+            "--wait",
+            "--timeout=180",
+            "-D",
+            self._data,
+            "-l",
+            str(self.folder / "log"),
+            "-o",
+            options,
+        )
 
     def stop(self) -> None:
         """Stop at once and cut connections, like a crash."""
@@ -63,6 +76,7 @@ class Postgres:
             check=False,
         )
         shutil.rmtree(self.folder, ignore_errors=True)
+        self._open.close()
 
     def _do(self, program: str, *arguments: str) -> None:
         command = [str(self._programs / program), *arguments]

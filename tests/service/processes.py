@@ -76,7 +76,7 @@ class WorkerProcess:
     def end(self, number: signal.Signals) -> int:
         """Send a signal and return the exit status."""
         self.send(number)
-        return self.process.wait(60)
+        return self.process.wait(120)
 
     def words(self) -> str:
         """Standard error of the process so far."""

@@ -1,6 +1,7 @@
 """The API while PostgreSQL is away: 503 at once, and nothing lost when it is back."""
 
 import asyncio
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from trompe_server.api import guard
+from trompe_server.api import following, guard
 from trompe_server.api.services import Services
 from trompe_server.library import Library
 from trompe_server.queue.store import JobStore
@@ -32,20 +33,29 @@ def services(postgres: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     store.close()
 
 
-def test_a_database_that_stops_is_answered_with_503_until_it_is_back(services: Services, postgres: Any) -> None:
-    asyncio.run(_stop_and_start(services, postgres))
+def test_a_database_that_stops_is_answered_with_503_until_it_is_back(
+    services: Services, postgres: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    look, followed = following._look, threading.Event()
+
+    def noticed(*arguments: Any) -> Any:
+        followed.set()
+        return look(*arguments)
+
+    monkeypatch.setattr(following, "_look", noticed)
+    asyncio.run(_stop_and_start(services, postgres, followed))
 
 
-async def _stop_and_start(services: Services, postgres: Any) -> None:
+async def _stop_and_start(services: Services, postgres: Any, followed: threading.Event) -> None:
     headers = {"Authorization": f"Bearer {services.tokens.create('ci', Right.write)}"}
     transport = httpx.ASGITransport(create_app(services), raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://trompe", headers=headers) as client:
         job = (await client.post("/v1/jobs", json=JOB)).json()["id"]
         stream = asyncio.create_task(client.get(f"/v1/jobs/{job}/events"))
-        await asyncio.sleep(0.5)
+        assert await asyncio.to_thread(followed.wait, 120)
         await asyncio.to_thread(postgres.stop)
         for method, path in [("GET", "/v1/jobs"), ("GET", "/readyz"), ("GET", "/metrics"), ("POST", "/v1/jobs")] * 2:
-            answer = await asyncio.wait_for(client.request(method, path, json=JOB), 10)
+            answer = await asyncio.wait_for(client.request(method, path, json=JOB), 60)
             assert (answer.status_code, answer.headers["retry-after"]) == (503, "5"), (method, path)
         assert (await client.get("/healthz")).status_code == 200
         assert not stream.done(), "followers wait until it is back"
@@ -54,5 +64,5 @@ async def _stop_and_start(services: Services, postgres: Any) -> None:
         listed = (await client.get("/v1/jobs")).json()["jobs"]
         assert [each["id"] for each in listed] == [job]
         await client.post(f"/v1/jobs/{job}/cancel")
-        followed = (await asyncio.wait_for(stream, 20)).text
-        assert '"cancelled"' in followed
+        text = (await asyncio.wait_for(stream, 120)).text
+        assert '"cancelled"' in text

@@ -129,7 +129,7 @@ def test_nothing_is_lost_while_postgresql_is_away(
     postgres: Any, tmp_path: Path, undisturbed: Callable[[int], Digests]
 ) -> None:
     expected = undisturbed(FEW)
-    with Site(tmp_path, postgres.database(), scattered=True, silence=SILENCE, phase_seconds=0.3) as site:
+    with Site(tmp_path, postgres.database(), scattered=True, silence=60.0, phase_seconds=0.3) as site:
         faults = Faults(site, seed=0)
         run = survive(site, faults, expected, meanwhile=away(postgres, faults, seconds=10.0), pause=0.7)
         assert faults.counts["PostgreSQL stopped"] == 1

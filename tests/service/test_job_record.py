@@ -358,7 +358,7 @@ def test_work_for_one_is_given_to_one_until_its_time_is_over(store: JobStore) ->
     assert take_lease(store.engine, "retention", seconds=60)
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(
     moves=st.lists(st.sampled_from(["claim", "advance", "finish", "give back", "die", "reap", "cancel"]), max_size=25)
 )

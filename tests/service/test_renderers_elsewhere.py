@@ -51,7 +51,7 @@ def test_workers_of_a_service_without_renderers_use_those_elsewhere(tmp_path: Pa
     with Served(tmp_path / "data", *options) as served, Client(served.url) as client:
         found = {info.address: info.alive for info in client.renderers()}
         assert found == {f"127.0.0.1:{renderer}": True, f"127.0.0.1:{nobody}": False}
-        assert client.job(served.submit("fine")).wait(60).status.attempts == 1
+        assert client.job(served.submit("fine")).wait(120).status.attempts == 1
         assert b"ready" in client.send(Request("GET", "/readyz", bytes))
 
 

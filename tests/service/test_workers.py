@@ -14,7 +14,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from tests.fake_job import PHASES, trace
-from tests.served import Served, free_port, wait_until
+from tests.served import Served, reserved_port, wait_until
 from tests.service.processes import Service
 from trompe_server.errors import ServiceError
 from trompe_server.settings import Settings
@@ -77,14 +77,15 @@ def test_another_worker_takes_over_from_one_that_is_gone_for_good(service: Servi
         wait_until(lambda: service.in_gate(job))
         holder = first if str(service.state(job).worker) in first.words() else second
         assert [info.alive for info in service.store.workers()] == [True, True]
-        assert [info.id for info in service.store.workers() if info.job == job] == [service.state(job).worker]
+        at_work = wait_until(lambda: [info.id for info in service.store.workers() if info.job == job])
+        assert at_work == [service.state(job).worker]
         holder.end(signal.SIGKILL)
         wait_until(lambda: service.state(job).attempts == 2)
         service.open_gate(job)
         found = service.ended(job)
         assert str(found.worker) in (second if holder is first else first).words()
     assert found.state is JobState.succeeded
-    assert "no heartbeat for 2 s" in "".join(event.message or "" for event in service.store.events(job))
+    assert "no heartbeat for 10 s" in "".join(event.message or "" for event in service.store.events(job))
 
 
 def test_a_worker_that_was_frozen_notices_that_it_lost_its_job_and_does_no_harm(service: Service) -> None:
@@ -129,7 +130,7 @@ def test_a_job_that_kills_three_workers_is_failed_and_the_next_job_runs(service:
     job, after = service.submit("deadly"), service.submit("fine")
     for _ in range(3):
         with service.worker() as running:
-            assert running.process.wait(60) == -signal.SIGKILL
+            assert running.process.wait(120) == -signal.SIGKILL
     with service.worker():
         found = service.ended(job)
         assert service.ended(after).state is JobState.succeeded
@@ -157,9 +158,7 @@ def test_cancelling_stops_a_running_job_within_its_phase_and_a_queued_one_at_onc
         wait_until(lambda: service.in_gate(running))
         assert service.store.request_cancel(queued).state is JobState.cancelled
         assert service.store.request_cancel(running).state is JobState.running
-        asked = time.monotonic()
-        assert service.ended(running).state is JobState.cancelled
-        assert time.monotonic() - asked < 5
+        assert service.ended(running).state is JobState.cancelled  # its gate is closed: the phase would never end
         assert service.ended(after).state is JobState.succeeded
         words = process.words()
 
@@ -180,7 +179,7 @@ def test_a_job_cancelled_while_its_worker_is_dead_is_cancelled_by_the_next(servi
 def test_a_job_that_stands_still_costs_its_worker_the_job(service: Service) -> None:
     job = service.submit("silent")
     with service.worker(TROMPE_STALL_TIMEOUT="1") as running:
-        assert running.process.wait(60) == 75
+        assert running.process.wait(120) == 75
     assert service.state(job).state is JobState.running
 
 
@@ -223,7 +222,11 @@ def test_three_workers_share_the_jobs_and_none_is_run_twice(service: Service) ->
     with contextlib.ExitStack() as stack:
         for _ in range(3):
             stack.enter_context(service.worker(TROMPE_FAKE_SECONDS="0.2"))
-        jobs = [service.submit("fine", seed=number) for number in range(12)]
+        gates = [service.submit("gate", seed=number) for number in range(3)]
+        jobs = gates + [service.submit("fine", seed=number) for number in range(3, 12)]
+        wait_until(lambda: all(service.in_gate(job) for job in gates))  # one in each worker
+        for job in gates:
+            service.open_gate(job)
         ended = [service.ended(job) for job in jobs]
         assert len(service.store.workers()) == 3
     assert {job.state for job in ended} == {JobState.succeeded}
@@ -238,7 +241,7 @@ def test_a_worker_ends_with_its_parent(service: Service) -> None:
     with service.worker() as running:
         assert running.process.stdin is not None
         running.process.stdin.close()
-        assert running.process.wait(20) == 0
+        assert running.process.wait(120) == 0
         running.process.stdin = running.process.stdout
 
 
@@ -246,7 +249,7 @@ def test_workers_of_a_service_are_counted_together_and_those_elsewhere_serve_the
     serve: Served, tmp_path: Path, renderer: int
 ) -> None:
     def scraped(url: str) -> dict[str, float]:
-        families = text_string_to_metric_families(httpx.get(url).text)
+        families = text_string_to_metric_families(httpx.get(url, timeout=120).text)
         return {"".join([s.name, *s.labels.values()]): s.value for family in families for s in family.samples}
 
     done = serve.submit("fine")
@@ -261,9 +264,8 @@ def test_workers_of_a_service_are_counted_together_and_those_elsewhere_serve_the
     assert {"trompe_phase_seconds_totalattack", "trompe_phase_seconds_totalprepare"} <= found.keys()
 
     elsewhere = Service(Settings(data=tmp_path / "elsewhere"), renderer)
-    port = free_port()
     job = elsewhere.submit("fine")
-    with elsewhere.worker(TROMPE_METRICS_PORT=str(port)):
+    with reserved_port() as port, elsewhere.worker(TROMPE_METRICS_PORT=str(port)):
         elsewhere.ended(job)
         assert scraped(f"http://127.0.0.1:{port}/metrics")["trompe_attack_steps_total"] == 10
     elsewhere.store.close()
@@ -320,7 +322,7 @@ class TestOutage:
             postgres.stop()
             started = time.monotonic()
             assert running.end(signal.SIGTERM) == 0
-            assert time.monotonic() - started < 10
+            assert time.monotonic() - started < 30  # the database is away for longer than that
             postgres.start()
         service.open_gate(job)
         with service.worker():

@@ -51,7 +51,7 @@ def painted(obj: Object3D, grey: int) -> Object3D:
 @pytest.fixture(scope="module")
 def anisotropic(running_worker: Running) -> Iterator[Ask]:
     with running_worker("--set", "anisotropy=16") as address:
-        target = SailenvTarget(*address, timeout=60)
+        target = SailenvTarget(*address, timeout=240)
         yield lambda obj, views: target.render(obj, views, size=SIZE)
         target.close()
 

@@ -220,7 +220,7 @@ def test_the_tokens_are_looked_up_once_for_many_requests_at_the_same_time(
     api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     api.headers = api.token("ci", Right.read)
-    monkeypatch.setattr("trompe_server.api.guard.FRESH", 1.0)
+    monkeypatch.setattr("trompe_server.api.guard.FRESH", 600.0)
     look_up = Mock(side_effect=api.services.tokens.by_hash)
     monkeypatch.setattr(api.services.tokens, "by_hash", look_up)
 

@@ -113,7 +113,7 @@ def test_a_range_of_a_file(done: Ended, asked: str, status: int, content: bytes)
     assert ("content-range" in answer.headers) == (status == 206)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], max_examples=30)
 @given(st.integers(0, 9), st.integers(0, 12))
 def test_content_range_says_which_bytes_these_are(done: Ended, first: int, length: int) -> None:
     answer = done.get("digits.txt", {"Range": f"bytes={first}-{first + length}"})

@@ -2,13 +2,16 @@
 
 import asyncio
 import json
+import threading
 import time
 from collections.abc import Callable
+from typing import Any
 from unittest.mock import Mock
 
 import httpx
 import pytest
 
+from tests.served import wait_until
 from tests.server.api.conftest import Api
 from trompe_server.api import following
 from trompe_server.storage.database import DatabaseDownError
@@ -49,16 +52,24 @@ def test_events_are_replayed_from_the_beginning_or_after_the_last_one_seen(stock
 
 
 def follow(api: Api, job: str, *, meanwhile: Callable[[], None]) -> httpx.Response:
-    """The stream of a job while ``meanwhile`` happens."""
+    """The stream of a job while ``meanwhile`` happens, once it has begun."""
+    look, begun = following._look, threading.Event()
+
+    def noticed(*arguments: Any) -> Any:
+        found = look(*arguments)
+        begun.set()
+        return found
 
     async def both() -> httpx.Response:
         async with api.connect() as client:
             stream = asyncio.create_task(client.get(f"/v1/jobs/{job}/events"))
-            await asyncio.sleep(0.1)
+            assert await asyncio.to_thread(begun.wait, 120)
             await asyncio.to_thread(meanwhile)
-            return await asyncio.wait_for(stream, 10)
+            return await asyncio.wait_for(stream, 120)
 
-    return asyncio.run(both())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(following, "_look", noticed)
+        return asyncio.run(both())
 
 
 @pytest.fixture
@@ -101,7 +112,7 @@ def test_a_follower_waits_for_a_database_that_is_away_for_a_moment(
 
     def lose() -> None:
         monkeypatch.setattr(store, "get", flaky)
-        time.sleep(0.3)
+        wait_until(lambda: len(failures) == 3)
         monkeypatch.setattr(store, "get", get)
         stocked.end(job)
 
@@ -113,12 +124,20 @@ def test_a_follower_waits_for_a_database_that_is_away_for_a_moment(
 @pytest.mark.usefixtures("quick")
 def test_a_connection_in_which_nothing_happens_is_kept_alive(stocked: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(following, "KEEP_ALIVE", 0.05)
-    job = stocked.job()
+    job, app, sent = stocked.job(), stocked.app, list[bytes]()
+
+    async def noting(scope: Any, receive: Any, send: Any) -> None:
+        async def note(message: Any) -> None:
+            sent.append(message.get("body", b""))
+            await send(message)
+
+        await app(scope, receive, note)
 
     def wait() -> None:
-        time.sleep(0.4)
+        wait_until(lambda: b"".join(sent).count(b": ping") >= 3)
         stocked.end(job, JobState.cancelled)
 
+    monkeypatch.setattr(stocked, "app", noting)
     assert follow(stocked, job, meanwhile=wait).text.count("\n: ping") >= 3
 
 
@@ -131,5 +150,6 @@ def test_many_followers_of_waiting_jobs_ask_the_database_seldom(stocked: Api, mo
         time.sleep(2.5)
         stocked.end(job)
 
+    began = time.monotonic()
     follow(stocked, job, meanwhile=wait)
-    assert look.call_count <= 9
+    assert look.call_count <= 8 + (time.monotonic() - began) / following.PATIENCE

@@ -2,7 +2,6 @@
 
 import asyncio
 import threading
-import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -112,7 +111,7 @@ def test_a_name_that_several_uploads_share_is_refused_with_their_ids(
 def test_uploads_are_looked_into_a_few_at_a_time_and_nothing_else_waits_for_them(
     api: Api, triangle_zip: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    at_work, most, lock = 0, 0, threading.Lock()
+    at_work, most, lock, gate = 0, 0, threading.Lock(), threading.Event()
     add = Library.add_object
 
     def slowly(*arguments: Any, **options: Any) -> ObjectInfo:
@@ -120,7 +119,7 @@ def test_uploads_are_looked_into_a_few_at_a_time_and_nothing_else_waits_for_them
         with lock:
             at_work += 1
             most = max(most, at_work)
-        time.sleep(0.05)
+        gate.wait(120)
         with lock:
             at_work -= 1
         return add(*arguments, **options)
@@ -131,9 +130,12 @@ def test_uploads_are_looked_into_a_few_at_a_time_and_nothing_else_waits_for_them
         async with api.connect() as client:
             posts = [client.post("/v1/objects", files={"file": ("a.zip", triangle_zip())}) for _ in range(10)]
             uploads = asyncio.gather(*posts)
-            await asyncio.sleep(0.05)
+            while at_work < UPLOADS:
+                await asyncio.sleep(0.01)
             assert (await client.get("/v1/jobs")).status_code == 200
             assert not uploads.done()
+            await asyncio.sleep(0.05)  # for one that comes in too many
+            gate.set()
             return await uploads
 
     answers = asyncio.run(many())

@@ -53,8 +53,9 @@ def test_a_job_on_another_device_is_the_same_job(kind: str, tmp_path: Path, monk
 
 def test_an_attack_computes_on_its_surrogates_device(mug: Object3D, monkeypatch: pytest.MonkeyPatch) -> None:
     """Textures, masks and a loaded state come from the CPU all the same."""
-    textures, masks = textures_of(mug), torch.rand(len(MUG_VIEWS), *SIZE) < 0.5
-    texels = {name: torch.rand(texture.shape[:2]) < 0.5 for name, texture in textures.items()}
+    textures, generator = textures_of(mug), torch.Generator().manual_seed(0)
+    masks = torch.rand(len(MUG_VIEWS), *SIZE, generator=generator) < 0.5
+    texels = {name: torch.rand(each.shape[:2], generator=generator) < 0.5 for name, each in textures.items()}
     found = []
     for device in ("cpu", pretend_device(monkeypatch)):
         geometry = prepare_geometry(mug, MUG_VIEWS, size=SIZE, sampling=SamplingModel(), device=device)

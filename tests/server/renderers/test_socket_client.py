@@ -5,13 +5,13 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 
 import numpy as np
 import pytest
 
+from tests.served import reserved_port, wait_until
 from tests.small_models import OBJ
 from trompe_server.renderers import SailenvTarget, local_renderer
 from trompe_shared.errors import RendererError
@@ -43,10 +43,10 @@ def listening(answer: Callable[[socket.socket], None]) -> Iterator[tuple[str, in
         thread = threading.Thread(target=serve)
         thread.start()
         yield listener.getsockname()[:2]
-        thread.join(timeout=30)
+        thread.join(timeout=240)
 
 
-def render(address: tuple[str, int], *, timeout: float = 30.0) -> str:
+def render(address: tuple[str, int], *, timeout: float = 240.0) -> str:
     """The message of the error that rendering raises."""
     with closing(SailenvTarget(*address, timeout=timeout)) as target, pytest.raises(RendererError) as raised:
         target.render(triangle(), [VIEW], size=(8, 8))
@@ -80,17 +80,15 @@ def pretend(frame: list[bytes], *, instance: str = "1") -> Callable[[socket.sock
 
 
 def test_where_nothing_listens_the_error_says_how_to_start_a_renderer() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        address = listener.getsockname()[:2]
-    message = render(address)
-    assert f"trompe render --host 127.0.0.1 --port {address[1]}" in message
+    with reserved_port() as port:
+        assert f"trompe render --host 127.0.0.1 --port {port}" in render(("127.0.0.1", port))
 
 
 def test_a_renderer_that_stays_silent_is_given_up() -> None:
     done = threading.Event()
 
     def answer(connection: socket.socket) -> None:
-        done.wait(20)
+        done.wait(240)
 
     with listening(answer) as address:
         assert "did not answer within" in render(address, timeout=0.2)
@@ -161,9 +159,7 @@ def test_a_local_renderer_ends_when_its_parent_is_killed() -> None:
     )
     killed = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=False)
     host, port = killed.stdout.split()
-    deadline = time.monotonic() + 30
-    while engine_at(host, int(port), timeout=5) is not None:
-        assert time.monotonic() < deadline, "it outlives its parent"
+    wait_until(lambda: engine_at(host, int(port), timeout=5) is None, story=lambda: "it outlives its parent")
 
 
 def test_a_local_renderer_that_does_not_start_is_an_error() -> None:

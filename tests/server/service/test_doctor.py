@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from tests.served import reserved_port
 from trompe_server.queue.store import JobStore
 from trompe_server.service import commands, doctor
 from trompe_server.settings import Settings
@@ -104,10 +105,11 @@ def healthy() -> Iterator[int]:
 
 def test_a_port_is_free_or_ours_or_somebody_elses(healthy: int) -> None:
     assert doctor._check_port(healthy) == "`trompe serve` is running"
+    with reserved_port() as port:
+        assert doctor._check_port(port) == "free for `trompe serve`"
     with socket.create_server(("127.0.0.1", 0)) as other:
-        port = other.getsockname()[1]
-    assert doctor._check_port(port) == "free for `trompe serve`"
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        threading.Thread(target=lambda: other.accept()[0].close(), daemon=True).start()
+        thread = threading.Thread(target=lambda: other.accept()[0].close())
+        thread.start()
         finding = failed(doctor._check_port, other.getsockname()[1])
+        thread.join()
     assert "trompe serve --port" in str(finding.remedy)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.served import wait_until
 from trompe_server.system.sandbox import run_limited
 from trompe_shared.errors import ClassifierError, ObjectError
 
@@ -19,7 +20,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     """Runs lines of Python as a module in the sandbox."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
 
-    def start(lines: str, *arguments: str, memory: int = 2**30, seconds: float = 30.0) -> Mapping[str, Any]:
+    def start(lines: str, *arguments: str, memory: int = 2**30, seconds: float = 120.0) -> Mapping[str, Any]:
         (tmp_path / "hostile_module.py").write_text(f"import os, sys, time\n{lines}\n")
         return run_limited("hostile_module", arguments, memory=memory, seconds=seconds, failure=ObjectError)
 
@@ -40,7 +41,7 @@ def test_a_refusal_is_raised_with_its_words_as_the_error_that_the_caller_names(r
     lines = 'print(\'{"error": "the chair has no legs"}\'); sys.exit(1)'
     assert failure(run, lines) == "the chair has no legs"
     with pytest.raises(ClassifierError, match="no legs"):
-        run_limited("hostile_module", [], memory=2**30, seconds=30, failure=ClassifierError)
+        run_limited("hostile_module", [], memory=2**30, seconds=120, failure=ClassifierError)
 
 
 @pytest.mark.parametrize(
@@ -62,17 +63,17 @@ def test_what_ended_it_is_said(run: Run, lines: str, words: str) -> None:
 
 
 def test_it_ends_when_its_time_is_over_and_takes_its_children_with_it(run: Run, tmp_path: Path) -> None:
-    note = str(tmp_path / "pid")
-    child = f"import subprocess; p = subprocess.Popen(['sleep', '60']); open({note!r}, 'w').write(str(p.pid))"
-    start = time.monotonic()
-    assert "more than 3 s" in failure(run, f"{child}\ntime.sleep(60)", seconds=3)
-    assert time.monotonic() - start < 20
-    pid = int((tmp_path / "pid").read_text())
-    for _ in range(100):
-        if state_of(pid) in {"", "Z"}:
-            return
-        time.sleep(0.05)
-    raise AssertionError("the child lives on")
+    note = tmp_path / "pid"
+    note.touch()
+    child = f"import subprocess; p = subprocess.Popen(['sleep', '600']); open({str(note)!r}, 'w').write(str(p.pid))"
+    for seconds in (3, 60):  # in three seconds a busy machine may not come as far as to the child
+        start = time.monotonic()
+        assert f"more than {seconds} s" in failure(run, f"{child}\ntime.sleep(600)", seconds=seconds)
+        assert time.monotonic() - start < seconds + 60
+        if note.read_text():
+            break
+    pid = int(note.read_text())
+    wait_until(lambda: state_of(pid) in {"", "Z"}, story=lambda: "the child lives on")
 
 
 def state_of(pid: int) -> str:
