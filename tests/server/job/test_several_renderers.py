@@ -116,12 +116,13 @@ class NoisyTarget(FakeTarget):
 
     engine: EngineInfo = EngineInfo("noisy", "1", deterministic=False)  # noqa: RUF009
     seen: list[tuple[bytes, int]] = field(default_factory=list)
+    levels: int = 3
 
     def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
         images = super().render(obj, views, **options)
         for image, view in zip(images, views, strict=True):
-            np.minimum(image, 253, out=image)
-            image += np.random.default_rng(view.noise).integers(0, 3, image.shape, dtype=np.uint8)
+            np.minimum(image, 256 - self.levels, out=image)
+            image += np.random.default_rng(view.noise).integers(0, self.levels, image.shape, dtype=np.uint8)
             self.seen.append((obj.to_zip(), view.noise))
         return images
 
@@ -155,6 +156,13 @@ def test_pictures_before_and_after_have_the_same_noise(library: Library) -> None
     for views in ("own", "held_out"):
         before, after = (run.artifacts.arrays(f"views_{when}")[views].astype(int) for when in ("before", "after"))
         assert abs(after - before).max() <= 2
+
+
+@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.parametrize(("levels", "advised"), [(3, False), (12, True)])
+def test_more_samples_are_advised_where_noise_is_strong(library: Library, levels: int, advised: bool) -> None:
+    run = run_job(spec_of(surrogate="calibrated", steps=1), library, target=NoisyTarget(levels=levels))
+    assert any("take more samples" in warning for warning in run.result.warnings) == advised
 
 
 def test_an_engine_that_is_deterministic_numbers_no_noise(library: Library) -> None:

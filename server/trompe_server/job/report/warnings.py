@@ -7,7 +7,6 @@ from trompe_server.job.report.data import ReportData
 from trompe_server.job.setup import JobSetup
 from trompe_server.judging.metrics import drop_warning, reach_warning, texels_altered, transfer_gap
 from trompe_server.judging.transparency import faint_warnings
-from trompe_server.surrogate.calibration import Calibration
 from trompe_server.surrogate.fidelity import MAX_ERROR, MIN_EXPLAINED
 from trompe_shared.api import MOST_VIEWS, JobSpec
 
@@ -21,8 +20,8 @@ LARGE_GAP: Final = 0.1
 STEEP: Final = 0.1
 """Difference of the slope of predicted changes from 1 above which a warning tells its direction."""
 
-LOUD: Final = 2.0 / 255
-"""Noise of a renderer, root mean square, above which it counts as a cause of poor fidelity."""
+LOUD: Final = 2.0
+"""Noise of a renderer, root mean square in 1/255, above which a warning advises more samples."""
 
 MORE_VIEWS: Final = 240
 """A pool size that reaches unseen views for most objects."""
@@ -61,6 +60,7 @@ def _noise(data: ReportData) -> Iterator[str]:
         yield (
             f"{engine} is not deterministic: pictures of the same view differ by random noise{by}. Only pictures of "
             "held-out views have noise that the attack has not seen."
+            + (" If they are fooled less, let the renderer take more samples." if measured and measured > LOUD else "")
         )
 
 
@@ -109,11 +109,12 @@ def _fidelity(data: ReportData) -> Iterator[str]:
     calibration = data.calibration
     if calibration is None or calibration.model == "diffuse" or calibration.fidelity.good_enough:
         return
-    mean = calibration.fidelity.mean()
+    mean, automatic = calibration.fidelity.mean(), data.spec.search.surrogate == "auto"
+    told = "`trompe render --check` tells whether the renderer keeps the conventions."
     yield (
         f"The surrogate is outside its tolerance: mean error {mean['error'] * 255:.1f}/255 "
         f"(at most {MAX_ERROR * 255:.1f}), {mean['explained']:.0%} of a random repaint's effect explained "
-        f"(at least {MIN_EXPLAINED:.0%}). {_direction(mean['slope'])}{_remedy(data, calibration)}"
+        f"(at least {MIN_EXPLAINED:.0%}). {_direction(mean['slope'])}{told if automatic else 'Try `surrogate: auto`.'}"
     )
 
 
@@ -124,14 +125,6 @@ def _direction(slope: float) -> str:
     return (
         f"It predicts {1 / slope:.1f} times the true change, so it promises too {'much' if slope < 1 else 'little'}. "
     )
-
-
-def _remedy(data: ReportData, calibration: Calibration) -> str:
-    if data.spec.search.surrogate != "auto":
-        return "Try `surrogate: auto`."
-    if calibration.noise > LOUD:
-        return f"The renderer's noise is {255 * calibration.noise:.1f}/255: let it take more samples."
-    return "`trompe render --check` tells whether the renderer keeps the conventions."
 
 
 def _transfer(data: ReportData) -> Iterator[str]:
