@@ -238,7 +238,7 @@ class SearchOptions(_Part):
     image_pipeline: PipelineName | None = _option(
         None,
         "random changes of each image before the networks: robust (size, tone, noise, JPEG), transfer (placement too, "
-        "for networks left out) or none; default: transfer for an ensemble on random views, else none",
+        "for networks left out) or none; default: transfer for an ensemble, else robust; none for grid and queries",
     )
     views_per_step: Annotated[int, Field(ge=1, le=MOST_VIEWS)] | None = _option(
         None, f"views in one step; default: {VIEWS_PER_STEP} of a pool, all of the grid"
@@ -403,8 +403,9 @@ class JobSpec(_Part):
         """What happens to each image of the attack before the networks."""
         if self.search.image_pipeline is not None:
             return self.search.image_pipeline
-        single = not self.victim.ensemble or self.victim.queries is not None
-        return "none" if single or self.views.grid else "transfer"
+        if self.views.grid or self.victim.queries is not None:
+            return "none"
+        return "transfer" if self.victim.ensemble else "robust"
 
     @property
     def views_per_step(self) -> int:

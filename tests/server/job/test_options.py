@@ -157,8 +157,10 @@ def test_scores_of_a_classifier_without_gradients_are_counted(
 @pytest.mark.parametrize(
     ("options", "pipeline"),
     [
-        ({}, "none"),
+        ({}, "robust"),
+        ({"image_pipeline": "none"}, "none"),
         ({"grid": True}, "none"),
+        ({"queries": 4}, "none"),
         ({"ensemble": ["net"], "queries": 4}, "none"),
         ({"ensemble": ["net"]}, "transfer"),
         ({"ensemble": ["net"], "grid": True}, "none"),
@@ -167,7 +169,7 @@ def test_scores_of_a_classifier_without_gradients_are_counted(
     ],
     ids=str,
 )
-def test_an_ensemble_is_attacked_for_transfer_except_on_the_papers_grid_or_by_scores(
+def test_paint_is_made_for_changed_images_except_on_the_papers_grid_or_by_scores(
     options: dict[str, Any], pipeline: str
 ) -> None:
     assert JobSpec.of("mug", label="mug", **options).image_pipeline == pipeline
