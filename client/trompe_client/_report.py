@@ -206,7 +206,9 @@ def _facts(result: Result, seconds: Mapping[str, float]) -> Iterator[tuple[str, 
     yield "transfer gap", f"{_figure(result.transfer_gap)}{differ}"
     parts = ", ".join(f"{part} {took:.1f}" for part, took in seconds.items())
     yield "seconds", f"{sum(seconds.values()):.1f}: {parts}"
-    yield "probe renders", str(result.probe_renders)
+    added = result.attacked_views - len(result.views)
+    yield "attacked views", f"{result.attacked_views}" + (f", {added} of them added where it lost" if added > 0 else "")
+    yield "probe renders", f"{result.probe_renders}, and {result.further_renders} to find views to add"
     if result.evaluations is not None:
         queries = "" if result.queries is None else f", {result.queries:,} scores asked"
         yield "images evaluated", f"{result.evaluations:,} by each attacked classifier{queries}"

@@ -128,7 +128,9 @@ class ResultRow(_Options):  # type: ignore[misc]
     fidelity_error: float | None = None
     fidelity_explained: float | None = None
     evaluations: int | None = None
+    attacked_views: int | None = None
     probe_renders: int | None = None
+    further_renders: int | None = None
     prepare_s: float | None = None
     calibrate_s: float | None = None
     attack_s: float | None = None

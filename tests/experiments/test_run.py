@@ -218,9 +218,9 @@ def test_rows_hold_the_resolved_views_per_step_and_image_pipeline(service: FakeS
     ran(plan_of(objects={"mug": {}}, grid={}, cases=cases), service, tmp_path)
     rows = read_table(tmp_path / RESULTS, ResultRow)
     assert [(row.case, row.image_pipeline, row.views_per_step, row.alpha) for row in rows] == [
-        ("plain", "none", 40, 0.01),
+        ("plain", "robust", 40, 0.01),
         ("many", "transfer", 40, 0.01),
-        ("few", "none", 7, 0.01),
+        ("few", "robust", 7, 0.01),
         ("grid", "none", 60, 0.01),
     ]
 

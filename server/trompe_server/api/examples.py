@@ -184,6 +184,8 @@ RESULT: Final = _json(
         "max_view_change": 0.049,
         "seconds": {"open": 0.4, "prepare": 3.1, "calibrate": 6.4, "attack": 21.0, "judge": 3.0, "report": 2.2},
         "probe_renders": 304,
+        "attacked_views": 75,
+        "further_renders": 105,
         "versions": {"trompe": "0.2.0"},
         "views": [_VIEW],
         "held_out_views": [_VIEW],

@@ -36,8 +36,10 @@ class Backgrounds:
     weights: Sequence[float] | None = None
 
     def weighted(self, recognised: Sequence[bool]) -> "Backgrounds":
-        """The same, weighted by the share of each background's own views in which the object is ``recognised``."""
-        own, known = np.asarray(self.own), np.asarray(recognised)
+        """The same, weighted by the share of each background's views in which the object is ``recognised``, as far as
+        that is told: of the first views."""
+        known = np.asarray(recognised)
+        own = np.asarray(self.own)[: len(known)]
         shares = [known[own == number].mean() if (own == number).any() else 0 for number in range(len(self.pictures))]
         return replace(self, weights=[float(share) + MIN_WEIGHT for share in shares])
 

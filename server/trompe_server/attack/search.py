@@ -19,13 +19,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from trompe_server.attack.backgrounds import Backgrounds
+from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Evaluation, Flat, Objective
-from trompe_server.attack.optimiser import OPTIMISERS, Box, Iterate, step_factor
+from trompe_server.attack.optimiser import OPTIMISERS, Box, Iterate, Memory, step_factor
 from trompe_server.attack.view_budget import ViewBudget
 from trompe_server.image_pipelines import Drawn, ImagePipeline
 from trompe_shared.api import OptimiserName
 
-__all__ = ["SHOWN", "SKIPPED", "Search"]
+__all__ = ["SHOWN", "SKIPPED", "Search", "finished", "went_on"]
 
 SKIPPED: Final = 2
 """Steps for which a settled view is skipped."""
@@ -39,8 +40,22 @@ NEARLY_ALL: Final = 0.99
 SAFE_ENOUGH: Final = 6.0
 """The safe margin at which the search ends. A goal with a larger one always runs all steps."""
 
+AGAIN: Final = 2
+"""Least number of steps after views were added."""
+
 RESUME, SHOWN, SAFE = "search.resume", "search.shown", "search.safe"
 """Memory of the search: step from which each view is evaluated again, images shown so far, safe margin."""
+
+
+def finished(memory: Memory, goal: Goal) -> bool:
+    """Whether all views are so safely won that no step is left to take."""
+    return float(memory.get(SAFE, goal.safe)) > SAFE_ENOUGH > goal.safe
+
+
+def went_on(memory: Memory, *, shown: int, added: int) -> Memory:
+    """Memory of a search that has looked at ``shown`` further images and ``added`` views: these ask for more steps."""
+    safe = {SAFE: memory[SAFE].clamp(max=SAFE_ENOUGH / RISE**AGAIN)} if added and SAFE in memory else {}
+    return {**memory, **safe, SHOWN: memory.get(SHOWN, torch.tensor(0)) + shown}
 
 
 @dataclass(frozen=True)
@@ -64,8 +79,8 @@ class Search:
     pipeline: ImagePipeline | None
 
     def finished(self, point: Iterate) -> bool:
-        """Whether all views are so safely won that no step is left to take."""
-        return self._safe(point) > SAFE_ENOUGH > self.objective.goal.safe
+        """Whether no step is left to take."""
+        return finished(point.memory, self.objective.goal)
 
     def least_left(self, point: Iterate, step: int) -> int:
         """Number of steps after ``step`` if nearly all views are fooled from now on."""
@@ -75,10 +90,11 @@ class Search:
         return min(most, max(0, math.floor(math.log(SAFE_ENOUGH / self._safe(point), RISE)) + 1))
 
     def evaluate(self, point: Iterate, step: int) -> tuple[Evaluation, Iterate]:
-        """Evaluate the step's views; returns the iterate with updated memory."""
+        """Evaluate the step's views, to which some may have come at the end; returns the iterate with new memory."""
         batches = self.objective.surrogate.batches
         from_start = torch.zeros(sum(map(len, batches)), dtype=torch.long, device=point.delta.device)
-        resume = point.memory.get(RESUME, from_start)
+        known = point.memory.get(RESUME, from_start)
+        resume = torch.cat([known, from_start[len(known) :]])
         change = OPTIMISERS[self.optimiser].gradient_at(point, step_factor(step, self.total), self.box)
         drawn = self._drawn(batches, step)
         found = self._objective_at(point, step).evaluate(change, drawn, resume <= step)

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
@@ -23,11 +23,16 @@ OPEN: Final = "open"
 
 @dataclass(frozen=True)
 class Spent:
-    """Steps of an attack, images shown to each classifier (before its first step too), scores asked."""
+    """Steps of an attack, images shown to each classifier (before its first step too), scores asked.
+
+    added, renders: views added to the first ones, and images rendered to find and to probe them.
+    """
 
     steps: int
     evaluations: int | None
     queries: int | None
+    added: int = 0
+    renders: int = 0
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,19 @@ class JobFiles:
             return False
         return True
 
+    def save_look(self, chunk: int, arrays: Mapping[str, NDArray[Any]], *, views: int, renders: int) -> None:
+        """Save what a look at further views found before a chunk, and its number of added ``views`` and images."""
+        self._write(f"{_LOOK}-{chunk:03d}", {"views": views, "renders": renders})
+        self.save(f"{_LOOK}-{chunk:03d}", **arrays)
+
+    def has_look(self, chunk: int) -> bool:
+        """Whether there was a look before a chunk."""
+        return self.artifacts.exists(f"{_LOOK}-{chunk:03d}.npz")
+
+    def load_look(self, chunk: int) -> dict[str, NDArray[Any]]:
+        """The arrays of ``save_look``. Raises ``DamagedFileError``."""
+        return self.load(f"{_LOOK}-{chunk:03d}")
+
     def note_seconds(self, phase: str, seconds: float) -> None:
         """Record the duration of a phase, or of what came before it since the phase before (``open-<phase>``)."""
         self._write(f"seconds-{phase}", seconds)
@@ -112,7 +130,9 @@ class JobFiles:
         spent = [each for each in found if each is not None]
         queries = sum(each["queries"] for each in spent)
         evaluations = spent[-1]["evaluations"] + (self._read("shown-before") or 0) if spent else None
-        return Spent(sum(each["steps"] for each in spent), evaluations, queries or None)
+        looks = [look for chunk in range(self.chunks) if (look := self._read(f"{_LOOK}-{chunk:03d}")) is not None]
+        added, renders = (sum(look[name] for look in looks) for name in ("views", "renders"))
+        return Spent(sum(each["steps"] for each in spent), evaluations, queries or None, added, renders)
 
     def _seal(self, name: str, data: bytes) -> None:
         """Write bytes with their hash at the end, which readers of .npz files ignore."""
@@ -147,4 +167,5 @@ def _whole(name: str) -> Iterator[None]:
 
 
 _CALIBRATION: Final = "calibration"
+_LOOK: Final = "look"
 _HASH: Final = hashlib.sha256().digest_size

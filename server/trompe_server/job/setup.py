@@ -48,6 +48,9 @@ reaches the last: each is won by as much as possible."""
 PROBE_STREAM, HELD_OUT_STREAM, POOL_STREAM, GRID_STREAM, NOISE_STREAM = range(5)
 """Separate random streams of probes, held-out views, pool, backgrounds of the grid and numbers of noise."""
 
+FEWEST, PARTS = 60, 4
+"""An attack starts with this part of its pool, and at least with so many views."""
+
 SAILENV: Final = "sailenv"
 Image8 = NDArray[np.uint8]
 
@@ -74,9 +77,10 @@ class JobSetup:
     """Everything a job works on.
 
     classifier: the first attacked one, which also judges. members: all attacked ones. pipeline: what happens to the
-    attack's images before them, if anything. within: masks of the texels that may change. views: attacked views;
-    ``held_out`` ones only judge. renderers: attacked ones, then those that only judge. backdrops: the pictures that
-    views name, (H, W, 3). original: uploaded file and its name; ``None`` if that is ``obj``. device: torch device.
+    attack's images before them, if anything. within: masks of the texels that may change. views: attacked views.
+    further: views of the pool that are attacked if the paint loses them. held_out: views that only judge. renderers:
+    attacked ones, then those that only judge. backdrops: the pictures that views name, (H, W, 3). original: uploaded
+    file and its name; ``None`` if that is ``obj``. device: torch device.
     """
 
     obj: Object3D
@@ -87,6 +91,7 @@ class JobSetup:
     goal: Goal
     within: tuple[TexelMasks, ...]
     views: tuple[View, ...]
+    further: tuple[View, ...]
     held_out: tuple[View, ...]
     renderers: tuple[JobRenderer, ...]
     backdrops: Mapping[str, Image8]
@@ -109,11 +114,10 @@ class JobSetup:
         """(H, W) of all images: the input size of the attacked classifier."""
         return self.classifier.image_size
 
-    @property
-    def backgrounds(self) -> Backgrounds | None:
-        """Backgrounds of the attacked views; ``None`` if they all have the same."""
+    def backgrounds(self, views: Sequence[View]) -> Backgrounds | None:
+        """Backgrounds of ``views``; ``None`` if they all have the same."""
         names: dict[str | tuple[int, int, int], int] = {}
-        own = [names.setdefault(view.backdrop or view.background, len(names)) for view in self.views]
+        own = [names.setdefault(view.backdrop or view.background, len(names)) for view in views]
         if len(names) == 1:
             return None
         pictures = np.empty((len(names), *self.size, 3), np.uint8)
@@ -159,7 +163,8 @@ def open_setup(
     framing = framing_of(obj, spec.views, shipped=info.name if info.shipped else None)
     distribution = ViewDistribution(framing.distance, framing.elevation, spec.views.ranges, centre=framing.centre)
     drawn = partial(_drawn, spec, distribution)
-    grid, count = spec.views.grid, spec.views.count
+    views = _grid(spec, framing) if spec.views.grid else drawn(spec.views.count, POOL_STREAM)
+    first = _first(spec, len(views), renderers=1 + len(more_targets))
     pictures = {name: _picture(name, library) for name in spec.views.background if colour_of(name) is None}
     return JobSetup(
         obj,
@@ -169,7 +174,8 @@ def open_setup(
         tuple(stored(judge) for judge in spec.judges.networks),
         _goal(spec, classifier),
         _within(spec, obj, library),
-        _grid(spec, framing) if grid else drawn(count, POOL_STREAM),
+        views[:first],
+        views[first:],
         drawn(spec.views.held_out, HELD_OUT_STREAM),
         (
             *(_renderer(spec, each, pictures, attacked=True) for each in (target, *more_targets)),
@@ -180,6 +186,14 @@ def open_setup(
         device,
         PIPELINES.get(spec.image_pipeline),
     )
+
+
+def _first(spec: JobSpec, count: int, *, renderers: int) -> int:
+    """Number of the ``count`` views that an attack starts with: all of them if one choice rests on all, or if each
+    renderer would need others."""
+    if spec.views.grid or spec.paint.tau is not None or spec.paint.keep is not None or spec.victim.queries is not None:
+        return count
+    return count if renderers > 1 else min(count, max(FEWEST, -(-count // PARTS)))
 
 
 def _renderer(spec: JobSpec, target: TargetRenderer, pictures: Mapping[str, Image8], *, attacked: bool) -> JobRenderer:

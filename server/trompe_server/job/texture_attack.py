@@ -2,15 +2,16 @@
 
 prepare     target images of the unpainted object, their classes and saliency
 calibrate   probes; sampling model of the target; the cheapest sufficient colour model
-attack-NNN  some steps of the attack in the surrogate
+attack-NNN  some steps of the attack in the surrogate; before some of them, further views from the pool
 judge       target images of the saved 8-bit texture; report
 """
 
 import logging
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Final
 
@@ -36,6 +37,7 @@ from trompe_server.attack import (
 from trompe_server.attack.search import SHOWN, SKIPPED
 from trompe_server.job.calibrations import JobCalibrations
 from trompe_server.job.files import OPEN, JobFiles
+from trompe_server.job.pool import GrowingPool
 from trompe_server.job.protocol import VIEWS_AFTER, VIEWS_BEFORE, Artifacts, OnProgress, PhaseReport, numbered
 from trompe_server.job.report import ReportData, saliency_views, worst, write_report
 from trompe_server.job.setup import JobRenderer, JobSetup, open_setup
@@ -75,6 +77,15 @@ Image8 = NDArray[np.uint8]
 Ask = Callable[[JobRenderer, Object3D, Sequence[View]], Image8]
 
 
+@dataclass(frozen=True)
+class _Scene:
+    """What the attack's steps look at: all views so far, their backgrounds if several, the texels that may change."""
+
+    surrogate: AnySurrogate
+    backgrounds: Backgrounds | None
+    texels: TexelMasks
+
+
 def open_job(
     spec: JobSpec, *, library: Library, artifacts: Artifacts, target: TargetRenderer, **options: Any
 ) -> "TextureAttack":
@@ -111,6 +122,7 @@ class TextureAttack:
         self._counts: Counter[str] = Counter()
         self._between = time.perf_counter() if began is None else began
         self._stepped: deque[float] = deque(maxlen=RECENT)
+        self._scenes: dict[tuple[View, ...], _Scene] = {}
 
     def phases(self) -> list[str]:
         """See ``PhasedJob.phases``."""
@@ -144,14 +156,22 @@ class TextureAttack:
             own = ask(renderer, setup.obj, renderer.shown(setup.views))
             held_out = ask(renderer, setup.obj, renderer.shown(setup.held_out, held_out=True))
             self.files.save(numbered(VIEWS_BEFORE, number), own=own, held_out=held_out)
-        clean = self._clean
         if setup.white_box:
-            maps = saliency(clean, setup.members, goal=setup.goal)
-            self.files.save("saliency", maps=maps.numpy().astype(np.float16))
-        if not recognised(setup.classifier.predict(clean), setup.labels).any():
+            self.files.save("saliency", maps=self._saliency())
+        if not any(self._recognised):
             return self._end_without_attack()
         _ = self._masks  # raises for a tau that leaves no pixel, before more images are rendered
         return PhaseReport(self._progress("prepare", 1.0))
+
+    def _saliency(self) -> NDArray[np.float16]:
+        """Saliency of the attacked renderers' images (views, H, W): with tau of all, otherwise of those that the report
+        shows, and zero elsewhere."""
+        clean, count = self._clean, len(self.setup.views)
+        shown = range(count) if self.spec.paint.tau is not None else saliency_views(self.setup)
+        index = [number * count + view for number in range(len(self.setup.attacked)) for view in shown]
+        maps = np.zeros(clean.shape[:3], np.float16)
+        maps[index] = saliency(clean[index], self.setup.members, goal=self.setup.goal).numpy()
+        return maps
 
     def _end_without_attack(self) -> PhaseReport:
         names = " or ".join(repr(self.setup.class_name(label)) for label in self.setup.labels)
@@ -175,6 +195,7 @@ class TextureAttack:
         if not chunk:
             self._choose(on_progress)
         total, asked = self.spec.search.steps, self.setup.queries or 0
+        before = self._looked(chunk, before, on_progress)
         steps = min(CHUNK, total - before.step)
         taken: list[Step] = []
         last = self._progress("attack", (before.step + steps) / total)
@@ -196,6 +217,20 @@ class TextureAttack:
             self._counts["classifier_images"] += taken[-1].evaluations - int(before.memory.get(SHOWN, 0))
             self.files.note_spent(chunk, steps=len(taken), evaluations=taken[-1].evaluations, queries=queries)
         return PhaseReport(last)
+
+    def _looked(self, chunk: int, state: AttackState, on_progress: OnProgress) -> AttackState:
+        """The state after a look at further views of the pool, if one is due."""
+        if not self.setup.further:
+            return state
+        self._pool.load(chunk)
+        if not self._pool.due(state):
+            return state
+        done = state.step / self.spec.search.steps
+        ask = partial(self._asker("attack", math.inf, on_progress, done=done), self.setup.renderers[0])
+        painted = self.budget.repaint(self.setup.obj, state.deltas)
+        looked = self._pool.look(chunk, state, painted, ask)
+        self._counts["classifier_images"] += int(looked.memory[SHOWN]) - int(state.memory.get(SHOWN, 0))
+        return looked
 
     def _left(self, most: int, least: int) -> dict[str, float]:
         """Estimated seconds left, from the time of the latest steps: with ``most`` and with ``least`` further ones.
@@ -223,11 +258,11 @@ class TextureAttack:
         self.artifacts.write("preview.png", encode_png(picture))
 
     def _ascend(self, state: AttackState, steps: int, on_step: Callable[[Step], None]) -> AttackState:
-        setup, search = self.setup, self.spec.search
+        setup, search, scene = self.setup, self.spec.search, self._scene()
         return attack(
             state,
             self._textures,
-            self._surrogate,
+            scene.surrogate,
             setup.members,
             goal=setup.goal,
             budget=self.budget,
@@ -235,13 +270,21 @@ class TextureAttack:
             total_steps=search.steps,
             optimiser=search.optimiser,
             masks=self._masks,
-            texels=self._movable,
+            texels=scene.texels,
             views_per_step=self.spec.views_per_step * len(setup.attacked),
-            backgrounds=self._backgrounds,
+            backgrounds=scene.backgrounds,
             pipeline=setup.pipeline,
             seed=search.seed,
             on_step=on_step,
         )
+
+    def _scene(self) -> _Scene:
+        added = self._pool.views if self.setup.further else ()
+        if added not in self._scenes:
+            parts = [*self._surrogates, *(self._pool.surrogates if added else ())]
+            surrogate, backgrounds = joined(parts), self._backgrounds(added)
+            self._scenes = {added: _Scene(surrogate, backgrounds, self._movable(surrogate))}
+        return self._scenes[added]
 
     def _judge(self, on_progress: OnProgress) -> PhaseReport:
         setup = self.setup
@@ -299,15 +342,16 @@ class TextureAttack:
         shown = [self._before(number)["own"] for number in range(len(self.setup.attacked))]
         return shown[0] if len(shown) == 1 else np.concatenate(shown)
 
-    def _asker(self, phase: str, total: int, on_progress: OnProgress) -> Ask:
-        """Renders in a renderer and reports progress; ``total`` images complete the phase."""
-        done = 0
+    def _asker(self, phase: str, total: float, on_progress: OnProgress, *, done: float = 0.0) -> Ask:
+        """Renders in a renderer and reports progress; ``total`` images complete the phase, of which a part is
+        ``done``."""
+        shown = 0
 
         def on_frame() -> None:
-            nonlocal done
-            done += 1
+            nonlocal shown
+            shown += 1
             self._counts["target_renders"] += 1
-            on_progress(self._progress(phase, min(1.0, done / total)))
+            on_progress(self._progress(phase, min(1.0, done + shown / total)))
 
         def ask(renderer: JobRenderer, obj: Object3D, views: Sequence[View]) -> Image8:
             return renderer.target.render(obj, views, size=self.setup.size, on_frame=on_frame)
@@ -344,7 +388,12 @@ class TextureAttack:
 
     @cached_property
     def _surrogate(self) -> AnySurrogate:
+        """Of the first views."""
         return joined(self._surrogates)
+
+    @cached_property
+    def _pool(self) -> GrowingPool:
+        return GrowingPool(self.setup, self.files, self._found[0])
 
     @cached_property
     def _maps(self) -> torch.Tensor | None:
@@ -364,32 +413,31 @@ class TextureAttack:
         """Saliency accumulated per texel."""
         return None if self._maps is None else rank_texels(self._surrogate, self._textures, self._maps)
 
-    @cached_property
-    def _backgrounds(self) -> Backgrounds | None:
+    def _backgrounds(self, added: Sequence[View] = ()) -> Backgrounds | None:
         """Backgrounds of a pool's views, drawn more often where the object is recognised better."""
-        backgrounds = None if self.spec.views.grid else self.setup.backgrounds
-        if backgrounds is None:
-            return None
-        logits = self.setup.classifier.predict(self._clean)
-        backgrounds = replace(backgrounds, own=[*backgrounds.own] * len(self.setup.attacked))
-        return backgrounds.weighted(recognised(logits, self.setup.labels).tolist())
+        views = [*self.setup.views] * len(self.setup.attacked)
+        backgrounds = None if self.spec.views.grid else self.setup.backgrounds([*views, *added])
+        return None if backgrounds is None else backgrounds.weighted(self._recognised)
 
     @cached_property
-    def _movable(self) -> TexelMasks:
+    def _recognised(self) -> list[bool]:
+        """Whether the object is recognised, for each image of the first views."""
+        found: list[bool] = recognised(self.setup.classifier.predict(self._clean), self.setup.labels).tolist()
+        return found
+
+    def _movable(self, surrogate: AnySurrogate) -> TexelMasks:
         within = list(self.setup.within)
         if self.spec.paint.keep is not None:
             known = self.files.load(FEW)
             within.append({name: torch.from_numpy(known[str(k)]) for k, name in enumerate(self._textures)})
-        return movable(self._surrogate, self.budget, self._masks, within=within)
+        return movable(surrogate, self.budget, self._masks, within=within)
 
     def _choose(self, on_progress: OnProgress) -> None:
-        """Choose the few texels of ``keep``, and count the images shown before the first step: each view once for its
-        saliency, and once for its class in front of its own background.
-        """
+        """Choose the few texels of ``keep``, and count the images shown before the first step, for them and for tau."""
         keep = self.spec.paint.keep
-        looks = (self.spec.paint.tau is not None) + (self._backgrounds is not None)
         few = 0 if keep is None else self._choose_texels(keep, on_progress)
-        shown = looks * len(self.setup.attacked) * len(self.setup.views) + few
+        for_tau = len(self._clean) if self.spec.paint.tau is not None else 0
+        shown = for_tau + few
         self._counts["classifier_images"] += shown
         self.files.note_shown_before(shown)
 
@@ -404,7 +452,7 @@ class TextureAttack:
             within=setup.within,
             masks=self._masks,
             views_per_step=self.spec.views_per_step * len(setup.attacked),
-            backgrounds=self._backgrounds,
+            backgrounds=self._backgrounds(),
             pipeline=setup.pipeline,
             seed=self.spec.search.seed,
             on_step=lambda _: on_progress(self._progress("attack", 0.0)),

@@ -54,6 +54,7 @@ MEASURES: Final = {
     "ssim": "SSIM",
     "delta_e": "CIEDE2000",
     "evaluations": "Images shown to the classifier",
+    "attacked_views": "Attacked views",
     "probe_renders": "Probe renders",
 }
 SHARES: Final = {"disagreement", "texels_altered"}

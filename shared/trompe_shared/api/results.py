@@ -198,7 +198,7 @@ class Result(Schema):
         None, description="mean |difference| of the change between neighbouring texels, [0, 1] units"
     )
     evaluations: int | None = Field(
-        None, description="images shown to each attacked classifier, those for tau, keep and backgrounds included"
+        None, description="images shown to each attacked classifier, those for tau, keep and further views included"
     )
     queries: int | None = Field(None, description="scores asked of a score-only classifier")
     fidelity: dict[str, float] = Field(
@@ -209,7 +209,11 @@ class Result(Schema):
     seconds: dict[str, float] = Field(
         description="wall time of the job by kind of work: the phases, ``open`` before and between them, ``report``"
     )
-    probe_renders: int
+    probe_renders: int = Field(description="target images of the calibration")
+    attacked_views: int = Field(
+        description="views that the attack used: `views`, and those that it added from its pool because it lost them"
+    )
+    further_renders: int = Field(description="target images with which the attack looked for views to add")
     versions: dict[str, str]
     views: list[ViewPrediction]
     held_out_views: list[ViewPrediction]

@@ -189,8 +189,10 @@ def test_views_draw_their_backgrounds_from_several(library: Library, photo: Imag
 def test_the_attack_knows_the_backgrounds_of_its_views(library: Library, photo: Image8) -> None:
     picture = library.add_background(encode_png(photo), "wall.png").id
     setup = setup_of(library, background=["black", "#ff0000", picture], pool=30)
-    assert setup.backgrounds is not None
-    for view, number in zip(setup.views, setup.backgrounds.own, strict=True):
+    backgrounds = setup.backgrounds(setup.views)
+    assert backgrounds is not None
+    for view, number in zip(setup.views, backgrounds.own, strict=True):
         expected = setup.backdrops[picture] if view.backdrop else np.array(view.background, np.uint8)
-        assert (setup.backgrounds.pictures[number].numpy() == expected).all()
-    assert setup_of(library, background=["black"], pool=30).backgrounds is None
+        assert (backgrounds.pictures[number].numpy() == expected).all()
+    black = setup_of(library, background=["black"], pool=30)
+    assert black.backgrounds(black.views) is None

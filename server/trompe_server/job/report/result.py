@@ -48,7 +48,8 @@ def worst(seen: Sequence[ReportData]) -> ReportData:
         judged = (data.held_out or data.target).a_drop
         return math.inf if judged is None else judged
 
-    return min((data for data in seen if data.renderer.attacked), key=drop)
+    attacked = [data for data in seen if data.renderer.attacked]
+    return min(attacked, key=drop) if len(attacked) > 1 else attacked[0]
 
 
 def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
@@ -88,6 +89,8 @@ def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
         ],
         **_calibration_fields(data),
         probe_renders=sum(each.calibration.renders for each in seen if each.calibration is not None),
+        attacked_views=len(setup.views) + data.spent.added,
+        further_renders=data.spent.renders,
         **_changes(data),
         goal_reached=_goal_reached(data),
         evaluations=data.spent.evaluations,

@@ -1,0 +1,129 @@
+"""The views that an attack adds to its first ones: those of its pool that its paint does not win yet.
+
+An attack starts with a part of its pool, because many objects need no more. At some of its steps the target shows the
+repainted object in the next views of the pool. If too many of these are lost, the attack probes those that are not
+safely won, and goes on with them. It never looks at held-out views.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from trompe_server.attack import AttackState
+from trompe_server.attack.search import finished, went_on
+from trompe_server.job.files import JobFiles
+from trompe_server.job.setup import JobSetup
+from trompe_server.surrogate import Geometry, Surrogate, prepare_geometry
+from trompe_server.surrogate.calibration import Calibration, build_surrogate, probe_images
+from trompe_shared.geometry import View
+from trompe_shared.object3d import Object3D
+
+__all__ = ["GrowingPool"]
+
+LOOKS: Final = (10, 20, 30)
+"""Steps after which an attack looks at further views. It also does so whenever all its views are safely won."""
+
+FEW_LOST: Final = 0.02
+"""Share of the further views that may be lost without more probes."""
+
+Image8 = NDArray[np.uint8]
+Ask = Callable[[Object3D, Sequence[View]], Image8]
+
+
+@dataclass(frozen=True)
+class _Look:
+    """The views that one look added, with their surrogate if there are any; it saw ``further`` views up to ``end``."""
+
+    views: tuple[View, ...]
+    surrogate: Surrogate | None
+    end: int
+
+
+class GrowingPool:
+    """The pool of a job. Its looks are in the job's ``files``, each by the chunk of steps before which it was taken."""
+
+    def __init__(self, setup: JobSetup, files: JobFiles, calibration: Calibration) -> None:
+        self._setup, self._files, self._calibration = setup, files, calibration
+        self._looks: dict[int, _Look] = {}
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The added views."""
+        return tuple(view for look in self._looks.values() for view in look.views)
+
+    @property
+    def surrogates(self) -> tuple[Surrogate, ...]:
+        """The surrogates of the added views."""
+        return tuple(look.surrogate for look in self._looks.values() if look.surrogate is not None)
+
+    def load(self, chunk: int) -> None:
+        """Take up the looks before ``chunk``. Raises ``DamagedFileError``."""
+        known = {earlier: look for earlier, look in self._looks.items() if earlier < chunk}
+        for earlier in range(chunk):
+            if earlier not in known and self._files.has_look(earlier):
+                known[earlier] = self._opened(self._files.load_look(earlier))
+        self._looks = dict(sorted(known.items()))
+
+    def due(self, state: AttackState) -> bool:
+        """Whether to look at further views before the next step."""
+        last = list(self._looks.values())[-1:]
+        if self._seen == len(self._setup.further) or (last and not last[0].views):
+            return False
+        return state.step in LOOKS or finished(state.memory, self._setup.goal)
+
+    def look(self, chunk: int, state: AttackState, painted: Object3D, ask: Ask) -> AttackState:
+        """Look at further views before the steps of ``chunk``; the state to go on with."""
+        setup, first = self._setup, self._seen
+        further = setup.further[first : first + len(setup.views)]
+        lost, unsafe = self._verdicts(ask(painted, self._shown(further)))
+        chosen = np.flatnonzero(unsafe) if lost.mean() > FEW_LOST else np.zeros(0, np.int64)
+        views = [further[k] for k in chosen]
+        with ThreadPoolExecutor(1, thread_name_prefix="rasterise") as executor:
+            geometry = executor.submit(self._geometry, views) if views else None
+            arrays = {"index": first + chosen, "end": np.array(first + len(further))} | self._probed(views, ask)
+        self._files.save_look(chunk, arrays, views=len(views), renders=len(further) + self._renders(len(views)))
+        self._looks[chunk] = self._opened(arrays, geometry.result() if geometry is not None else None)
+        return replace(state, memory=went_on(state.memory, shown=len(further), added=len(views)))
+
+    @property
+    def _seen(self) -> int:
+        return max((look.end for look in self._looks.values()), default=0)
+
+    def _shown(self, views: Sequence[View]) -> list[View]:
+        return self._setup.renderers[0].shown(views)
+
+    def _verdicts(self, images: Image8) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(Lost, not safely won) views by their images, for any of the classifiers."""
+        goal = self._setup.goal
+        logits = [torch.from_numpy(member.predict(images)) for member in self._setup.members]
+        lost, unsafe = (~torch.stack([won(each) for each in logits]).all(0) for won in (goal.reached, goal.settled))
+        return lost.numpy(), unsafe.numpy()
+
+    def _probed(self, views: Sequence[View], ask: Ask) -> dict[str, Image8]:
+        obj, shown = self._setup.obj, self._shown(views)
+        empty = np.zeros((0, *self._setup.size, 3), np.uint8)
+        if not views:
+            return {"clean": empty, "probes": np.zeros((len(self._calibration.greys), *empty.shape), np.uint8)}
+        return {"clean": ask(obj, shown), "probes": probe_images(self._calibration.greys, obj, shown, ask)}
+
+    def _renders(self, views: int) -> int:
+        return views * (1 + len(self._calibration.greys))
+
+    def _geometry(self, views: Sequence[View]) -> Geometry:
+        setup, sampling = self._setup, self._calibration.sampling
+        return prepare_geometry(setup.obj, views, size=setup.size, sampling=sampling, device=setup.device)
+
+    def _opened(self, found: Mapping[str, NDArray[Any]], geometry: Geometry | None = None) -> _Look:
+        views, end = tuple(self._setup.further[k] for k in found["index"]), int(found["end"])
+        if not views:
+            return _Look(views, None, end)
+        built = partial(build_surrogate, replace(self._calibration, probes=found["probes"]), self._setup.obj)
+        backdrops, device = self._setup.backdrops, self._setup.device
+        surrogate = built(self._shown(views), found["clean"], geometry=geometry, backdrops=backdrops, device=device)
+        return _Look(views, surrogate, end)

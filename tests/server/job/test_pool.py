@@ -1,0 +1,129 @@
+"""A growing pool: which views an attack adds, and that it survives interruption."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.fakes import FakeTarget
+from tests.job_runs import MemoryArtifacts, Run, opened, run_job, setup_of, spec_of
+from trompe_server.job.protocol import DamagedFileError
+from trompe_server.library import Library
+from trompe_shared.geometry import View
+from trompe_shared.object3d import Object3D
+
+pytestmark = pytest.mark.usefixtures("no_pictures", "few_first_views")
+
+HARD: dict[str, Any] = {"pool": 16, "steps": 20, "epsilon": 0.1, "alpha": 0.02, "surrogate": "calibrated"}
+
+
+@pytest.fixture
+def few_first_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four first views, and four at each look, which is after every chunk of steps."""
+    monkeypatch.setattr("trompe_server.job.setup.FEWEST", 4)
+    monkeypatch.setattr("trompe_server.job.pool.LOOKS", (5, 10, 15))
+
+
+class Recorder(FakeTarget):
+    """Records the views of each request, and shows noise on some views."""
+
+    def __init__(self, noisy: Sequence[View] = ()) -> None:
+        super().__init__()
+        self.asked, self.noisy = list[tuple[Object3D, tuple[View, ...]]](), set(noisy)
+
+    def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> NDArray[np.uint8]:
+        self.asked.append((obj, tuple(views)))
+        images = super().render(obj, views, **options)
+        for image, view in zip(images, views, strict=True):
+            if view in self.noisy:
+                image[:] = np.random.default_rng(0).integers(0, 256, image.shape)
+        return images
+
+
+def test_an_attack_that_loses_views_adds_those_it_has_not_safely_won(library: Library) -> None:
+    target, artifacts, setup = Recorder(), MemoryArtifacts(), setup_of(library, **HARD)
+    assert (len(setup.views), len(setup.further)) == (4, 12)
+    job, seen = opened(spec_of(**HARD), library, artifacts, target=target), 0
+    for phase in job.phases():
+        before = len(target.asked)
+        job.run(phase, lambda _: None)
+        asked = target.asked[before:]
+        if not artifacts.exists(f"look-{phase[-3:]}.npz"):
+            continue
+        found = artifacts.arrays(f"look-{phase[-3:]}")
+        painted, looked = asked[0]
+        assert looked == setup.further[seen : seen + 4]
+        seen = int(found["end"])
+        logits = setup.classifier.predict(FakeTarget().render(painted, looked, size=setup.size))
+        own = logits[:, list(setup.labels)].max(1)
+        margin = np.delete(logits, list(setup.labels), axis=1).max(1) - own
+        wanted = [view for view, by in zip(looked, margin, strict=True) if by < setup.goal.safe]
+        added = [setup.further[k] for k in found["index"]]
+        assert added == (wanted if (margin < 0).mean() > 0.02 else [])
+        assert [views for _, views in asked[1 : 1 + 3 * bool(added)]] == [tuple(added)] * 3 * bool(added)
+    result = artifacts.result()
+    assert result.attacked_views > 4 == len(result.views) == result.target.views
+    assert result.further_renders == seen + 3 * (result.attacked_views - 4)
+
+
+def test_an_attack_that_loses_few_of_the_further_views_adds_none(
+    library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trompe_server.job.pool.LOOKS", (15,))
+    monkeypatch.setattr("trompe_server.job.pool.FEW_LOST", 1.0)
+    run = run_job(spec_of(**HARD), library)
+    assert run.result.attacked_views == 4
+    assert run.result.further_renders == 4
+
+
+def test_a_pool_grows_to_the_same_bytes_after_interruption(library: Library) -> None:
+    once, anew = run_job(spec_of(**HARD), library), run_job(spec_of(**HARD), library, new=True, times=2)
+    assert once.result.attacked_views > 4
+    assert anew.artifacts.lasting() == once.artifacts.lasting()
+
+
+def test_held_out_views_cannot_influence_the_texture(library: Library) -> None:
+    setup = setup_of(library, **HARD)
+    honest, target = run_job(spec_of(**HARD), library), Recorder(setup.held_out)
+    lied = run_job(spec_of(**HARD), library, target=target)
+    assert lied.result.held_out != honest.result.held_out
+    assert lied.artifacts.files["chair-adversarial.zip"] == honest.artifacts.files["chair-adversarial.zip"]
+    judged = [views for _, views in target.asked if set(views) & set(setup.held_out)]
+    assert judged == [setup.held_out] * 2
+
+
+def test_images_of_looks_are_counted(library: Library) -> None:
+    target = Recorder()
+    run = run_job(spec_of(**HARD), library, target=target)
+    assert run.counts()["target_renders"] == sum(len(views) for _, views in target.asked)
+    assert run.result.evaluations == run.counts("attack")["classifier_images"]
+
+
+def test_a_damaged_look_is_taken_anew(library: Library) -> None:
+    spec, run = spec_of(**HARD), Run()
+    job = opened(spec, library, run.artifacts)
+    for phase in job.phases()[:4]:
+        job.run(phase, lambda _: None)
+    whole = run.artifacts.files["look-001.npz"]
+    run.artifacts.files["look-001.npz"] = whole[:-40]
+    with pytest.raises(DamagedFileError, match="look-001"):
+        opened(spec, library, run.artifacts).run("attack-002", lambda _: None)
+    opened(spec, library, run.artifacts).run("attack-001", lambda _: None)
+    assert run.artifacts.files["look-001.npz"] == whole
+
+
+@pytest.mark.parametrize(
+    "options", [{"tau": 0.05}, {"keep": 0.1}, {"pool": 4}], ids=["tau", "keep", "no more than the first"]
+)
+def test_attacks_whose_choice_rests_on_all_views_start_with_all(library: Library, options: dict[str, Any]) -> None:
+    setup = setup_of(library, **HARD | options)
+    assert (len(setup.views), setup.further) == (options.get("pool", 16), ())
+
+
+def test_backgrounds_of_added_views_are_drawn_too(library: Library) -> None:
+    spec = spec_of(**HARD, background=["white", "black", "#808080"])
+    once, anew = run_job(spec, library), run_job(spec, library, new=True)
+    assert once.result.attacked_views > 4
+    assert anew.artifacts.lasting() == once.artifacts.lasting()
