@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from trompe_server.attack import AttackState
+from trompe_server.attack.goal import SAFE_MARGIN
 from trompe_server.attack.search import finished, went_on
 from trompe_server.job.files import JobFiles
 from trompe_server.job.setup import JobSetup
@@ -99,8 +100,9 @@ class GrowingPool:
         return self._setup.renderers[0].shown(views)
 
     def _verdicts(self, images: Image8) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(Lost, not safely won) views by their images, for any of the classifiers."""
-        goal = self._setup.goal
+        """(Lost, not safely won) views by their images, for any of the classifiers. The margin is that of plain images:
+        those of a pipeline would have nearly all views probed."""
+        goal = replace(self._setup.goal, safe=min(self._setup.goal.safe, SAFE_MARGIN))
         logits = [torch.from_numpy(member.predict(images)) for member in self._setup.members]
         lost, unsafe = (~torch.stack([won(each) for each in logits]).all(0) for won in (goal.reached, goal.settled))
         return lost.numpy(), unsafe.numpy()
