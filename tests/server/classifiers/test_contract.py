@@ -30,7 +30,7 @@ from trompe_server.classifiers import (
     score_based,
 )
 from trompe_server.classifiers.archive import read_program
-from trompe_server.classifiers.fold import BATCH_NORM, Formatted, fold_batch_norm
+from trompe_server.classifiers.fold import BATCH_NORM, CONVOLUTION, Formatted, fold_batch_norm
 from trompe_server.classifiers.onnx import OnnxClassifier, load_onnx
 from trompe_server.classifiers.protocol import fit_images
 from trompe_shared.errors import ClassifierError
@@ -326,6 +326,29 @@ def test_a_network_that_does_not_run_channels_last_is_left_as_it_was(tmp_path: P
     assert classifier.network.memory_format is torch.contiguous_format
     images = fit_images(noise(3), SIZE)
     torch.testing.assert_close(classifier.logits(images), network(images.contiguous()))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        pytest.param(lambda net, x: nn.functional.relu6(net.body[0](x)).mean((2, 3)), id="an activation with bounds"),
+        pytest.param(lambda net, x: net.body[0](x).relu().mean((2, 3)), id="an activation without"),
+        pytest.param(lambda net, x: _activated_and_not(net.body[0](x)), id="another reader"),
+        pytest.param(lambda net, x: net.body[0](x).sigmoid().mean((2, 3)), id="another activation"),
+    ],
+)
+def test_logits_without_a_gradient_are_the_same(function: Callable[[Any, Tensor], Tensor], tmp_path: Path) -> None:
+    network = white_box(export(Around(function), tmp_path / "net.pt2"))
+    assert isinstance(network.network, Formatted)
+    assert network.network.scoring is not None
+    assert not [node for node in network.network.scoring.graph.nodes if node.target is CONVOLUTION]
+    images = fit_images(noise(3), SIZE)
+    torch.testing.assert_close(network.scores(images), network.logits(images.requires_grad_()).detach())
+
+
+def _activated_and_not(features: Tensor) -> Tensor:
+    sums: Tensor = features.relu() + features
+    return sums.mean((2, 3))
 
 
 @pytest.mark.parametrize(

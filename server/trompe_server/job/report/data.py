@@ -81,8 +81,10 @@ class ReportData:
         """Logits of the surrogate's images of the own views, before and after; ``None`` without an attack."""
         if self.surrogate is None or self.painted is None:
             return None
-        classifier, surrogate = self.setup.classifier, self.surrogate
-        return classifier.predict(surrogate.images(self.setup.obj)), classifier.predict(surrogate.images(self.painted))
+        predict, clean = self.setup.classifier.predict, self.surrogate.images(self.setup.obj)
+        anchored = np.array_equal(clean, self.before["own"])
+        before = self.logits_before["own"] if anchored else predict(clean)
+        return before, predict(self.surrogate.images(self.painted))
 
     def _accuracy(self, views: str) -> Accuracy:
         after = None if self.logits_after is None else self.logits_after[views]
