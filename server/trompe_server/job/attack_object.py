@@ -10,15 +10,15 @@ import numpy as np
 
 from trompe_server.attack import Budget, Goal, ViewDistribution, attack, start
 from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
-from trompe_server.image_pipelines import ImagePipeline
-from trompe_server.job.setup import HELD_OUT_STREAM, POOL_STREAM, PROBE_STREAM
+from trompe_server.image_pipelines import PIPELINES
+from trompe_server.job.setup import HELD_OUT_STREAM, POOL_STREAM, PROBE_STREAM, SAFE_MARGINS
 from trompe_server.judging.metrics import accuracy
 from trompe_server.renderers import TargetRenderer
 from trompe_server.spec.framing import framing_of
 from trompe_server.spec.labels import resolve_labels
 from trompe_server.surrogate import textures_of
 from trompe_server.surrogate.calibration import build_surrogate, calibrate
-from trompe_shared.api import Accuracy, ViewOptions
+from trompe_shared.api import Accuracy, PipelineName, ViewOptions
 from trompe_shared.errors import ClassifierError
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, load_object
@@ -51,21 +51,22 @@ def attack_object(
     budget: Budget | None = None,
     steps: int = 30,
     seed: int = 0,
-    pipeline: ImagePipeline | None = None,
+    image_pipeline: PipelineName = "robust",
 ) -> AttackedObject:
     """Repaint ``obj`` so that ``classifier`` no longer recognises ``label`` in the images of ``target``.
 
     Each of several labels counts as the object. ``obj`` and ``classifier`` can be paths or names of shipped ones, such
     as ``mug`` and ``tiny``. ``views`` and ``held_out`` default to random cameras and lights that frame the object.
-    ``budget`` defaults to epsilon 0.05, alpha 0.01. ``pipeline``: random changes of the attack's images before the
-    classifier. The same arguments give the same bytes. Raises ``TrompeError`` for inputs that cannot be read or do not
-    fit together.
+    ``budget`` defaults to epsilon 0.05, alpha 0.01. ``image_pipeline``: random changes of the attack's images before
+    the classifier, as for a job. The same arguments give the same bytes. Raises ``TrompeError`` for inputs that cannot be
+    read or do not fit together.
     """
     obj = obj if isinstance(obj, Object3D) else _load(obj)
     network = load_classifier(classifier) if isinstance(classifier, str | Path) else classifier
     if not isinstance(network, WhiteBoxClassifier):
         raise ClassifierError(f"{network.name!r} gives scores but no gradients (.onnx); use a .pt2 file.")
-    goal = Goal(resolve_labels(label, network.classes, network.n_classes, network.name))
+    labels = resolve_labels(label, network.classes, network.n_classes, network.name)
+    goal = Goal(labels, safe=SAFE_MARGINS[image_pipeline])
     framing = framing_of(obj, ViewOptions())
     cameras = ViewDistribution(framing.distance, framing.elevation, centre=framing.centre)
     own = cameras.sample(VIEWS, generator=np.random.default_rng([seed, POOL_STREAM])) if views is None else views
@@ -89,7 +90,7 @@ def attack_object(
         budget=budget,
         steps=steps,
         seed=seed,
-        pipeline=pipeline,
+        pipeline=PIPELINES.get(image_pipeline),
     )
     painted = budget.repaint(obj, state.deltas)
 
