@@ -58,8 +58,8 @@ def attack_object(
     Each of several labels counts as the object. ``obj`` and ``classifier`` can be paths or names of shipped ones, such
     as ``mug`` and ``tiny``. ``views`` and ``held_out`` default to random cameras and lights that frame the object.
     ``budget`` defaults to epsilon 0.05, alpha 0.01. ``image_pipeline``: random changes of the attack's images before
-    the classifier, as for a job. The same arguments give the same bytes. Raises ``TrompeError`` for inputs that cannot be
-    read or do not fit together.
+    the classifier, as for a job. The same arguments give the same bytes. Raises ``TrompeError`` for inputs that cannot
+    be read or do not fit together.
     """
     obj = obj if isinstance(obj, Object3D) else _load(obj)
     network = load_classifier(classifier) if isinstance(classifier, str | Path) else classifier
