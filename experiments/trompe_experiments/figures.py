@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from trompe_experiments.between import between_chart, between_markdown
 from trompe_experiments.engines import engines_chart, engines_markdown
 from trompe_experiments.histograms import prediction_histograms
 from trompe_experiments.paper import paper_means_markdown, table_one_chart, table_one_markdown
@@ -109,6 +110,12 @@ FIGURES: dict[str, Kind] = {
         lambda data: _values(data, "renderers") > 1,
         lambda data: engines_chart(data.results),
         lambda data: engines_markdown(data.results),
+    ),
+    "between": Kind(
+        "What is kept when images are changed on their way to the network",
+        lambda data: _values(data, "image_pipeline") > 1 and all(row.drops_through for row in data.results),
+        lambda data: between_chart(data.results),
+        lambda data: between_markdown(data.results),
     ),
     "histograms": Kind(
         "Predicted classes, before and after",

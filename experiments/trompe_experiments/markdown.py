@@ -4,9 +4,11 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-__all__ = ["cells_of", "figure_words", "markdown_row", "markdown_table"]
+__all__ = ["NOT_APPLICABLE", "cells_of", "figure_words", "markdown_row", "markdown_table"]
 
 DELIMITERS: Final = {"l": "---", "r": "---:"}
+
+NOT_APPLICABLE: Final = "n.a."
 
 
 def markdown_table(header: Sequence[object], rows: Iterable[Iterable[object]], *, align: str | None = None) -> str:
@@ -32,4 +34,4 @@ def cells_of(line: str) -> list[str]:
 
 def figure_words(value: float | None, form: str = ".2f") -> str:
     """A number for tables."""
-    return "n.a." if value is None else format(value, form)
+    return NOT_APPLICABLE if value is None else format(value, form)

@@ -13,7 +13,7 @@ from typing import Any, Final, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-from trompe_experiments.markdown import figure_words
+from trompe_experiments.markdown import NOT_APPLICABLE, figure_words
 from trompe_shared.api import OPTIONS, Accuracy, JobSpec, JobState, Option, Result
 from trompe_shared.errors import SpecError
 
@@ -140,6 +140,12 @@ class ResultRow(_Options):  # type: ignore[misc]
     pipeline_drops: str = ""
     warnings: str = ""
     error: str = ""
+
+    @property
+    def drops_through(self) -> dict[str, float | None]:
+        """Held-out ``A_drop`` through each image pipeline of the judges, by its name; ``None`` where it is n.a."""
+        words = [each.rpartition(" ") for each in self.pipeline_drops.split(SEPARATOR) if each]
+        return {name: None if drop == NOT_APPLICABLE else float(drop) for name, _, drop in words}
 
     @property
     def dissimilarity(self) -> float | None:

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from trompe_client.cli import main
+from trompe_experiments.between import between_markdown
 from trompe_experiments.documents import fill, outdated
 from trompe_experiments.engines import engines_markdown
 from trompe_experiments.figures import FIGURES, Data, figures_of, histogram_rows, plain_rows, read_data
@@ -69,6 +70,25 @@ def prediction(key: str, moment: str, count: int, *, true: bool) -> PredictionRo
     return PredictionRow(
         key=key, views="target", moment=moment, class_index=index, name=name, true_class=true, count=count
     )
+
+
+def test_drops_through_changes_of_the_images_are_compared_with_the_undisturbed_ones(tmp_path: Path) -> None:
+    rows = [
+        row(image_pipeline="robust", held_out_a_drop=0.8, pipeline_drops="half size 0.600 | grain 0.800"),
+        row(image_pipeline="robust", object="pot", held_out_a_drop=0.4, pipeline_drops="half size 0.100 | grain n.a."),
+        row(image_pipeline="none", held_out_a_drop=1.0, pipeline_drops="half size 0.200 | grain 0.500"),
+    ]
+    lines = [[*map(str.strip, line.split("|")[1:-1])] for line in between_markdown(rows).splitlines()]
+    assert lines[0] == ["in between", "robust: A_drop", "robust: kept", "none: A_drop", "none: kept"]
+    assert lines[2:] == [
+        ["nothing", "0.60", "**1.00**", "1.00", "**1.00**"],
+        ["half size", "0.35", "**0.50**", "0.20", "**0.20**"],
+        ["grain", "0.80", "**1.00**", "0.50", "**0.50**"],
+    ]
+    data = Data(tmp_path, tuple(rows), ())
+    assert "between" in figures_of(data)
+    assert all(path.stat().st_size > 5000 for path in data.draw("between"))
+    assert "between" not in figures_of(Data(tmp_path, tuple(rows[:2]), ()))
 
 
 def test_configurations_are_means_over_the_objects_that_all_of_them_have() -> None:
