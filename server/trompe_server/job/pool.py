@@ -2,7 +2,8 @@
 
 An attack starts with a part of its pool, because many objects need no more. At some of its steps the target shows the
 repainted object in the next views of the pool. If too many of these are lost, the attack probes those that are not
-safely won, and goes on with them. It never looks at held-out views.
+safely won, and goes on with them. Where few views show the object recognised at all, few can be lost: it then looks at
+more of them, and fewer losses are too many. It never looks at held-out views.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +32,10 @@ LOOKS: Final = (10, 20, 30)
 """Steps after which an attack looks at further views. It also does so whenever all its views are safely won."""
 
 FEW_LOST: Final = 0.02
-"""Share of the further views that may be lost without more probes."""
+"""Share of the recognised views that may be lost without more probes."""
+
+LEAST_KNOWN: Final = 0.25
+"""Share of recognised views below which no more views are looked at."""
 
 Image8 = NDArray[np.uint8]
 Ask = Callable[[Object3D, Sequence[View]], Image8]
@@ -47,10 +51,13 @@ class _Look:
 
 
 class GrowingPool:
-    """The pool of a job. Its looks are in the job's ``files``, each by the chunk of steps before which it was taken."""
+    """The pool of a job. Its looks are in the job's ``files``, each by the chunk of steps before which it was taken.
 
-    def __init__(self, setup: JobSetup, files: JobFiles, calibration: Calibration) -> None:
-        self._setup, self._files, self._calibration = setup, files, calibration
+    ``known``: share of the first views in which the unpainted object is recognised.
+    """
+
+    def __init__(self, setup: JobSetup, files: JobFiles, calibration: Calibration, known: float) -> None:
+        self._setup, self._files, self._calibration, self._known = setup, files, calibration, known
         self._looks: dict[int, _Look] = {}
 
     @property
@@ -81,9 +88,9 @@ class GrowingPool:
     def look(self, chunk: int, state: AttackState, painted: Object3D, ask: Ask) -> AttackState:
         """Look at further views before the steps of ``chunk``; the state to go on with."""
         setup, first = self._setup, self._seen
-        further = setup.further[first : first + len(setup.views)]
+        further = setup.further[first : first + round(len(setup.views) / max(self._known, LEAST_KNOWN))]
         lost, unsafe = self._verdicts(ask(painted, self._shown(further)))
-        chosen = np.flatnonzero(unsafe) if lost.mean() > FEW_LOST else np.zeros(0, np.int64)
+        chosen = np.flatnonzero(unsafe) if lost.mean() > FEW_LOST * self._known else np.zeros(0, np.int64)
         views = [further[k] for k in chosen]
         with ThreadPoolExecutor(1, thread_name_prefix="rasterise") as executor:
             geometry = executor.submit(self._geometry, views) if views else None

@@ -393,7 +393,7 @@ class TextureAttack:
 
     @cached_property
     def _pool(self) -> GrowingPool:
-        return GrowingPool(self.setup, self.files, self._found[0])
+        return GrowingPool(self.setup, self.files, self._found[0], float(np.mean(self._recognised)))
 
     @cached_property
     def _maps(self) -> torch.Tensor | None:
