@@ -59,7 +59,7 @@ def saliency_object_sheet(
 
 def _triple(image: Images, saliency: Float[np.ndarray, "H W"], rendered: Images) -> Image.Image:
     hot = heat_over(image, _scaled({"view": saliency})["view"])
-    pictures = {"as it is": image, "saliency of this view": hot, "of all views, on the object": rendered}
+    pictures = {"as it is": image, "saliency of this view": hot, "accumulated on the object": rendered}
     return beside([captioned(_framed(picture, OBJECT_TILE), text) for text, picture in pictures.items()])
 
 
