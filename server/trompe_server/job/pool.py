@@ -9,7 +9,6 @@ more of them, and fewer losses are too many. It never looks at held-out views.
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -22,7 +21,7 @@ from trompe_server.attack.search import finished, went_on
 from trompe_server.job.files import JobFiles
 from trompe_server.job.setup import JobSetup
 from trompe_server.surrogate import Geometry, Surrogate, prepare_geometry
-from trompe_server.surrogate.calibration import Calibration, build_surrogate, probe_images
+from trompe_server.surrogate.calibration import Calibration, build_surrogate, painted_grey
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
@@ -59,6 +58,7 @@ class GrowingPool:
     def __init__(self, setup: JobSetup, files: JobFiles, calibration: Calibration, known: float) -> None:
         self._setup, self._files, self._calibration, self._known = setup, files, calibration, known
         self._looks: dict[int, _Look] = {}
+        self._loaded = False
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -72,16 +72,16 @@ class GrowingPool:
 
     def load(self, chunk: int) -> None:
         """Take up the looks before ``chunk``. Raises ``DamagedFileError``."""
-        known = {earlier: look for earlier, look in self._looks.items() if earlier < chunk}
-        for earlier in range(chunk):
-            if earlier not in known and self._files.has_look(earlier):
-                known[earlier] = self._opened(self._files.load_look(earlier))
-        self._looks = dict(sorted(known.items()))
+        if not self._loaded:
+            taken = [earlier for earlier in range(chunk) if self._files.has_look(earlier)]
+            self._looks = {earlier: self._opened(self._files.load_look(earlier)) for earlier in taken}
+            self._loaded = True
+        self._looks = {earlier: look for earlier, look in self._looks.items() if earlier < chunk}
 
     def due(self, state: AttackState) -> bool:
         """Whether to look at further views before the next step."""
-        last = list(self._looks.values())[-1:]
-        if self._seen == len(self._setup.further) or (last and not last[0].views):
+        last = next(reversed(self._looks.values()), None)
+        if self._seen == len(self._setup.further) or (last is not None and not last.views):
             return False
         return state.step in LOOKS or finished(state.memory, self._setup.goal)
 
@@ -92,11 +92,15 @@ class GrowingPool:
         lost, unsafe = self._verdicts(ask(painted, self._shown(further)))
         chosen = np.flatnonzero(unsafe) if lost.mean() > FEW_LOST * self._known else np.zeros(0, np.int64)
         views = [further[k] for k in chosen]
-        with ThreadPoolExecutor(1, thread_name_prefix="rasterise") as executor:
-            geometry = executor.submit(self._geometry, views) if views else None
-            arrays = {"index": first + chosen, "end": np.array(first + len(further))} | self._probed(views, ask)
-        self._files.save_look(chunk, arrays, views=len(views), renders=len(further) + self._renders(len(views)))
-        self._looks[chunk] = self._opened(arrays, geometry.result() if geometry is not None else None)
+        arrays, geometry = {"index": first + chosen, "end": np.array(first + len(further))}, None
+        if views:
+            with ThreadPoolExecutor(1, thread_name_prefix="rasterise") as executor:
+                prepared = executor.submit(self._geometry, views)
+                arrays |= self._probed(views, ask)
+            geometry = prepared.result()
+        renders = len(further) + len(views) * (1 + len(self._calibration.greys))
+        self._files.save_look(chunk, arrays, views=len(views), renders=renders)
+        self._looks[chunk] = self._opened(arrays, geometry)
         return replace(state, memory=went_on(state.memory, shown=len(further), added=len(views)))
 
     @property
@@ -115,14 +119,10 @@ class GrowingPool:
         return lost.numpy(), unsafe.numpy()
 
     def _probed(self, views: Sequence[View], ask: Ask) -> dict[str, Image8]:
-        obj, shown = self._setup.obj, self._shown(views)
-        empty = np.zeros((0, *self._setup.size, 3), np.uint8)
-        if not views:
-            return {"clean": empty, "probes": np.zeros((len(self._calibration.greys), *empty.shape), np.uint8)}
-        return {"clean": ask(obj, shown), "probes": probe_images(self._calibration.greys, obj, shown, ask)}
-
-    def _renders(self, views: int) -> int:
-        return views * (1 + len(self._calibration.greys))
+        obj, shown, greys = self._setup.obj, self._shown(views), self._calibration.greys
+        clean = ask(obj, shown)
+        probes = np.array([ask(painted_grey(obj, grey), shown) for grey in greys], np.uint8)
+        return {"clean": clean, "probes": probes.reshape(len(greys), *clean.shape)}
 
     def _geometry(self, views: Sequence[View]) -> Geometry:
         setup, sampling = self._setup, self._calibration.sampling
@@ -132,7 +132,14 @@ class GrowingPool:
         views, end = tuple(self._setup.further[k] for k in found["index"]), int(found["end"])
         if not views:
             return _Look(views, None, end)
-        built = partial(build_surrogate, replace(self._calibration, probes=found["probes"]), self._setup.obj)
-        backdrops, device = self._setup.backdrops, self._setup.device
-        surrogate = built(self._shown(views), found["clean"], geometry=geometry, backdrops=backdrops, device=device)
+        setup = self._setup
+        surrogate = build_surrogate(
+            replace(self._calibration, probes=found["probes"]),
+            setup.obj,
+            self._shown(views),
+            found["clean"],
+            geometry=geometry,
+            backdrops=setup.backdrops,
+            device=setup.device,
+        )
         return _Look(views, surrogate, end)

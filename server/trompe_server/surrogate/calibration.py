@@ -41,7 +41,6 @@ __all__ = [
     "find_sampling",
     "painted_grey",
     "painted_noise",
-    "probe_images",
 ]
 
 CALIBRATED_GREYS: Final = (0, 128)
@@ -303,11 +302,6 @@ def build_surrogate(
         size = (clean.shape[1], clean.shape[2])
         geometry = prepare_geometry(obj, views, size=size, sampling=calibration.sampling, device=device)
     return _shaded(calibration, geometry, obj, views, clean, backdrops)
-
-
-def probe_images(greys: Sequence[int], obj: Object3D, views: Sequence[View], ask: Ask) -> Image8:
-    """The target's images (greys, views, H, W, 3) of ``obj`` painted in each of the ``greys``."""
-    return np.stack([ask(painted_grey(obj, grey), views) for grey in greys])
 
 
 def _shaded(

@@ -83,8 +83,10 @@ def test_an_attack_that_loses_few_of_the_further_views_adds_none(
     assert run.result.further_renders == 4
 
 
-def test_a_pool_grows_to_the_same_bytes_after_interruption(library: Library) -> None:
-    once, anew = run_job(spec_of(**HARD), library), run_job(spec_of(**HARD), library, new=True, times=2)
+@pytest.mark.parametrize("surrogate", ["diffuse", "calibrated", "curve"])
+def test_a_pool_grows_to_the_same_bytes_after_interruption(library: Library, surrogate: str) -> None:
+    spec = spec_of(**HARD | {"surrogate": surrogate})
+    once, anew = run_job(spec, library), run_job(spec, library, new=True, times=2)
     assert once.result.attacked_views > 4
     assert anew.artifacts.lasting() == once.artifacts.lasting()
 
