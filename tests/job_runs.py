@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.fakes import FakeTarget
-from trompe_server.job.protocol import PhaseReport
+from trompe_server.job.protocol import PhaseReport, number_after
 from trompe_server.job.setup import JobSetup, open_setup
 from trompe_server.job.texture_attack import TextureAttack, open_job
 from trompe_server.library import Library
@@ -131,10 +131,13 @@ def run_job(
         library.calibrations.delete_all()
     run = Run()
     job = opened(spec, library, run.artifacts, **options)
-    for phase in job.phases():
+    phases, number = job.phases(), 0
+    while number < len(phases):
+        phase = phases[number]
         for _ in range(times):
             job = opened(spec, library, run.artifacts, **options) if new else job
             run.reports[phase] = job.run(phase, run.progress.append)
         if run.reports[phase].state is not None or phase == until:
             break
+        number = number_after(run.reports[phase], number, phases)
     return run

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from trompe_server.classifiers import WhiteBoxClassifier
+from trompe_server.job.protocol import number_after
 from trompe_server.job.setup import JobSetup, open_setup
 from trompe_server.job.texture_attack import TextureAttack
 from trompe_server.library import Library
@@ -35,9 +36,10 @@ def run_job(spec: JobSpec, target: TargetRenderer, folder: Path, *, change: Chan
         members = tuple(change(member) for member in setup.members)
         setup = replace(setup, classifier=members[0], members=members)
     job = TextureAttack(spec, setup, artifacts, library.calibrations)
-    for phase in job.phases():
-        if job.run(phase, lambda _: None).state is not None:
-            break
+    phases, number = job.phases(), 0
+    while number < len(phases):
+        report = job.run(phases[number], lambda _: None)
+        number = len(phases) if report.state is not None else number_after(report, number, phases)
     result = Result.model_validate_json(artifacts.read("result.json"))
     archive = f"{result.object}{ADVERSARIAL}.zip"
     return Done(result, setup, artifacts.read(archive) if artifacts.exists(archive) else None)

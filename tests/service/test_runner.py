@@ -25,10 +25,10 @@ Phase = Callable[[OnProgress], None]
 
 
 class Scripted:
-    """A job whose phases are functions. ``ran`` lists the phases run."""
+    """A job whose phases are functions. ``ran`` lists the phases run. ``then``: phases to go on with."""
 
     def __init__(self, **phases: Phase) -> None:
-        self._phases, self.ran = phases, list[str]()
+        self._phases, self.ran, self.then = phases, list[str](), dict[str, str]()
 
     def phases(self) -> list[str]:
         return list(self._phases)
@@ -36,7 +36,8 @@ class Scripted:
     def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
         self.ran.append(phase)
         self._phases[phase](on_progress)
-        return PhaseReport(Progress(phase=phase, fraction=(self.phases().index(phase) + 1) / len(self._phases)))
+        fraction = (self.phases().index(phase) + 1) / len(self._phases)
+        return PhaseReport(Progress(phase=phase, fraction=fraction), then=self.then.get(phase))
 
 
 def nothing(_: OnProgress) -> None:
@@ -284,3 +285,21 @@ def test_phases_count_their_seconds_and_their_work_by_kind(store: JobStore) -> N
     )
     assert (steps, renders) == (10, 4)
     assert 0.01 <= seconds < 100
+
+
+def test_phases_that_a_job_has_no_need_of_are_left_out_and_damage_goes_back_to_the_last_that_ran(
+    store: JobStore,
+) -> None:
+    damaged = [True]
+
+    def needs(_: OnProgress) -> None:
+        if damaged[0]:
+            raise DamagedFileError("the end of the attack is gone")
+
+    def mend(_: OnProgress) -> None:
+        damaged[0] = len(job.ran) == 1
+
+    job = Scripted(first=mend, second=needs, third=needs, last=needs)
+    job.then["first"] = "last"
+    assert run(store, job) is JobState.succeeded
+    assert job.ran == ["first", "last", "third", "second", "first", "last"]

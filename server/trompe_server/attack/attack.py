@@ -118,7 +118,8 @@ def attack(
         found, point = search.evaluate(point, step)
         point = search.move(point, found, step)
         on_step(Step(step, found.loss, found.fooled, search.shown(point), search.least_left(point, step)))
-    delta = search.saved(point.delta) if state.step + steps == total else point.delta
+    ended = state.step + steps == total or search.finished(point)
+    delta = search.saved(point.delta) if ended else point.delta
     return AttackState(state.step + steps, objective.split(delta), _split(objective, point.memory))
 
 

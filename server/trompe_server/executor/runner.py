@@ -10,7 +10,7 @@ from typing import Final, TypeVar
 
 from trompe_server.errors import NotFoundError
 from trompe_server.executor.metrics import count_phase
-from trompe_server.job.protocol import DamagedFileError, PhasedJob, PhaseReport
+from trompe_server.job.protocol import DamagedFileError, PhasedJob, PhaseReport, number_after
 from trompe_server.queue.claims import Claim, Claims, Ending, LostJobError
 from trompe_server.storage.database import RETRY_WAITS, DatabaseDownError, patiently
 from trompe_shared.api import JobState, Progress
@@ -147,7 +147,7 @@ class _Phases:
                 continue
             if report.state is not None:
                 return Ending(report.state, note=report.note, progress=report.progress, public=report.public)
-            number += 1
+            number = number_after(report, number, names)
             self._record(report, done=number)
         return Ending(JobState.succeeded)
 

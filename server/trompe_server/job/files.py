@@ -72,6 +72,15 @@ class JobFiles:
                 raise ValueError(f"it is of step {state.step} instead of {step}")
         return state
 
+    def save_end(self, state: AttackState) -> None:
+        """Save the state after the last step that was taken."""
+        self._seal("state-end.npz", save_state(state))
+
+    def load_end(self) -> AttackState:
+        """The state of ``save_end``. Raises ``DamagedFileError``."""
+        with _whole("state-end"):
+            return load_state(self._unseal("state-end.npz"))
+
     def save_calibration(self, renderer: int, packed: bytes) -> None:
         """Save the packed calibration of a renderer, by its number."""
         self._seal(f"{numbered(_CALIBRATION, renderer)}.npz", packed)

@@ -4,7 +4,7 @@ Each phase reads its input from the job's artifacts and writes its output there,
 job. Knows no executor, database or clock.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -19,6 +19,7 @@ __all__ = [
     "OnProgress",
     "PhaseReport",
     "PhasedJob",
+    "number_after",
     "numbered",
 ]
 
@@ -62,7 +63,7 @@ class PhaseReport:
 
     state: set if the job ends with this phase (succeeded, or n.a. with the reason in ``note``). public: names of the
     artifacts for the user. counts: work of the phase, by name: ``attack_steps``, ``classifier_images`` (shown by the
-    attack), ``target_renders``.
+    attack), ``target_renders``. then: the phase to go on with, if not the next one of the job.
     """
 
     progress: Progress
@@ -70,6 +71,12 @@ class PhaseReport:
     note: str | None = None
     public: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
+    then: str | None = None
+
+
+def number_after(report: PhaseReport, number: int, phases: Sequence[str]) -> int:
+    """Number of the phase to go on with after phase ``number``."""
+    return number + 1 if report.then is None else phases.index(report.then)
 
 
 class PhasedJob(Protocol):

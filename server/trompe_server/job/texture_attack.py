@@ -34,7 +34,7 @@ from trompe_server.attack import (
     saliency_masks,
     start,
 )
-from trompe_server.attack.search import SHOWN, SKIPPED
+from trompe_server.attack.search import SHOWN, SKIPPED, finished
 from trompe_server.job.calibrations import JobCalibrations
 from trompe_server.job.files import OPEN, JobFiles
 from trompe_server.job.pool import GrowingPool
@@ -209,14 +209,19 @@ class TextureAttack:
             on_progress(last)
 
         after = self._ascend(before, steps, on_step)
-        self.files.save_state(chunk + 1, after)
+        ended = after.step == total or self._ended(after)
+        self.files.save_end(after) if ended else self.files.save_state(chunk + 1, after)
         if taken:
             self._preview(after)
             queries = (self.setup.queries or 0) - asked
             self._counts["attack_steps"] += len(taken)
             self._counts["classifier_images"] += taken[-1].evaluations - int(before.memory.get(SHOWN, 0))
             self.files.note_spent(chunk, steps=len(taken), evaluations=taken[-1].evaluations, queries=queries)
-        return PhaseReport(last)
+        return PhaseReport(last, then="judge" if ended else None)
+
+    def _ended(self, state: AttackState) -> bool:
+        """Whether no step is left, and no look at further views either."""
+        return finished(state.memory, self.setup.goal) and not (self.setup.further and self._pool.due(state))
 
     def _looked(self, chunk: int, state: AttackState, on_progress: OnProgress) -> AttackState:
         """The state after a look at further views of the pool, if one is due."""
@@ -288,8 +293,7 @@ class TextureAttack:
 
     def _judge(self, on_progress: OnProgress) -> PhaseReport:
         setup = self.setup
-        deltas = self.files.load_state(self.files.chunks, step=self.spec.search.steps).deltas
-        painted = self.budget.repaint(setup.obj, deltas)
+        painted = self.budget.repaint(setup.obj, self.files.load_end().deltas)
         # The figures and the report take about as long as the images.
         count = len(setup.views) + len(setup.held_out)
         ask = self._asker("judge", 2 * count * len(setup.renderers), on_progress)

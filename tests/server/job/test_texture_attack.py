@@ -248,6 +248,23 @@ def test_all_images_shown_by_the_search_are_counted(
 
 
 @pytest.mark.usefixtures("no_pictures")
+def test_an_attack_that_has_won_all_views_goes_on_with_the_judgement(library: Library) -> None:
+    easy = spec_of(epsilon=0.5, alpha=0.1, steps=90)
+    run = run_job(easy, library)
+    *_, last, judge = run.reports
+    assert (judge, run.reports[last].then) == ("judge", "judge")
+    assert len(run.reports) < len(opened(easy, library, run.artifacts).phases())
+    assert run.result.target.a_after == 0
+    end = run.artifacts.files["state-end.npz"]
+    run.artifacts.files["state-end.npz"] = end[:-40]
+    for phase in ("judge", "attack-017"):
+        with pytest.raises(DamagedFileError):
+            opened(easy, library, run.artifacts).run(phase, lambda _: None)
+    opened(easy, library, run.artifacts).run(last, lambda _: None)
+    assert run.artifacts.files["state-end.npz"] == end
+
+
+@pytest.mark.usefixtures("no_pictures")
 def test_a_second_job_on_the_same_object_and_views_renders_no_probe(library: Library) -> None:
     one, other = CountingTarget(), CountingTarget()
     spec = {"surrogate": "calibrated", "steps": 1}
@@ -382,7 +399,7 @@ def test_the_threshold_stops_the_gradient_of_less_salient_pixels(library: Librar
         steps=2,
         masks=saliency_masks(maps, 0.2),
     )
-    done = load_state(artifacts.read("state-1.npz"))
+    done = load_state(artifacts.read("state-end.npz"))
     assert done.step == 2
     for name, delta in expected.deltas.items():
         assert torch.equal(done.deltas[name], delta)
