@@ -131,7 +131,7 @@ def test_every_field_of_the_form_reaches_its_option_and_its_fault_is_shown_besid
     faults.clear()  # browsers report answers of 422 on the console
 
 
-def test_the_divider_is_dragged_and_views_are_chosen_by_key_and_from_the_strip(
+def test_the_divider_is_dragged_and_views_are_chosen_by_key_and_on_the_map(
     service: Service, page: Page, done: str
 ) -> None:
     page.goto(f"{service.url}/jobs/{done}")
@@ -150,13 +150,36 @@ def test_the_divider_is_dragged_and_views_are_chosen_by_key_and_from_the_strip(
     page.keyboard.press("ArrowRight")
     assert shown.get_attribute("src") != first
 
-    button = page.locator(".strip button").nth(3)
-    button.click()
-    assert shown.get_attribute("src") == button.locator("img").get_attribute("src")
-    assert button.locator("span").inner_text().split(" ", 1)[1] in page.inner_text("trompe-viewer .sides")
+    dot = page.locator('.sphere circle[data-set="1"][data-view="3"]')
+    dot.click()
+    assert re.search(r"/pictures/own/\d+/after.png$", shown.get_attribute("src") or "")
+    assert page.locator(".sphere circle.shown").count() == 1
+    expect(dot).to_have_class(re.compile("shown"))
+    for side in dot.locator("title").text_content().split(", then "):  # type: ignore[union-attr]
+        assert side in page.inner_text("trompe-viewer .sides")
 
     page.get_by_label("difference").check()
     assert "difference" in (shown.get_attribute("src") or "")
+
+
+def test_the_list_shows_what_came_of_a_job_and_deletes_it(service: Service, page: Page) -> None:
+    job = service.finished(labels={"fate": "short"})
+    with service.client() as client:
+        result = client.job(job).result()
+    assert result.held_out is not None
+    page.goto(f"{service.url}/jobs?label=fate:short")
+    row = page.locator(f"#job-{job}")
+    expect(row).to_contain_text(f"{result.held_out.a_drop:.2f} held-out")
+    assert row.locator("img").evaluate("image => image.decode().then(() => image.naturalWidth)") > 100
+
+    page.once("dialog", lambda dialog: dialog.dismiss())
+    row.get_by_role("button", name="Delete").click()
+    expect(row).to_be_visible()
+    page.once("dialog", lambda dialog: dialog.accept())
+    row.get_by_role("button", name="Delete").click()
+    expect(row).to_have_count(0)
+    page.reload()
+    expect(row).to_have_count(0)
 
 
 def test_the_page_of_a_result_says_what_the_result_says_and_gives_it_as_one_zip(
@@ -169,11 +192,12 @@ def test_the_page_of_a_result_says_what_the_result_says_and_gives_it_as_one_zip(
     row = page.locator("tr", has=page.get_by_role("rowheader", name="target", exact=True))
     figures = [str(result.target.views), f"{result.target.a_before:.2f}", f"{result.target.a_after:.2f}"]
     assert row.locator("td").all_inner_texts()[:3] == figures
-    assert page.locator(".strip li").count() == len(result.views)
-    kept = sum(view.after == result.label for view in result.views)
-    assert page.locator(".strip li.kept").count() == kept
-    never = sum(result.label not in {view.before, view.after} for view in result.views)
-    assert page.locator(".strip li.never").count() == never
+    judged = [*result.views, *result.held_out_views]
+    assert page.locator(".sphere circle").count() == len(judged)
+    kept = sum(view.after == result.label for view in judged)
+    assert page.locator(".sphere circle.kept").count() == kept
+    never = sum(result.label not in {view.before, view.after} for view in judged)
+    assert page.locator(".sphere circle.never").count() == never
     assert page.locator("trompe-viewer .sides .true").count() == 1  # the first view shown was recognised before
 
     with page.expect_download() as download:

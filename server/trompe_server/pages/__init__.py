@@ -4,6 +4,7 @@ from fastapi import FastAPI
 from starlette.staticfiles import StaticFiles
 
 from trompe_server.pages.errors import HtmlProblems
+from trompe_server.pages.outcomes import Outcomes
 from trompe_server.pages.pictures import Pictures
 from trompe_server.pages.routes import router
 from trompe_server.pages.serving import STATIC
@@ -13,7 +14,7 @@ __all__ = ["add_pages"]
 
 def add_pages(app: FastAPI) -> None:
     """Add the pages to ``app``, which serves the API. Problem details become pages for browsers."""
-    app.state.pictures = Pictures()
+    app.state.pictures, app.state.outcomes = Pictures(), Outcomes()
     app.include_router(router)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     app.add_middleware(HtmlProblems)

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final
 
-from trompe_server.job.protocol import numbered
+from trompe_server.job.protocol import THUMBNAIL, numbered
+from trompe_server.pages.outcomes import Outcome
+from trompe_server.pages.sphere import Sphere, sphere
 from trompe_shared.api import (
     OPTIONS,
     VIEW_LIMITS,
@@ -58,6 +60,8 @@ MEASURES: Final = {
     "probe_renders": "Probe renders",
 }
 SHARES: Final = {"disagreement", "texels_altered"}
+BAR: Final = 120
+"""Length of the bar of a drop of 1, in SVG units."""
 PICTURES: Final = {
     "textures.png": "The texture: before, after, and the difference",
     "saliency_object.png": "Saliency on the object",
@@ -75,7 +79,7 @@ PHASES: Final = {
 
 @dataclass(frozen=True)
 class JobRow:
-    """A job in a list. ``version`` changes with the displayed values."""
+    """A job in a list. ``version`` changes with the displayed values. ``outcome``: of an ended job with a result."""
 
     id: str
     object: str
@@ -92,6 +96,12 @@ class JobRow:
     note: str | None
     created: datetime
     artifacts: Sequence[str]
+    outcome: Outcome | None = None
+
+    @property
+    def thumbnail(self) -> str | None:
+        """Address of a small picture of a view before and after, if there is one."""
+        return f"/v1/jobs/{self.id}/artifacts/{THUMBNAIL}" if THUMBNAIL in self.artifacts else None
 
     @property
     def percent(self) -> int:
@@ -156,7 +166,7 @@ class Shown:
     drawn_by: str | None
     noticed: str | None
     viewer: Sequence[Mapping[str, Any]]
-    strip: Sequence[Mapping[str, Any]]
+    sphere: Sphere
     became: str
     accuracies: Sequence[Mapping[str, Any]]
     measures: Sequence[Mapping[str, str]]
@@ -170,13 +180,12 @@ class Shown:
 def present(result: Result, job: JobRow, *, names: ClassNames) -> Shown:
     """Prepare a result for its page. ``names`` maps class indices to names."""
     sets = _view_sets(result, names, f"/jobs/{job.id}/pictures")
-    own = sets[0]["views"]
     return Shown(
         verdict=_verdict(result, job),
         drawn_by=result.drawn_by,
         noticed=result.noticed,
         viewer=sets,
-        strip=[{"picture": view["after"], "says": view["says_after"], "verdict": _fate(view)} for view in own],
+        sphere=sphere([each["views"] for each in sets]),
         became=result.became,
         accuracies=list(_accuracies(result)),
         measures=list(_measures(result)),
@@ -197,22 +206,17 @@ def present(result: Result, job: JobRow, *, names: ClassNames) -> Shown:
 
 
 def _view_sets(result: Result, names: ClassNames, place: str) -> list[dict[str, Any]]:
-    """Own and held-out views in each renderer, those of the headline first; addresses begin with ``place``."""
+    """Held-out and own views in each renderer, those of the headline first; addresses begin with ``place``."""
     sets = []
     for number, (name, each) in enumerate(result.by_renderer):
         for title, kind, views in (
-            ("the attack's own", "own", each.views),
             ("held-out", "held_out", each.held_out_views),
+            ("the attack's own", "own", each.views),
         ):
             if views:
                 shown = _views(views, result, names, f"{place}/{numbered(kind, number)}")
                 sets.append({"name": name + title, "views": shown, "headline": each.renderer == result.renderer})
     return sorted(sets, key=lambda each: not each["headline"])
-
-
-def _fate(view: Mapping[str, Any]) -> str:
-    """``kept``, ``fooled``, or ``never`` recognised."""
-    return "kept" if view["kept_after"] else "fooled" if view["kept_before"] else "never"
 
 
 def _verdict(result: Result, job: JobRow) -> str:
@@ -235,7 +239,7 @@ def _views(views: Sequence[ViewPrediction], result: Result, names: ClassNames, p
 
 def viewer_record(view: ViewPrediction, labels: Sequence[int], names: ClassNames, place: str) -> dict[str, Any]:
     """One view for the viewer; the addresses of its pictures begin with ``place``."""
-    attacked = view.after is not None
+    attacked, known = view.after is not None, view.before in labels
     after, confidence = (view.after, view.after_confidence) if attacked else (view.before, view.before_confidence)
     assert after is not None
     assert confidence is not None
@@ -245,8 +249,12 @@ def viewer_record(view: ViewPrediction, labels: Sequence[int], names: ClassNames
         "difference": f"{place}/difference.png" if attacked else None,
         "says_before": f"{names(view.before)} {view.before_confidence:.0%}",
         "says_after": f"{names(after)} {confidence:.0%}",
-        "kept_before": view.before in labels,
+        "kept_before": known,
         "kept_after": after in labels,
+        "fate": "kept" if after in labels else "fooled" if known else "never",
+        "confidence": round(confidence, 3),
+        "azimuth": view.azimuth,
+        "elevation": view.elevation,
         "where": f"Camera: azimuth {view.azimuth:.0f}°, elevation {view.elevation:.0f}°, {view.distance:.2f} m. "
         f"Light: azimuth {view.light_azimuth:.0f}°, elevation {view.light_elevation:.0f}°.",
     }
@@ -267,7 +275,21 @@ def _accuracies(result: Result) -> Iterable[dict[str, Any]]:
             shares = (accuracy.a_before, accuracy.a_after, accuracy.a_drop)
             interval = accuracy.a_drop_interval
             ends = f"{interval[0]:.2f} to {interval[1]:.2f}" if interval else "n.a."
-            yield {"name": name, "views": accuracy.counted, "cells": [*map(_share, shares), ends]}
+            yield {
+                "name": name,
+                "views": accuracy.counted,
+                "cells": [*map(_share, shares), ends],
+                "bar": _bar(accuracy),
+            }
+
+
+def _bar(accuracy: Accuracy) -> dict[str, float] | None:
+    """A drop and the ends of its interval as lengths; ``None`` if no view was recognised before."""
+    if accuracy.a_drop is None:
+        return None
+    low, high = accuracy.a_drop_interval or (accuracy.a_drop, accuracy.a_drop)
+    ends = {"drop": accuracy.a_drop, "low": low, "high": high}
+    return {name: round(BAR * min(1.0, max(0.0, value)), 1) for name, value in ends.items()}
 
 
 def _share(value: float | None) -> str:

@@ -3,6 +3,7 @@
 import asyncio
 import json
 from collections.abc import AsyncIterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 from urllib.parse import urlencode
@@ -49,7 +50,7 @@ Label = Annotated[str, Query(max_length=264)]
 @router.get("/")
 def home(request: Request, services: ServicesDep) -> HTMLResponse:
     """Example, latest jobs and explanation."""
-    return page(request, "home.html", gallery=GALLERY, rows=_rows(services, limit=LATEST)[0])
+    return page(request, "home.html", gallery=GALLERY, rows=_rows(request, services, limit=LATEST)[0])
 
 
 @router.get("/jobs")
@@ -57,7 +58,7 @@ def jobs(
     request: Request, services: ServicesDep, state: State = "", label: Label = "", cursor: Cursor = None
 ) -> HTMLResponse:
     """The list of jobs."""
-    rows, older = _rows(services, state=state, label=label, cursor=cursor)
+    rows, older = _rows(request, services, state=state, label=label, cursor=cursor)
     filters = {"state": state, "label": label}
     given = {name: value for name, value in filters.items() if value}
     # Older pages show the same jobs, updated.
@@ -78,14 +79,14 @@ def jobs(
 
 @router.get("/jobs/stream")
 def follow_list(
-    services: ServicesDep, state: State = "", label: Label = "", ids: str = "", limit: int = PAGE
+    request: Request, services: ServicesDep, state: State = "", label: Label = "", ids: str = "", limit: int = PAGE
 ) -> EventSourceResponse:
     """Stream of changed rows as HTML, newest first."""
 
     def look() -> list[JobRow]:
         if ids:
-            return [_row(services, job) for each in ids.split(",")[:PAGE] if (job := _found(services, each))]
-        return _rows(services, state=state, label=label, limit=min(max(limit, 1), PAGE))[0]
+            return [_row(request, services, job) for each in ids.split(",")[:PAGE] if (job := _found(services, each))]
+        return _rows(request, services, state=state, label=label, limit=min(max(limit, 1), PAGE))[0]
 
     return EventSourceResponse(_changes(look), ping=15)
 
@@ -149,7 +150,7 @@ def compare(request: Request, services: ServicesDep, a: str, b: str) -> HTMLResp
 def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
     """One job: its progress, or its result."""
     found = services.store.get(job)
-    row, result = _row(services, found), _result(services, found)
+    row, result = _row(request, services, found), _result(services, found)
     shown = _shown(services, row, result) if result else None
     return page(request, "job.html", job=row, shown=shown, terms=TERMS)
 
@@ -255,7 +256,13 @@ def sign_out() -> Response:
 
 
 def _rows(
-    services: Services, *, state: str = "", label: str = "", limit: int = PAGE, cursor: str | None = None
+    request: Request,
+    services: Services,
+    *,
+    state: str = "",
+    label: str = "",
+    limit: int = PAGE,
+    cursor: str | None = None,
 ) -> tuple[list[JobRow], str | None]:
     found = services.store.page(
         state=JobState(state) if state else None,
@@ -264,11 +271,12 @@ def _rows(
         cursor=cursor,
     )
     names = Names(services.library)
-    return [names.row(job) for job in found.jobs], found.next_cursor
+    return [_row(request, services, job, names) for job in found.jobs], found.next_cursor
 
 
-def _row(services: Services, job: Job) -> JobRow:
-    return Names(services.library).row(job)
+def _row(request: Request, services: Services, job: Job, names: Names | None = None) -> JobRow:
+    outcome = request.app.state.outcomes.of(services.artifacts(job.id)) if RESULT in job.artifacts else None
+    return replace((names or Names(services.library)).row(job), outcome=outcome)
 
 
 def _found(services: Services, job: str) -> Job | None:

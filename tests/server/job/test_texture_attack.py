@@ -37,6 +37,7 @@ PICTURES = {
     "difference.png",
     "saliency.png",
     "textures.png",
+    "thumbnail.png",
 }
 MODELS = {"chair-adversarial.zip", "chair-adversarial.glb"}
 IMAGES = {"views_before.npz", "views_after.npz"}

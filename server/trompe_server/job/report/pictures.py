@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from trompe_server.job.protocol import THUMBNAIL
 from trompe_server.job.report.data import Images, ReportData, distinct_views
 from trompe_server.job.setup import JobSetup
 from trompe_server.judging.metrics import predicted_classes, softmax
@@ -32,6 +33,8 @@ __all__ = ["picture_files", "saliency_views"]
 SHEET_VIEWS: Final = 12
 SALIENCY_VIEWS: Final = 6
 DIFFERENCE_VIEWS: Final = 4
+THUMBNAIL_HEIGHT: Final = 112
+"""Pixels."""
 
 
 def picture_files(data: ReportData) -> dict[str, bytes]:
@@ -91,9 +94,22 @@ def _before_and_after(data: ReportData, after: Images, title: str) -> dict[str, 
             title=f"Predictions for {title}: {len(own)} target views",
         ),
     }
+    sheets[THUMBNAIL] = _thumbnail(data, after)
     if data.painted is not None:
         sheets["textures.png"] = texture_sheet(setup.obj.textures, data.painted.textures, title=title)
     return sheets
+
+
+def _thumbnail(data: ReportData, after: Images) -> Image.Image:
+    """A view before and after, side by side: a held-out one if there are any, recognised before and fooled after."""
+    kind = "held_out" if data.setup.held_out else "own"
+    logits_before, logits_after = data.logits_before[kind], (data.logits_after or {})[kind]
+    before, then = (_verdicts(logits, data.setup) for logits in (logits_before, logits_after))
+    fates = [was.correct + (was.correct and not now.correct) for was, now in zip(before, then, strict=True)]
+    view = int(np.argmax(fates))
+    pair = np.concatenate([data.before[kind][view], after[kind][view]], axis=1)
+    height, width = pair.shape[:2]
+    return Image.fromarray(pair).resize((round(THUMBNAIL_HEIGHT * width / height), THUMBNAIL_HEIGHT))
 
 
 def _shown(recognised: Sequence[int], after: Sequence[Verdict], setup: JobSetup) -> list[int]:

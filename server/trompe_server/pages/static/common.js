@@ -50,6 +50,18 @@ export function follow(path, name, onMessage) {
   return stop;
 }
 
+// Buttons with data-delete: the row of a list goes with its job.
+document.addEventListener("click", async (event) => {
+  const button = event.target.closest("button[data-delete]");
+  if (!button || !confirm("Delete the job and all its files?")) return;
+  try {
+    await ask(button.dataset.delete, { method: "DELETE" });
+    button.closest("tr").remove();
+  } catch (error) {
+    tell(words(error));
+  }
+});
+
 // Buttons with data-post.
 document.addEventListener("click", async (event) => {
   const button = event.target.closest("button[data-post]");

@@ -89,6 +89,14 @@ class Viewer extends HTMLElement {
     this.say(this.saysBefore, "Before: ", view.says_before, view.kept_before);
     this.say(this.saysAfter, "After: ", view.says_after, view.kept_after);
     this.where.textContent = view.where;
+    this.mark(index);
+  }
+
+  // The dot of the view on the map of a result.
+  mark(index) {
+    const set = this.sets.findIndex(({ views }) => views === this.views);
+    for (const dot of document.querySelectorAll(".sphere circle.shown")) dot.classList.remove("shown");
+    document.querySelector(`.sphere circle[data-set="${set}"][data-view="${index}"]`)?.classList.add("shown");
   }
 
   say(place, title, text, right) {
@@ -98,11 +106,11 @@ class Viewer extends HTMLElement {
 
 customElements.define("trompe-viewer", Viewer);
 
-// The strip below the viewer leads to its views.
-for (const button of document.querySelectorAll(".strip button[data-view]")) {
-  button.onclick = () => {
-    const viewer = document.querySelector("trompe-viewer");
-    viewer.choose(0, Number(button.dataset.view));
-    viewer.scrollIntoView({ block: "start" });
-  };
-}
+// The map beside the viewer leads to its views, and marks the one that is shown.
+document.querySelector(".sphere")?.addEventListener("click", (event) => {
+  const dot = event.target.closest("circle");
+  if (!dot) return;
+  const viewer = document.querySelector("trompe-viewer");
+  viewer.choose(Number(dot.dataset.set), Number(dot.dataset.view));
+  viewer.scrollIntoView({ block: "nearest" });
+});
