@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Final
 
 import numpy as np
@@ -28,6 +28,7 @@ from trompe_server.classifiers import (
     score_based,
 )
 from trompe_server.image_pipelines import PIPELINES, ImagePipeline
+from trompe_server.judging.judge import Judge
 from trompe_server.library import Library
 from trompe_server.renderers import BackdropTarget, TargetRenderer, fitted
 from trompe_server.spec.checks import check_gradients, check_keep, check_members
@@ -135,10 +136,10 @@ class JobSetup:
         """Scores asked so far of a score-only classifier."""
         return sum(each.queries for each in self.members if isinstance(each, ScoreBasedClassifier)) or None
 
-    def class_name(self, index: int) -> str:
-        """Name of a class, or its number if the classifier has no names."""
-        classes = self.classifier.classes
-        return classes[index] if classes is not None else f"class {index}"
+    @cached_property
+    def judge(self) -> Judge:
+        """The attacked classifier as a judge."""
+        return Judge.of(self.classifier, self.labels)
 
 
 def open_setup(

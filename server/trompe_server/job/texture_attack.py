@@ -174,7 +174,7 @@ class TextureAttack:
         return maps
 
     def _end_without_attack(self) -> PhaseReport:
-        names = " or ".join(repr(self.setup.class_name(label)) for label in self.setup.labels)
+        names = " or ".join(repr(self.setup.judge.class_name(label)) for label in self.setup.labels)
         note = (
             f"{self.setup.classifier.name!r} recognises {names} in none of the {len(self._clean)} target views "
             "of the unpainted object, so nothing can drop. Check `label`, `distance`, `elevation` and `background`."

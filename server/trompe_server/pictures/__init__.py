@@ -1,6 +1,6 @@
 """Pictures of a result: functions from arrays to PIL images."""
 
-from trompe_server.pictures.contact_sheet import Verdict, contact_sheet, extremes, representative
+from trompe_server.pictures.contact_sheet import Verdict, contact_sheet, hardest_and_easiest, representative
 from trompe_server.pictures.difference import difference_strip, texture_sheet
 from trompe_server.pictures.heat import heat_colours
 from trompe_server.pictures.histogram import prediction_histogram
@@ -11,7 +11,7 @@ __all__ = [
     "Verdict",
     "contact_sheet",
     "difference_strip",
-    "extremes",
+    "hardest_and_easiest",
     "heat_colours",
     "heat_textures",
     "prediction_histogram",

@@ -23,8 +23,9 @@ from trompe_server.pictures.layout import (
     text_width,
     tile,
 )
+from trompe_shared.geometry import Camera, spherical
 
-__all__ = ["FRAME", "TILE", "Verdict", "contact_sheet", "extremes", "representative"]
+__all__ = ["FRAME", "TILE", "Verdict", "contact_sheet", "extremes", "hardest_and_easiest", "representative"]
 
 TILE: Final = 168
 """Width of an image on the sheet, without its frame."""
@@ -60,6 +61,18 @@ def extremes(hardness: Float[np.ndarray, " n"], directions: Float[np.ndarray, "n
     third = max(-(-k // 2), len(order) // 3)
     hard, easy = _spread(order[:third], directions, k - k // 2), _spread(order[::-1][:third], directions, k // 2)
     return [int(index) for index in order if index in {*hard, *easy}]
+
+
+def hardest_and_easiest(
+    recognised: Sequence[int], after: Sequence[Verdict], cameras: Sequence[Camera], k: int
+) -> list[int]:
+    """At most ``k`` views of those ``recognised`` before: the hardest to fool and the easiest, from all sides.
+
+    after, cameras: of all views.
+    """
+    confidences = [after[index].confidence * (1 if after[index].correct else -1) for index in recognised]
+    directions = np.array([spherical(cameras[index].azimuth, cameras[index].elevation) for index in recognised])
+    return [recognised[index] for index in extremes(np.array(confidences), directions, k)]
 
 
 def _spread(ranked: NDArray[np.int64], directions: Float[np.ndarray, "n 3"], k: int) -> list[int]:

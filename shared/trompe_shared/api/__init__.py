@@ -1,6 +1,7 @@
 """The HTTP contract between client and server. Needs pydantic alone.
 
-``jobs`` (what a job asks for), ``results`` (``result.json``), ``stored`` (objects, classifiers, backgrounds),
+``jobs`` (what a job asks for), ``results`` (``result.json``), ``manifest``
+(``judgement.json``), ``stored`` (objects, classifiers, backgrounds),
 ``service`` (the record of jobs, workers, problems).
 """
 
@@ -34,6 +35,17 @@ from trompe_shared.api.jobs import (
     in_parts,
     levels_within,
 )
+from trompe_shared.api.manifest import (
+    AS_RENDERED,
+    Cell,
+    Finding,
+    HashedFile,
+    JudgedNetwork,
+    JudgedRenderer,
+    Manifest,
+    Predictions,
+    TextureChange,
+)
 from trompe_shared.api.results import (
     ADVERSARIAL,
     FEW_RECOGNISED,
@@ -45,6 +57,7 @@ from trompe_shared.api.results import (
     Result,
     ViewFidelity,
     ViewPrediction,
+    Visibility,
 )
 from trompe_shared.api.service import (
     Event,
@@ -61,6 +74,7 @@ from trompe_shared.api.stored import BackgroundInfo, ClassifierInfo, ObjectInfo
 
 __all__ = [
     "ADVERSARIAL",
+    "AS_RENDERED",
     "FEW_RECOGNISED",
     "MOST_VIEWS",
     "OPTIONS",
@@ -70,22 +84,28 @@ __all__ = [
     "VIEW_LIMITS",
     "Accuracy",
     "BackgroundInfo",
+    "Cell",
     "ClassifierInfo",
     "Colour",
     "Event",
     "ExperimentInfo",
     "FileKind",
+    "Finding",
     "FooledAs",
     "GoalOptions",
+    "HashedFile",
     "Job",
     "JobList",
     "JobRequest",
     "JobSpec",
     "JobState",
     "JudgeOptions",
+    "JudgedNetwork",
+    "JudgedRenderer",
     "Judgement",
     "Labels",
     "Loss",
+    "Manifest",
     "Needs",
     "ObjectInfo",
     "OptimiserName",
@@ -93,6 +113,7 @@ __all__ = [
     "PaintOptions",
     "PipelineJudgement",
     "PipelineName",
+    "Predictions",
     "Priority",
     "Problem",
     "Progress",
@@ -101,11 +122,13 @@ __all__ = [
     "Result",
     "SearchOptions",
     "SurrogateModel",
+    "TextureChange",
     "VictimOptions",
     "ViewFidelity",
     "ViewOptions",
     "ViewPrediction",
     "ViewRanges",
+    "Visibility",
     "WorkerInfo",
     "in_flags",
     "in_parts",

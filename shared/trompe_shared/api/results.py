@@ -136,7 +136,45 @@ class FooledAs(Schema):
         return f"{name} {self.own + self.held_out}" + (" (neighbour)" if self.neighbour else "")
 
 
-class Result(Schema):
+class Visibility(Schema):
+    """Visibility of a repaint, in the textures and in the target's images; null if there was no attack."""
+
+    texels_altered: float | None = Field(
+        default=None, description="share of texels altered (N%); null if the textures cannot be compared"
+    )
+    mean_texel_change: float | None = Field(
+        default=None, description="mean |change| over altered texels and channels, [0, 1] units"
+    )
+    max_view_change: float | None = Field(
+        default=None, description="largest |change| of a pixel of a target view, [0, 1] units"
+    )
+    pixels_beyond_epsilon: float | None = Field(
+        default=None, description="share of the object's pixels in target views that changed by more than epsilon"
+    )
+    views_beyond_epsilon: float | None = Field(default=None, description="share of target views with such a pixel")
+    ssim: float | None = Field(
+        default=None,
+        description="mean structural similarity of target views before and after, over the object; 1 is equal",
+    )
+    ssim_worst: float | None = Field(default=None, description="the same in the worst view")
+    delta_e: float | None = Field(default=None, description="mean CIEDE2000 colour difference over the object's pixels")
+    delta_e_95: float | None = Field(default=None, description="95th percentile of that difference")
+    texture_variation: float | None = Field(
+        default=None, description="mean |difference| of the change between neighbouring texels, [0, 1] units"
+    )
+
+    @property
+    def noticed(self) -> str | None:
+        """What a viewer notices of the change; ``None`` if no image shows the object before and after."""
+        if self.delta_e is None or self.delta_e_95 is None:
+            return None
+        return (
+            f"Side by side, a viewer sees {_visible(self.delta_e)} on average (CIEDE2000 {self.delta_e:.1f}) and "
+            f"{_visible(self.delta_e_95)} in places ({self.delta_e_95:.1f})."
+        )
+
+
+class Result(Visibility):
     """Request, outcome, and agreement of surrogate and target.
 
     With several renderers all figures and views outside ``renderers`` are of ``renderer``: the attacked one with the
@@ -181,22 +219,6 @@ class Result(Schema):
         default_factory=list, description="the classifier on held-out images that were resized, compressed and so on"
     )
     goal_reached: float | None = Field(None, description="share of target views on which the goal is reached")
-    texels_altered: float | None = Field(description="share of texels the attack altered (N%)")
-    mean_texel_change: float | None = Field(description="mean |change| over altered texels and channels, [0, 1] units")
-    max_view_change: float | None = Field(description="largest |change| of a pixel of a target view, [0, 1] units")
-    pixels_beyond_epsilon: float | None = Field(
-        None, description="share of the object's pixels in target views that changed by more than epsilon"
-    )
-    views_beyond_epsilon: float | None = Field(None, description="share of target views with such a pixel")
-    ssim: float | None = Field(
-        None, description="mean structural similarity of target views before and after, over the object; 1 is equal"
-    )
-    ssim_worst: float | None = Field(None, description="the same in the worst view")
-    delta_e: float | None = Field(None, description="mean CIEDE2000 colour difference over the object's pixels")
-    delta_e_95: float | None = Field(None, description="95th percentile of that difference")
-    texture_variation: float | None = Field(
-        None, description="mean |difference| of the change between neighbouring texels, [0, 1] units"
-    )
     evaluations: int | None = Field(
         None, description="images shown to each attacked classifier, those for tau, keep and further views included"
     )
@@ -236,16 +258,6 @@ class Result(Schema):
         judging = {True: ": ", False: ", not attacked: "}
         named = [(each.renderer.named(engines) + judging[each.attacked], each) for each in self.renderers]
         return [*named] or [("", self)]
-
-    @property
-    def noticed(self) -> str | None:
-        """What a viewer notices of the change; ``None`` if there was no attack."""
-        if self.delta_e is None or self.delta_e_95 is None:
-            return None
-        return (
-            f"Side by side, a viewer sees {_visible(self.delta_e)} on average (CIEDE2000 {self.delta_e:.1f}) and "
-            f"{_visible(self.delta_e_95)} in places ({self.delta_e_95:.1f})."
-        )
 
     @property
     def became(self) -> str:

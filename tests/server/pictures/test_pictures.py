@@ -10,7 +10,6 @@ from trompe_server.pictures import (
     Verdict,
     contact_sheet,
     difference_strip,
-    extremes,
     heat_colours,
     heat_textures,
     prediction_histogram,
@@ -20,7 +19,7 @@ from trompe_server.pictures import (
     saliency_texture_sheet,
     texture_sheet,
 )
-from trompe_server.pictures.contact_sheet import FRAME, TILE
+from trompe_server.pictures.contact_sheet import FRAME, TILE, extremes
 from trompe_server.pictures.difference import amplified_difference
 from trompe_server.pictures.heat import BAR, GREY, OUTLINE, TICKS, heat_legend, heat_over
 from trompe_server.pictures.histogram import AFTER, BARS, BEFORE

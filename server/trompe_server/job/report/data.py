@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from trompe_server.job.files import Spent
 from trompe_server.job.setup import JobRenderer, JobSetup
-from trompe_server.judging.metrics import Agreement, accuracy, agreement
-from trompe_server.spec.neighbours import neighbours
+from trompe_server.judging.metrics import Agreement, agreement
 from trompe_server.surrogate import Surrogate
 from trompe_server.surrogate.calibration import Calibration
 from trompe_server.surrogate.fidelity import ViewFit, compare_views
@@ -66,7 +65,7 @@ class ReportData:
         """Accuracy on the surrogate's images of the own views; ``None`` without an attack."""
         if self._expected is None:
             return None
-        return accuracy(*self._expected, self.setup.labels, near=self.near, distinct=self.distinct("own"))
+        return self.setup.judge.accuracy(*self._expected, distinct=self.distinct("own"))
 
     @cached_property
     def agreement(self) -> Agreement | None:
@@ -88,8 +87,7 @@ class ReportData:
 
     def _accuracy(self, views: str) -> Accuracy:
         after = None if self.logits_after is None else self.logits_after[views]
-        before, labels = self.logits_before[views], self.setup.labels
-        return accuracy(before, after, labels, near=self.near, distinct=self.distinct(views))
+        return self.setup.judge.accuracy(self.logits_before[views], after, distinct=self.distinct(views))
 
     def distinct(self, views: str) -> int | None:
         """Number of distinct views; ``None`` if all are."""
@@ -106,12 +104,6 @@ class ReportData:
         if self.after is None:
             return None
         return {name: self.setup.classifier.predict(images) for name, images in self.after.items()}
-
-    @cached_property
-    def near(self) -> frozenset[int] | None:
-        """Neighbours of the object's classes; ``None`` without class names."""
-        classes = self.setup.classifier.classes
-        return None if classes is None else neighbours(self.setup.labels, classes)
 
     @cached_property
     def fits(self) -> Sequence[ViewFit | None]:

@@ -25,10 +25,10 @@ def classes_of_fooled(data: ReportData) -> list[FooledAs]:
     found = [
         FooledAs(
             label=label,
-            name=setup.class_name(label) if setup.classifier.classes else None,
+            name=setup.judge.class_name(label) if setup.classifier.classes else None,
             own=own.get(label, 0),
             held_out=held_out.get(label, 0),
-            neighbour=label in (data.near or ()),
+            neighbour=label in (setup.judge.near or ()),
         )
         for label in {**own, **held_out}
     ]

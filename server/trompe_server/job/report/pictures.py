@@ -11,12 +11,11 @@ from PIL import Image
 from trompe_server.job.protocol import THUMBNAIL
 from trompe_server.job.report.data import Images, ReportData, distinct_views
 from trompe_server.job.setup import JobSetup
-from trompe_server.judging.metrics import predicted_classes, softmax
+from trompe_server.judging.metrics import predicted_classes
 from trompe_server.pictures import (
-    Verdict,
     contact_sheet,
     difference_strip,
-    extremes,
+    hardest_and_easiest,
     prediction_histogram,
     representative,
     saliency_object_sheet,
@@ -25,7 +24,6 @@ from trompe_server.pictures import (
     texture_sheet,
 )
 from trompe_shared.engine import DEFAULT_ENGINE
-from trompe_shared.geometry import spherical
 from trompe_shared.object3d import encode_png
 
 __all__ = ["picture_files", "saliency_views"]
@@ -73,9 +71,10 @@ def _before_and_after(data: ReportData, after: Images, title: str) -> dict[str, 
     setup, own = data.setup, data.before["own"]
     logits_before, logits_after = data.logits_before["own"], (data.logits_after or {})["own"]
     distinct = distinct_views(setup)
-    verdicts_before, verdicts_after = _verdicts(logits_before, setup), _verdicts(logits_after, setup)
+    verdicts_before, verdicts_after = map(setup.judge.verdicts, (logits_before, logits_after))
     recognised = [index for index in distinct if verdicts_before[index].correct]
-    shown = _shown(recognised, verdicts_after, setup)
+    cameras = [view.camera for view in setup.views]
+    shown = hardest_and_easiest(recognised, verdicts_after, cameras, SHEET_VIEWS)
     few = distinct[representative(len(distinct), DIFFERENCE_VIEWS)]
     sheets = {
         "contact_sheet.png": contact_sheet(
@@ -104,20 +103,12 @@ def _thumbnail(data: ReportData, after: Images) -> Image.Image:
     """A view before and after, side by side: a held-out one if there are any, recognised before and fooled after."""
     kind = "held_out" if data.setup.held_out else "own"
     logits_before, logits_after = data.logits_before[kind], (data.logits_after or {})[kind]
-    before, then = (_verdicts(logits, data.setup) for logits in (logits_before, logits_after))
+    before, then = map(data.setup.judge.verdicts, (logits_before, logits_after))
     fates = [was.correct + (was.correct and not now.correct) for was, now in zip(before, then, strict=True)]
     view = int(np.argmax(fates))
     pair = np.concatenate([data.before[kind][view], after[kind][view]], axis=1)
     height, width = pair.shape[:2]
     return Image.fromarray(pair).resize((round(THUMBNAIL_HEIGHT * width / height), THUMBNAIL_HEIGHT))
-
-
-def _shown(recognised: Sequence[int], after: Sequence[Verdict], setup: JobSetup) -> list[int]:
-    """The views of the contact sheet: of the recognised ones the hardest to fool and the easiest, from all sides."""
-    confidences = [after[index].confidence * (1 if after[index].correct else -1) for index in recognised]
-    cameras = [setup.views[index].camera for index in recognised]
-    directions = np.array([spherical(camera.azimuth, camera.elevation) for camera in cameras])
-    return [recognised[index] for index in extremes(np.array(confidences), directions, SHEET_VIEWS)]
 
 
 def _facts(kept: Sequence[bool], setup: JobSetup) -> str:
@@ -141,12 +132,4 @@ def _counts(logits: NDArray[np.float32], setup: JobSetup) -> Counter[str]:
 
 def _short_name(setup: JobSetup, index: int) -> str:
     """The first of a class's names."""
-    return setup.class_name(index).split(",")[0]
-
-
-def _verdicts(logits: NDArray[np.float32], setup: JobSetup) -> list[Verdict]:
-    best, probability = logits.argmax(axis=1), softmax(logits).max(axis=1)
-    return [
-        Verdict(setup.class_name(int(index)), float(share), index in setup.labels)
-        for index, share in zip(best, probability, strict=True)
-    ]
+    return setup.judge.class_name(index).split(",")[0]

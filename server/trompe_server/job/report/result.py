@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
 
@@ -14,18 +13,9 @@ from trompe_server.image_pipelines import SUITE, ImagePipeline
 from trompe_server.job.report.data import ReportData
 from trompe_server.job.report.outcome import classes_of_fooled, neighbour_warning
 from trompe_server.job.report.warnings import warnings_of
-from trompe_server.judging.metrics import (
-    accuracy,
-    max_view_change,
-    mean_texel_change,
-    share_beyond,
-    texels_altered,
-    transfer_gap,
-    view_predictions,
-)
-from trompe_server.judging.perceptual import object_pixels, perceived_change, total_variation
-from trompe_server.spec.labels import resolve_labels
-from trompe_server.spec.neighbours import neighbours
+from trompe_server.judging.judge import Judge
+from trompe_server.judging.metrics import transfer_gap, view_predictions
+from trompe_server.judging.visibility import visibility_of
 from trompe_server.surrogate import behind
 from trompe_server.surrogate.fidelity import ViewFit
 from trompe_shared.api import (
@@ -36,6 +26,7 @@ from trompe_shared.api import (
     Result,
     ViewFidelity,
     ViewPrediction,
+    Visibility,
 )
 
 __all__ = ["result_of", "worst"]
@@ -58,7 +49,7 @@ def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
     spec, setup = data.spec, data.setup
     became = classes_of_fooled(data)
     synonyms = neighbour_warning(became, data.target, data.held_out)
-    names = [setup.class_name(label) for label in setup.labels] if setup.classifier.classes else None
+    names = [setup.judge.class_name(label) for label in setup.labels] if setup.classifier.classes else None
     return Result(
         spec=spec,
         object=setup.object_name,
@@ -82,7 +73,7 @@ def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
         fooled_as=became,
         transfer_gap=transfer_gap(data.predicted, data.target),
         **_agreement(data),
-        judges=[_judgement(judge, data) for judge in setup.judges],
+        judges=[_judgement(_judge(network, data), data) for network in setup.judges],
         image_pipelines=[
             PipelineJudgement(pipeline=name, held_out=_through(pipeline, data))
             for name, pipeline in (SUITE if setup.held_out and data.after is not None else {}).items()
@@ -91,7 +82,7 @@ def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
         probe_renders=sum(each.calibration.renders for each in seen if each.calibration is not None),
         attacked_views=len(setup.views) + data.spent.added,
         further_renders=data.spent.renders,
-        **_changes(data),
+        **_visibility(data).model_dump(),
         goal_reached=_goal_reached(data),
         evaluations=data.spent.evaluations,
         queries=data.spent.queries,
@@ -140,26 +131,24 @@ def _goal_reached(data: ReportData) -> float | None:
     return float(data.setup.goal.reached(torch.from_numpy(data.logits_after["own"])).float().mean())
 
 
-def _judgement(judge: Classifier, data: ReportData) -> Judgement:
-    classes = judge.classes or data.setup.classifier.classes
-    labels = resolve_labels(data.spec.goal.label, classes, judge.n_classes, judge.name)
-    near = None if judge.classes is None else neighbours(labels, judge.classes)
+def _judge(network: Classifier, data: ReportData) -> Judge:
+    return Judge.of(network, data.spec.goal.label, classes=data.setup.classifier.classes)
 
+
+def _judgement(judge: Judge, data: ReportData) -> Judgement:
     def judged(views: str) -> Accuracy:
-        after = None if data.after is None else judge.predict(data.after[views])
-        return accuracy(judge.predict(data.before[views]), after, labels, near=near, distinct=data.distinct(views))
+        after = None if data.after is None else judge.network.predict(data.after[views])
+        return judge.accuracy(judge.network.predict(data.before[views]), after, distinct=data.distinct(views))
 
     held_out = judged("held_out") if data.setup.held_out else None
-    return Judgement(classifier=judge.name, target=judged("own"), held_out=held_out)
+    return Judgement(classifier=judge.network.name, target=judged("own"), held_out=held_out)
 
 
 def _through(pipeline: ImagePipeline, data: ReportData) -> Accuracy:
     """Accuracy through ``pipeline`` on every second held-out view: all of them would take a fifth of a job's time."""
     assert data.after is not None
-    before, after = (
-        data.setup.classifier.predict(pipeline.shown(each["held_out"][::2])) for each in (data.before, data.after)
-    )
-    return accuracy(before, after, data.setup.labels, near=data.near)
+    shown = (pipeline.shown(each["held_out"][::2]) for each in (data.before, data.after))
+    return data.setup.judge.accuracy(*map(data.setup.classifier.predict, shown))
 
 
 def _calibration_fields(data: ReportData) -> dict[str, Any]:
@@ -177,21 +166,14 @@ def _rounded(figures: Mapping[str, float]) -> dict[str, float]:
     return {name: round(value, 5) for name, value in figures.items()}
 
 
-def _changes(data: ReportData) -> dict[str, Any]:
-    """Change of the textures, and of the target's images over all views: by the paper's constraint and as perceived."""
+def _visibility(data: ReportData) -> Visibility:
+    """Over all target views."""
     if data.after is None or data.painted is None:
-        return {"texels_altered": None, "mean_texel_change": None, "max_view_change": None}
-    setup, clean, painted = data.setup, data.setup.obj.textures, data.painted.textures
+        return Visibility()
+    setup = data.setup
     before, after = (np.concatenate([each["own"], each["held_out"]]) for each in (data.before, data.after))
-    pixels = object_pixels(before, after, behind([*setup.views, *setup.held_out], setup.backdrops, setup.size))
-    pixels_beyond, views_beyond = share_beyond(before, after, pixels, epsilon=data.spec.paint.epsilon)
-    seen = perceived_change(before, after, pixels)
-    return {
-        "texels_altered": texels_altered(clean, painted),
-        "mean_texel_change": mean_texel_change(clean, painted),
-        "max_view_change": max_view_change(before, after),
-        "pixels_beyond_epsilon": pixels_beyond,
-        "views_beyond_epsilon": views_beyond,
-        "texture_variation": total_variation(clean, painted),
-        **({} if seen is None else asdict(seen)),
-    }
+    return visibility_of(
+        *(setup.obj.textures, data.painted.textures),
+        *(before, after, behind([*setup.views, *setup.held_out], setup.backdrops, setup.size)),
+        epsilon=data.spec.paint.epsilon,
+    )

@@ -1,0 +1,114 @@
+"""Two objects: the same but for their paint, or not, in whatever format they come."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trompe_server.formats import read_object, write_glb
+from trompe_server.judging.objects import ObjectPair, texture_changes
+from trompe_shared.object3d import Object3D, Part, encode_png, load_object
+from trompe_shared.shipped import shipped_objects
+
+NAMES = sorted(shipped_objects())
+
+
+def shipped(name: str) -> Object3D:
+    return load_object(shipped_objects()[name].read())
+
+
+def repainted(obj: Object3D, *, by: int, seed: int = 0) -> Object3D:
+    """The object with each level changed by at most ``by``."""
+    random = np.random.default_rng(seed)
+    change = {name: random.integers(-by, by + 1, texture.shape) for name, texture in obj.textures.items()}
+    painted = {name: (obj.textures[name] + each).clip(0, 255).astype(np.uint8) for name, each in change.items()}
+    return obj.with_textures(painted)
+
+
+def with_parts(obj: Object3D, change: Callable[[Part], Part]) -> Object3D:
+    return replace(obj, parts=tuple(map(change, obj.parts)))
+
+
+def shuffled(part: Part) -> Part:
+    """The part with its triangles in another order, each from another corner."""
+    random = np.random.default_rng(0)
+    faces = np.stack([np.roll(face, random.integers(3)) for face in part.faces[random.permutation(len(part.faces))]])
+    return replace(part, faces=faces)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_repaint_differs_in_its_albedo_only_in_another_format_too(name: str) -> None:
+    obj = shipped(name)
+    painted = repainted(obj, by=12)
+    for after in (painted, read_object(write_glb(painted), name="other.glb").obj, with_parts(painted, shuffled)):
+        pair = ObjectPair(obj, after)
+        assert pair.findings() == []
+        before, compared = pair.textures
+        assert before.keys() == obj.textures.keys()
+        assert all(np.array_equal(compared[texture], painted.textures[texture]) for texture in compared)
+
+
+@settings(max_examples=25)
+@given(st.integers(1, 60), st.floats(0.005, 0.25), st.integers(0, 2**16))
+def test_texels_beyond_epsilon_are_those_with_a_larger_change(by: int, epsilon: float, seed: int) -> None:
+    before = np.random.default_rng(seed).integers(0, 256, (6, 7, 3), np.uint8)
+    after = (before.astype(np.int16) + np.random.default_rng(seed + 1).integers(-by, by + 1, before.shape)).clip(0, 255)
+    (found,) = texture_changes({"a": before}, {"a": after.astype(np.uint8)}, epsilon=epsilon)
+    change = np.abs(after - before).max(axis=2) / 255
+    assert found.texels_beyond_epsilon == (change > epsilon + 1e-9).sum()
+    assert found.max_levels == round(255 * change.max())
+    assert found.texels_altered == (change > 0).mean()
+
+
+def moved(part: Part) -> Part:
+    return replace(part, vertices=part.vertices + np.float32(0.002) * (part.vertices[:, 1:2] > 0.02).astype(np.float32))
+
+
+def lighter(obj: Object3D, *, map_of: str) -> Object3D:
+    """The object with a plain picture in place of one of its maps."""
+    (material,) = obj.materials.values()
+    file = getattr(material, map_of)
+    return replace(obj, files={**obj.files, file: encode_png(np.full((8, 8, 4), 200, np.uint8))})
+
+
+MUG = shipped("mug")
+CHANGES = {
+    "another object": (shipped("ball"), "object", "2368 triangles, the second 1728"),
+    "moved": (with_parts(MUG, moved), "geometry", r"839 of 2368 triangles .* by up to 3\.46 mm"),
+    "another layout": (
+        with_parts(MUG, lambda part: replace(part, uvs=part.uvs / np.float32(2))),
+        "uv",
+        "2368 of 2368 triangles",
+    ),
+    "other normals": (with_parts(MUG, lambda part: replace(part, normals=-part.normals)), "geometry", "shaded"),
+    "another normal map": (lighter(MUG, map_of="normal"), "material", "The normal map of the material 'mug_ceramic'"),
+    "other metal": (lighter(MUG, map_of="metallic"), "material", "metal and smoothness"),
+    "a hole": (lighter(MUG, map_of="albedo"), "material", "The opacity"),
+    "half the texels": (
+        MUG.with_textures({name: texture[::2, ::2] for name, texture in MUG.textures.items()}),
+        "size",
+        "512 x 512 texels before and 256 x 256 after",
+    ),
+}
+
+
+@pytest.mark.parametrize(("after", "kind", "text"), CHANGES.values(), ids=CHANGES.keys())
+def test_each_other_difference_is_one_clear_sentence(after: Object3D, kind: str, text: str) -> None:
+    pair = ObjectPair(MUG, after)
+    (found,) = pair.findings()
+    assert found.kind == kind
+    assert re.search(text, found.text)
+    comparable = kind == "material" or "shaded" in found.text
+    assert bool(pair.textures[0]) == bool(pair.textures[1]) == comparable
+
+
+def test_triangles_that_keep_their_layout_keep_their_figures() -> None:
+    lamp = shipped("lamp")
+    first, second = lamp.parts
+    pair = ObjectPair(lamp, replace(lamp, parts=(first, replace(second, uvs=second.uvs / np.float32(2)))))
+    assert [found.kind for found in pair.findings()] == ["uv"]
+    assert pair.textures[0].keys() == {lamp.albedo_of(first)}
