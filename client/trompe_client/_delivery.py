@@ -7,8 +7,8 @@ import zipfile
 from pathlib import Path, PurePosixPath
 
 from trompe_client._errors import ContractError
-from trompe_client._plan import SPLIT_SUFFIXES
 from trompe_shared.api import ADVERSARIAL
+from trompe_shared.local_files import SPLIT_SUFFIXES
 
 
 def in_the_form_of(source: str, file: Path) -> Path:

@@ -1,29 +1,28 @@
 """An attack before it is sent: its files are found and its options checked before any request."""
 
 import hashlib
-import io
 import json
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO
 
 from pydantic import ValidationError
 
 from trompe_shared.api import OPTIONS, BackgroundInfo, ClassifierInfo, JobRequest, ObjectInfo, in_parts
-from trompe_shared.errors import ClassifierError, ObjectError, SpecError
+from trompe_shared.errors import ClassifierError, SpecError
 from trompe_shared.faults import Fault, faults_of
-
-CLASSIFIER_SUFFIXES: Final = (".pt2", ".onnx")
-LOOKED_UP: Final = "torchvision:"
-"""Prefix of names of torchvision's networks, whatever their suffix."""
-SPLIT_SUFFIXES: Final = {".obj", ".gltf"}
-"""Models with textures and materials in files beside them."""
-MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, ".glb", ".fbx", ".ply", ".stl"}
-PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
+from trompe_shared.local_files import (
+    CLASSIFIER_SUFFIXES,
+    LOOKED_UP,
+    MODEL_SUFFIXES,
+    PICTURE_SUFFIXES,
+    classes_beside,
+    model_file,
+    models_in,
+)
 
 StoredKind = type[ObjectInfo | ClassifierInfo | BackgroundInfo]
 Source = str | Path
@@ -146,7 +145,7 @@ def object_source(source: Source) -> Upload | str:
     """
     path = Path(source)
     is_path = isinstance(source, Path) or path.is_file() or path.suffix.lower() in {".zip", *MODEL_SUFFIXES}
-    return object_upload(path) if is_path or (path.is_dir() and _models_in(path)) else str(source)
+    return object_upload(path) if is_path or (path.is_dir() and models_in(path)) else str(source)
 
 
 def object_upload(path: Path) -> Upload:
@@ -154,17 +153,7 @@ def object_upload(path: Path) -> Upload:
 
     Raises ``ObjectError``.
     """
-    if path.is_dir():
-        return Upload(f"{path.resolve().name}.zip", _zip_folder(path))
-    if not path.is_file():
-        raise ObjectError(
-            f"There is no file {str(path)!r}. Give a zip, a model file, a folder with one, or a stored object's name."
-        )
-    if path.suffix.lower() in SPLIT_SUFFIXES:
-        return Upload(f"{path.stem}.zip", _zip_files([path, *_companions(path)]))
-    if path.suffix.lower() not in MODEL_SUFFIXES and not zipfile.is_zipfile(path):
-        raise ObjectError(f"{str(path)!r} is not a zip archive. Give a zip, a model file, or a folder with one.")
-    return Upload(path.name, path)
+    return Upload(*model_file(path))
 
 
 def named_object_upload(path: Path, name: str | None) -> Upload:
@@ -189,7 +178,7 @@ def classifier_upload(source: Source, *, classes: list[str] | None = None, name:
             f"There is no classifier file {str(path)!r}. Give a file that ends in {' or '.join(CLASSIFIER_SUFFIXES)}, "
             "or the name of a stored classifier."
         )
-    names = classes if classes is not None else _classes_beside(path)
+    names = classes if classes is not None else classes_beside(path)
     form = {"classes": json.dumps(names)} if names is not None else {}
     return Upload(path.name, path, form | ({"name": name} if name else {}), ClassifierInfo)
 
@@ -208,46 +197,3 @@ def _picture(path: Path, use: str, remedy: str) -> Upload:
     if not path.is_file():
         raise SpecError(f"There is no {use} picture {str(path)!r}. Give a picture of {remedy}.")
     return Upload(path.name, path, kind=BackgroundInfo)
-
-
-def _classes_beside(path: Path) -> list[str] | None:
-    candidates = [f"{path.stem}.classes.json", "imagenet_classes.json", "classes.json"]
-    file = next((file for name in candidates if (file := path.with_name(name)).is_file()), None)
-    if file is None:
-        return None
-    try:
-        names = json.loads(file.read_text("utf-8"))
-    except ValueError as error:
-        raise ClassifierError(f"The class names in {str(file)!r} are not JSON ({error}).") from error
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ClassifierError(
-            f"The class names in {str(file)!r} must be a JSON list of strings, in the order of the logits."
-        )
-    return names
-
-
-def _zip_folder(folder: Path) -> bytes:
-    files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
-    if not _models_in(folder):
-        raise ObjectError(f"The folder {str(folder)!r} holds no .obj, .gltf or other model file.")
-    return _zip_files(files)
-
-
-def _models_in(folder: Path) -> list[Path]:
-    return [file for file in folder.iterdir() if file.suffix.lower() in MODEL_SUFFIXES]
-
-
-def _companions(mesh: Path) -> list[Path]:
-    """Material files, buffers and pictures beside an .obj or .gltf file."""
-    wanted = {".mtl", ".json", ".bin", *PICTURE_SUFFIXES}
-    return [file for file in mesh.parent.iterdir() if file.is_file() and file.suffix.lower() in wanted]
-
-
-def _zip_files(files: list[Path]) -> bytes:
-    """A flat zip, sorted by name, with fixed time stamps: the same files give the same bytes."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for file in sorted(files, key=lambda file: file.name):
-            info = zipfile.ZipInfo(file.name, (1980, 1, 1, 0, 0, 0))
-            archive.writestr(info, file.read_bytes(), compress_type=zipfile.ZIP_DEFLATED, compresslevel=1)
-    return buffer.getvalue()

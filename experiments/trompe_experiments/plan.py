@@ -6,12 +6,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
-from trompe_client._plan import CLASSIFIER_SUFFIXES, PICTURE_SUFFIXES, AttackPlan, Upload, plan_attack, source_of
+from trompe_client._plan import AttackPlan, Upload, plan_attack, source_of
 from trompe_experiments.asset_objects import asset_objects
 from trompe_experiments.design import AssetsFolder, Experiment, expanded
 from trompe_experiments.table import RowId, job_key
 from trompe_shared.api import JobRequest
 from trompe_shared.errors import ObjectError, SpecError
+from trompe_shared.local_files import CLASSIFIER_SUFFIXES, PICTURE_SUFFIXES
 from trompe_shared.presets import PRESETS
 from trompe_shared.shipped import shipped_objects
 

@@ -10,7 +10,6 @@ import pytest
 
 from tests.client.conftest import zipped
 from trompe_client._plan import (
-    CLASSIFIER_SUFFIXES,
     Upload,
     background_source,
     classifier_source,
@@ -20,6 +19,7 @@ from trompe_client._plan import (
 )
 from trompe_shared.api import BackgroundInfo, ClassifierInfo
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
+from trompe_shared.local_files import CLASSIFIER_SUFFIXES
 
 
 def names(source: Path) -> list[str]:

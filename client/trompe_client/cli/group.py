@@ -41,6 +41,7 @@ EXTENSIONS: Final = {
     "worker": _Extension("server", "Run an additional attack worker."),
     "demo": _Extension("server", "Attack a shipped object and show the result."),
     "doctor": _Extension("server", "Check this machine and suggest repairs."),
+    "judge": _Extension("server", "Judge an adversarial object from two model files."),
     "experiment": _Extension("experiments", "Run grids of jobs and report their results."),
     "migrate": _Extension("server", "Create or upgrade the service's database."),
     "render": _Extension("renderer", "Run a renderer worker (SAILenv's protocol)."),

@@ -3,7 +3,7 @@
 from trompe_server.classifiers.ensemble import as_ensemble, resized
 from trompe_server.classifiers.network import NetworkClassifier
 from trompe_server.classifiers.protocol import Classifier, ScoringClassifier, WhiteBoxClassifier
-from trompe_server.classifiers.registry import load_classifier
+from trompe_server.classifiers.registry import classifier_file, load_classifier
 from trompe_server.classifiers.score_based import ScoreBasedClassifier, score_based
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "ScoringClassifier",
     "WhiteBoxClassifier",
     "as_ensemble",
+    "classifier_file",
     "load_classifier",
     "resized",
     "score_based",

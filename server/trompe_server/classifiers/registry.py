@@ -22,11 +22,11 @@ from trompe_server.classifiers.exported import load_exported
 from trompe_server.classifiers.network import NetworkClassifier
 from trompe_server.classifiers.onnx import load_onnx
 from trompe_server.classifiers.protocol import Classifier
-from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, load_tiny
-from trompe_server.classifiers.vision import load_torchvision
+from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, WEIGHTS, load_tiny
+from trompe_server.classifiers.vision import load_torchvision, weights_file
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["ENDINGS", "load_classifier"]
+__all__ = ["ENDINGS", "classifier_file", "load_classifier"]
 
 ENDINGS: Final = (".pt2", ".onnx")
 """Endings of classifier files."""
@@ -65,6 +65,13 @@ def load_classifier(
     if reference == "tiny":
         return NetworkClassifier("tiny", load_tiny().to(device), IMAGE_SIZE, len(CLASSES), tuple(CLASSES), device)
     return _from_file(Path(path_or_name), name, classes, device)
+
+
+def classifier_file(reference: str) -> Path:
+    """The file with the weights of the classifier that ``load_classifier`` loads. Raises ``ClassifierError``."""
+    if reference == "tiny":
+        return WEIGHTS
+    return Path(reference) if reference.endswith(ENDINGS) else weights_file(reference.rpartition(":")[2])
 
 
 def _by_bare_name(

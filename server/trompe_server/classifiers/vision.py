@@ -19,7 +19,7 @@ from trompe_server.classifiers.network import NetworkClassifier
 from trompe_server.classifiers.protocol import check_classes
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["load_torchvision", "read_weights"]
+__all__ = ["load_torchvision", "read_weights", "weights_file"]
 
 
 class _LocalWeights:
@@ -65,6 +65,11 @@ def load_torchvision(
     fast, n_classes = prepared(whole, (side, side), model, device=device)
     check_classes(names, n_classes, model)
     return NetworkClassifier(name or model, fast, (side, side), n_classes, names, device)
+
+
+def weights_file(model: str) -> Path:
+    """The file with torchvision's default weights of ``model`` in torch's cache. Raises ``ClassifierError``."""
+    return _find_weights(_torchvision(), model, None)[1]
 
 
 def _torchvision() -> Any:

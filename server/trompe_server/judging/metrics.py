@@ -18,6 +18,7 @@ __all__ = [
     "drop_interval",
     "drop_warning",
     "fooled_as",
+    "margins",
     "max_view_change",
     "mean_texel_change",
     "predicted_classes",
@@ -182,13 +183,13 @@ class Agreement(NamedTuple):
 
 def agreement(before: Logits, after: Logits, predicted: Logits, label: Label) -> Agreement:
     """Compare logits (views, classes): of the target before and after, and of the surrogate's images after."""
-    clean, true, guess = (_margins(logits, label) for logits in (before, after, predicted))
+    clean, true, guess = (margins(logits, label) for logits in (before, after, predicted))
     moved = float((clean - true).mean())
     differ = recognised(after, label) != recognised(predicted, label, like=after)
     return Agreement(float(differ.mean()), float(np.abs(guess - true).mean()) / moved if moved > 0 else None)
 
 
-def _margins(logits: Logits, label: Label) -> NDArray[np.float64]:
+def margins(logits: Logits, label: Label) -> NDArray[np.float64]:
     """Best logit of the object's classes minus the best of all others, (views,)."""
     own = np.zeros(logits.shape[1], np.bool_)
     own[np.asarray(label)] = True

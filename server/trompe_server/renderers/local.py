@@ -4,8 +4,9 @@ import contextlib
 import re
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
-from typing import Final
+from typing import IO, Final
 
 from trompe_shared.errors import RendererError
 from trompe_shared.sailenv_client import SailenvTarget
@@ -22,16 +23,27 @@ def local_renderer(command: Sequence[str] = COMMAND) -> Iterator[SailenvTarget]:
     command: starts another worker. It must print ``listening on HOST:PORT`` as its first line and end when its standard
     input closes.
 
-    Raises ``RendererError`` if the worker does not start.
+    Raises ``RendererError`` with the worker's last words if it does not start.
     """
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+    with (
+        tempfile.TemporaryFile("w+") as log,
+        subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=log, text=True) as process,
+    ):
         try:
             assert process.stdout is not None
             ready = re.search(r"listening on ([\d.]+):(\d+)", process.stdout.readline())
             if ready is None:
-                raise RendererError("The renderer worker did not start; `trompe doctor` prints the reason.")
+                raise RendererError(f"The renderer worker did not start. {_last_words(process, log)}")
             with contextlib.closing(SailenvTarget(ready[1], int(ready[2]))) as target:
                 yield target
         finally:
             process.terminate()
+
+
+def _last_words(process: "subprocess.Popen[str]", log: IO[str]) -> str:
+    """The last line of an ended worker's log."""
+    process.wait()
+    log.seek(0)
+    lines = log.read().strip().splitlines()
+    return lines[-1].removeprefix("Error: ") if lines else "`trompe doctor` prints the reason."

@@ -45,6 +45,7 @@ from trompe_shared.api.manifest import (
     Manifest,
     Predictions,
     TextureChange,
+    ViewRecord,
 )
 from trompe_shared.api.results import (
     ADVERSARIAL,
@@ -128,6 +129,7 @@ __all__ = [
     "ViewOptions",
     "ViewPrediction",
     "ViewRanges",
+    "ViewRecord",
     "Visibility",
     "WorkerInfo",
     "in_flags",

@@ -4,10 +4,10 @@ from typing import Final, Literal
 
 from pydantic import Field
 
+from trompe_shared.api.jobs import Colour
 from trompe_shared.api.results import Accuracy, Visibility
 from trompe_shared.api.schema import Schema
 from trompe_shared.engine import EngineInfo
-from trompe_shared.geometry import View
 
 AS_RENDERED: Final = "as rendered"
 """Name of the images themselves among the image pipelines."""
@@ -27,7 +27,7 @@ class Finding(Schema):
 class HashedFile(Schema):
     """A file that was looked at."""
 
-    path: str = Field(description="relative to the manifest's folder")
+    source: str = Field(description="path relative to the manifest's folder, or name of a shipped object")
     sha256: str
     bytes: int
 
@@ -48,7 +48,7 @@ class JudgedNetwork(Schema):
 
     name: str
     reference: str = Field(description="name, or path relative to the manifest's folder")
-    sha256: str | None = Field(None, description="of its file, or of the weights of a network by name")
+    sha256: str | None = Field(default=None, description="of its file, or of the weights of a network by name")
     image_size: tuple[int, int] | None = None
     labels: list[int] = Field(default_factory=list)
     label_names: list[str] | None = None
@@ -62,6 +62,22 @@ class JudgedRenderer(Schema):
     engine: EngineInfo | None = None
     visibility: Visibility = Field(default_factory=Visibility)
     missing: str | None = None
+
+
+class ViewRecord(Schema):
+    """A camera with its light and background; metres, degrees, sRGB."""
+
+    distance: float
+    azimuth: float
+    elevation: float
+    roll: float
+    centre: tuple[float, float, float]
+    light_azimuth: float
+    light_elevation: float
+    light_intensity: float
+    light_ambient: float
+    light_colour: Colour
+    background: Colour
 
 
 class Cell(Schema):
@@ -97,7 +113,7 @@ class Manifest(Schema):
     renderers: list[JudgedRenderer]
     image_size: tuple[int, int] = Field(description="of the rendered images, (height, width)")
     seed: int = Field(description="of the views")
-    views: list[View]
+    views: list[ViewRecord]
     findings: list[Finding]
     textures: list[TextureChange]
     cells: list[Cell]

@@ -10,11 +10,11 @@ import httpx
 import pytest
 
 from tests.server.api.conftest import CLASSES, GIF, Api
-from trompe_client._plan import CLASSIFIER_SUFFIXES
 from trompe_server.api.library import UPLOADS
 from trompe_server.classifiers.registry import ENDINGS
 from trompe_server.library import Library
 from trompe_shared.api import ObjectInfo
+from trompe_shared.local_files import CLASSIFIER_SUFFIXES
 
 
 def stored_files(api: Api) -> list[Path]:

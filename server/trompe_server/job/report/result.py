@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from trompe_server.judging.metrics import transfer_gap, view_predictions
 from trompe_server.judging.visibility import visibility_of
 from trompe_server.surrogate import behind
 from trompe_server.surrogate.fidelity import ViewFit
+from trompe_server.system.versions import versions
 from trompe_shared.api import (
     Accuracy,
     Judgement,
@@ -88,7 +88,7 @@ def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
         queries=data.spent.queries,
         warnings=[*warnings, *warnings_of(data, seen), *([synonyms] if synonyms else [])],
         seconds={},
-        versions={name: version(name) for name in ("trompe", "torch", "numpy", "pyrender", "onnxruntime")},
+        versions=versions(),
         **_views(data),
     )
 

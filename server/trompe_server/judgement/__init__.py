@@ -1,0 +1,1 @@
+"""One judgement of two model files, before and after, whoever painted the second: no surrogate, no attack."""

@@ -1,0 +1,160 @@
+"""Judge one model file against another: the object of the second is said to be that of the first, repainted.
+
+Whatever is missing or does not fit becomes a finding, and the rest is judged.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache, cached_property, partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trompe_server.attack import ViewDistribution
+from trompe_server.image_pipelines import SUITE
+from trompe_server.job.setup import HELD_OUT_STREAM, NOISE_STREAM
+from trompe_server.judgement.manifest import Judged
+from trompe_server.judgement.request import JudgeRequest
+from trompe_server.judgement.sources import JudgedObject, open_judge, read_judged, running
+from trompe_server.judgement.work import Kept, OnWork, Timed, key_of
+from trompe_server.judging.judge import Judge
+from trompe_server.renderers import TargetRenderer
+from trompe_server.spec.framing import framing_of
+from trompe_shared.api import AS_RENDERED, JudgedNetwork, ViewOptions
+from trompe_shared.engine import EngineInfo
+from trompe_shared.errors import ClassifierError, LabelError, RendererError, SpecError
+from trompe_shared.geometry import View, colour_of
+
+__all__ = ["judge_files", "noisy", "views_of"]
+
+SHARE: Final = 10
+"""Images between two saves."""
+
+PIPELINES: Final = {AS_RENDERED: None, **SUITE}
+IMAGE_SIZE: Final = (224, 224)
+"""Of the images if no network can be loaded."""
+
+Images = NDArray[np.uint8]
+
+
+def judge_files(request: JudgeRequest, folder: Path, *, kept: Path, on_work: OnWork) -> Judged:
+    """Judge what ``request`` names, for a manifest in ``folder``. A stopped judgement goes on with what is in ``kept``.
+
+    Raises ``ObjectError`` if one of the two files cannot be read, and ``SpecError`` for two networks of one name.
+    """
+    before, after = (read_judged(source, folder) for source in (request.before, request.after))
+    judges, records = _networks(request, folder)
+    size = request.image_size or next((judge.network.image_size for judge in judges.values()), IMAGE_SIZE)
+    judged = Judged(before, after, judges, records, views_of(request, before), size)
+    _Run(request, judged, Kept(kept), on_work).run()
+    return judged
+
+
+def views_of(request: JudgeRequest, before: JudgedObject) -> list[View]:
+    """The random views of a judgement: those of a job's held-out ones if the seed is the same."""
+    framing = framing_of(
+        before.obj, ViewOptions(distance=request.distance, elevation=request.elevation), shipped=before.shipped
+    )
+    cameras = ViewDistribution(framing.distance, framing.elevation, centre=framing.centre)
+    drawn = cameras.sample(request.views, generator=np.random.default_rng([request.seed, HELD_OUT_STREAM]))
+    behind = colour_of(request.background)
+    assert behind is not None  # the request has checked it
+    return [replace(view, background=behind) for view in drawn]
+
+
+def noisy(views: Sequence[View], engine: EngineInfo, seed: int) -> Sequence[View]:
+    """``views`` with the number of their noise, as a job's held-out ones, if the engine is random."""
+    if engine.deterministic:
+        return views
+    noise = int(np.random.default_rng([seed, NOISE_STREAM]).integers(2**31, size=2)[1])
+    return [replace(view, noise=noise) for view in views]
+
+
+def _networks(request: JudgeRequest, folder: Path) -> tuple[dict[str, Judge], list[JudgedNetwork]]:
+    """The networks that can judge, by name, and the records of all."""
+    judges, records = dict[str, Judge](), list[JudgedNetwork]()
+    for reference in request.networks:
+        try:
+            judge, record = open_judge(reference, request.label, folder)
+        except (ClassifierError, LabelError, SpecError) as error:
+            record = JudgedNetwork(name=reference, reference=reference, missing=str(error))
+        else:
+            if record.name in judges:
+                raise SpecError(f"Two networks are called {record.name!r}; rename the file of one.")
+            judges[record.name] = judge
+        records.append(record)
+    return judges, records
+
+
+@dataclass(frozen=True)
+class _Run:
+    request: JudgeRequest
+    judged: Judged
+    kept: Kept
+    on_work: OnWork
+
+    def run(self) -> None:
+        """Look at everything, and note it in ``judged``."""
+        for name in self.request.renderers:
+            try:
+                with running(name) as target:
+                    self._in_renderer(name, target)
+            except RendererError as error:
+                self.judged.missing[name] = str(error)
+                self._timed.skip(_rendering(name), *(_showing(name, network) for network in self.judged.judges))
+
+    @cached_property
+    def _timed(self) -> Timed:
+        pairs, renderers = 2 * len(self.judged.views), self.request.renderers
+        left = Counter({_rendering(name): pairs for name in renderers})
+        left |= Counter({_showing(name, to): pairs * len(PIPELINES) for name in renderers for to in self.judged.judges})
+        return Timed(left, self.on_work)
+
+    def _in_renderer(self, name: str, target: TargetRenderer) -> None:
+        engine, views = target.engine, noisy(self.judged.views, target.engine, self.request.seed)
+        objects = {"before": self.judged.before, "after": self.judged.after}
+        images = {kind: self._images(name, target, each, views) for kind, each in objects.items()}
+        self.judged.engines[name], self.judged.images[name] = engine, images
+        for pipeline in PIPELINES:
+            for kind, each in objects.items():
+                self._show(name, pipeline, kind, self._key(each, engine, views))
+
+    def _key(self, each: JudgedObject, engine: EngineInfo, views: Sequence[View]) -> str:
+        """Of images of some views."""
+        return key_of(each.file.sha256, asdict(engine), [asdict(view) for view in views], self.judged.size)
+
+    def _images(self, name: str, target: TargetRenderer, each: JudgedObject, views: Sequence[View]) -> Images:
+        parts = []
+        for start in range(0, len(views), SHARE):
+            share = views[start : start + SHARE]
+            key = self._key(each, target.engine, share)
+            with self._timed.step(_rendering(name), len(share), kept=self.kept.has(key)):
+                parts.append(self.kept.array(key, partial(target.render, each.obj, share, size=self.judged.size)))
+        return np.concatenate(parts)
+
+    def _show(self, renderer: str, pipeline: str, kind: str, key: str) -> None:
+        """Show the images of one object, through a pipeline, to all networks."""
+        through, images = PIPELINES[pipeline], self.judged.images[renderer][kind]
+        shown = cache(lambda: images if through is None else through.shown(images))
+        for record in self.judged.records:
+            if (judge := self.judged.judges.get(record.name)) is None:
+                continue
+            mine = key_of(key, pipeline, str(through), record.sha256)
+            with self._timed.step(_showing(renderer, record.name), len(images), kept=self.kept.has(mine)):
+                logits = self.kept.array(mine, partial(_logits, judge, shown))
+            self.judged.logits[renderer, record.name, pipeline, kind] = logits
+
+
+def _logits(judge: Judge, shown: Callable[[], Images]) -> NDArray[np.float32]:
+    return judge.network.predict(shown())
+
+
+def _rendering(renderer: str) -> str:
+    return f"rendering in {renderer}"
+
+
+def _showing(renderer: str, network: str) -> str:
+    return f"showing images of {renderer} to {network}"

@@ -1,0 +1,200 @@
+"""From what a judgement has seen to its manifest."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trompe_server.image_pipelines import SUITE
+from trompe_server.judgement.request import JudgeRequest
+from trompe_server.judgement.sources import JudgedObject
+from trompe_server.judging.judge import Judge
+from trompe_server.judging.metrics import drop_warning, margins
+from trompe_server.judging.objects import ObjectPair, texture_changes
+from trompe_server.judging.transparency import faint_warnings
+from trompe_server.judging.visibility import visibility_of
+from trompe_server.surrogate import behind
+from trompe_server.system.versions import versions
+from trompe_shared.api import (
+    AS_RENDERED,
+    Cell,
+    Finding,
+    JudgedNetwork,
+    JudgedRenderer,
+    Manifest,
+    Predictions,
+    TextureChange,
+    ViewRecord,
+    Visibility,
+    levels_within,
+)
+from trompe_shared.engine import EngineInfo
+from trompe_shared.geometry import Camera, Light, View
+
+__all__ = ["Judged", "manifest_of", "view_of", "view_record"]
+
+Images = NDArray[np.uint8]
+Logits = NDArray[np.float32]
+PIPELINES = (AS_RENDERED, *SUITE)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What was looked at, and what was seen.
+
+    judges: networks that could be loaded, by name. images: by renderer, of the objects ``before`` and ``after``
+    (views, H, W, 3). logits: by (renderer, network, pipeline, ``before`` or ``after``), (views, classes). missing:
+    why a renderer gave no images.
+    """
+
+    before: JudgedObject
+    after: JudgedObject
+    judges: Mapping[str, Judge]
+    records: Sequence[JudgedNetwork]
+    views: Sequence[View]
+    size: tuple[int, int]
+    engines: dict[str, EngineInfo] = field(default_factory=dict)
+    images: dict[str, Mapping[str, Images]] = field(default_factory=dict)
+    logits: dict[tuple[str, str, str, str], Logits] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def pair(self) -> ObjectPair:
+        """The two objects."""
+        return ObjectPair(self.before.obj, self.after.obj)
+
+    def both(self, renderer: str, network: str, pipeline: str = AS_RENDERED) -> tuple[Logits, Logits] | None:
+        """Logits before and after; ``None`` if the renderer or the network is missing."""
+        cell = renderer, network, pipeline
+        return (self.logits[*cell, "before"], self.logits[*cell, "after"]) if (*cell, "after") in self.logits else None
+
+
+def manifest_of(judged: Judged, request: JudgeRequest, *, seconds: float) -> Manifest:
+    """The manifest. ``seconds``: wall time of the judgement."""
+    changes = texture_changes(*judged.pair.textures, epsilon=request.epsilon)
+    cells = [
+        _cell(judged, renderer, network.name, pipeline)
+        for renderer in request.renderers
+        for network in judged.records
+        for pipeline in PIPELINES
+    ]
+    return Manifest(
+        suite=request.suite,
+        label=list(request.label),
+        epsilon=request.epsilon,
+        before=judged.before.file,
+        after=judged.after.file,
+        networks=list(judged.records),
+        renderers=[_renderer(judged, name, request.epsilon) for name in request.renderers],
+        image_size=judged.size,
+        seed=request.seed,
+        views=[view_record(view) for view in judged.views],
+        findings=[*judged.pair.findings(), *_findings(judged, request, changes, cells)],
+        textures=changes,
+        cells=cells,
+        predictions=[
+            prediction
+            for renderer in judged.engines
+            for network in judged.judges
+            if (prediction := _predictions(judged, renderer, network)) is not None
+        ],
+        seconds=round(seconds, 1),
+        versions=versions(),
+    )
+
+
+def view_record(view: View) -> ViewRecord:
+    """A view in the words of the manifest."""
+    camera, light = view.camera, view.light
+    return ViewRecord(
+        distance=camera.distance,
+        azimuth=camera.azimuth,
+        elevation=camera.elevation,
+        roll=camera.roll,
+        centre=camera.centre,
+        light_azimuth=light.azimuth,
+        light_elevation=light.elevation,
+        light_intensity=light.intensity,
+        light_ambient=light.ambient,
+        light_colour=light.colour,
+        background=view.background,
+    )
+
+
+def view_of(record: ViewRecord) -> View:
+    """Inverse of ``view_record``."""
+    camera = Camera(record.distance, record.azimuth, record.elevation, record.roll, record.centre)
+    light = Light(
+        record.light_azimuth,
+        record.light_elevation,
+        record.light_intensity,
+        record.light_ambient,
+        record.light_colour,
+    )
+    return View(camera, light, record.background)
+
+
+def _cell(judged: Judged, renderer: str, network: str, pipeline: str) -> Cell:
+    both = judged.both(renderer, network, pipeline)
+    accuracy = None if both is None else judged.judges[network].accuracy(*both)
+    return Cell(renderer=renderer, network=network, pipeline=pipeline, accuracy=accuracy)
+
+
+def _renderer(judged: Judged, name: str, epsilon: float | None) -> JudgedRenderer:
+    if name not in judged.engines:
+        return JudgedRenderer(name=name, missing=judged.missing[name])
+    return JudgedRenderer(name=name, engine=judged.engines[name], visibility=_visibility(judged, name, epsilon))
+
+
+def _visibility(judged: Judged, renderer: str, epsilon: float | None) -> Visibility:
+    images, ground = judged.images[renderer], behind(judged.views, {}, judged.size)
+    return visibility_of(*judged.pair.textures, images["before"], images["after"], ground, epsilon=epsilon)
+
+
+def _predictions(judged: Judged, renderer: str, network: str) -> Predictions | None:
+    both = judged.both(renderer, network)
+    if both is None:
+        return None
+    labels = judged.judges[network].labels
+    classes = [logits.argmax(axis=1).tolist() for logits in both]
+    found = [np.round(margins(logits, labels), 4).tolist() for logits in both]
+    return Predictions(
+        renderer=renderer,
+        network=network,
+        before=classes[0],
+        after=classes[1],
+        before_margins=found[0],
+        after_margins=found[1],
+    )
+
+
+def _findings(
+    judged: Judged, request: JudgeRequest, changes: Sequence[TextureChange], cells: Sequence[Cell]
+) -> Iterator[Finding]:
+    """Findings about the budget, and about what is missing or rests on little."""
+    for change in changes:
+        if change.texels_beyond_epsilon and request.epsilon is not None:
+            yield Finding(
+                kind="epsilon",
+                text=f"The texture {change.texture!r} exceeds the stated epsilon of {request.epsilon:g} "
+                f"({levels_within(request.epsilon)} levels of 255): {change.texels_beyond_epsilon} of "
+                f"{change.size[0] * change.size[1]} texels change by more, one by {change.max_levels} levels.",
+            )
+    for warning in faint_warnings(judged.before.obj):
+        yield Finding(kind="material", text=warning)
+    for network in judged.records:
+        if network.missing is not None:
+            yield Finding(kind="network", text=f"No figures of the network {network.name!r}: {network.missing}")
+        elif network.image_size not in (None, judged.size):
+            sizes = [" x ".join(map(str, size)) for size in (network.image_size, judged.size) if size]
+            yield Finding(
+                kind="network",
+                text=f"The network {network.name!r} takes images of {sizes[0]}; those of {sizes[1]} are resized.",
+            )
+    for name, reason in judged.missing.items():
+        yield Finding(kind="renderer", text=f"No figures of the renderer {name!r}: {reason}")
+    for cell in cells:
+        if cell.pipeline == AS_RENDERED and cell.accuracy is not None and (words := drop_warning(cell.accuracy)):
+            yield Finding(kind="views", text=f"{cell.renderer}, {cell.network}: {words}")

@@ -1,0 +1,139 @@
+"""Verification of a manifest: its files are those it names, its figures follow from its predictions, and random views,
+rendered again, get the same classes.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trompe_server.judgement.judge_files import noisy
+from trompe_server.judgement.manifest import view_of
+from trompe_server.judgement.sources import JudgedObject, network_file, open_judge, read_judged, running
+from trompe_server.judging.judge import Judge
+from trompe_server.judging.metrics import margins
+from trompe_server.renderers import TargetRenderer
+from trompe_shared.api import JudgedRenderer, Manifest, Predictions
+from trompe_shared.errors import ClassifierError, LabelError, ObjectError, RendererError
+from trompe_shared.shipped import shipped_objects
+
+__all__ = ["VIEWS_AGAIN", "verify"]
+
+VIEWS_AGAIN: Final = 20
+"""Views that are rendered again."""
+
+
+def verify(manifest: Manifest, folder: Path, *, generator: np.random.Generator) -> Iterator[str]:
+    """The faults of a manifest that lies in ``folder``, each in a sentence.
+
+    generator: draws the views that are rendered again, at most ``VIEWS_AGAIN``.
+    """
+    yield from _figures(manifest)
+    objects, judges = dict[str, JudgedObject](), dict[str, Judge]()
+    for kind, file in (("before", manifest.before), ("after", manifest.after)):
+        try:
+            objects[kind] = read_judged(_source(file.source, folder), folder)
+        except ObjectError as error:
+            yield f"The file {kind} cannot be read again: {error}"
+        else:
+            yield from _same_hash(file.source, file.sha256, objects[kind].file.sha256)
+    for network in manifest.networks:
+        if network.missing is not None:
+            continue
+        try:
+            judges[network.name], found = open_judge(_source(network.reference, folder), network.labels, folder)
+        except (ClassifierError, LabelError) as error:
+            yield f"The network {network.name!r} cannot be loaded again: {error}"
+        else:
+            yield from _same_hash(network.name, network.sha256, found.sha256)
+    if len(objects) == 2:
+        count = len(manifest.views)
+        index = np.sort(generator.permutation(count)[:VIEWS_AGAIN])
+        for renderer in manifest.renderers:
+            yield from _Again(manifest, objects, judges, index.tolist(), renderer).faults()
+
+
+def _source(source: str, folder: Path) -> str:
+    """A path of the manifest from here; a name as it is."""
+    is_name = source in shipped_objects() or (network_file(source) is None and not (folder / source).exists())
+    return source if is_name else str(folder / source)
+
+
+def _same_hash(name: str, recorded: str | None, found: str | None) -> Iterator[str]:
+    if recorded != found:
+        yield f"{name} has changed: its sha256 is {str(found)[:16]}..., the manifest says {str(recorded)[:16]}..."
+
+
+def _figures(manifest: Manifest) -> Iterator[str]:
+    """Cells of the images as rendered that do not follow from the classes of their views."""
+    labels = {network.name: network.labels for network in manifest.networks}
+    for each in manifest.predictions:
+        accuracy = manifest.cell(each.renderer, each.network)
+        if accuracy is None:
+            yield f"{each.renderer}, {each.network}: the manifest has classes of views but no figures."
+            continue
+        shares = [float(np.isin(classes, labels[each.network]).mean()) for classes in (each.before, each.after)]
+        if not np.allclose(shares, [accuracy.a_before, accuracy.a_after or 0.0], atol=1e-9):
+            yield (
+                f"{each.renderer}, {each.network}: by the classes of its views the object is recognised in "
+                f"{shares[0]:.3f} before and {shares[1]:.3f} after, by the figures in {accuracy.a_before:.3f} and "
+                f"{accuracy.a_after or 0.0:.3f}."
+            )
+
+
+@dataclass(frozen=True)
+class _Again:
+    """Some views in one renderer again."""
+
+    manifest: Manifest
+    objects: Mapping[str, JudgedObject]
+    judges: Mapping[str, Judge]
+    index: Sequence[int]
+    renderer: JudgedRenderer
+
+    def faults(self) -> Iterator[str]:
+        """Another engine, and views with another class."""
+        if self.renderer.engine is None:
+            return
+        try:
+            with running(self.renderer.name) as target:
+                if target.engine != self.renderer.engine:
+                    yield f"The renderer here is {target.engine}, the manifest's {self.renderer.engine}."
+                yield from self._views(target)
+        except RendererError as error:
+            yield f"The renderer {self.renderer.name!r} cannot be asked again: {error}"
+
+    def _views(self, target: TargetRenderer) -> Iterator[str]:
+        views = noisy([view_of(self.manifest.views[k]) for k in self.index], target.engine, self.manifest.seed)
+        for kind, each in self.objects.items():
+            images = target.render(each.obj, views, size=self.manifest.image_size)
+            for recorded in self.manifest.predictions:
+                if recorded.renderer == self.renderer.name and recorded.network in self.judges:
+                    judge = self.judges[recorded.network]
+                    yield from self._classes(recorded, kind, judge, judge.network.predict(images))
+
+    def _classes(
+        self,
+        recorded: Predictions,
+        kind: str,
+        judge: Judge,
+        logits: NDArray[np.float32],
+    ) -> Iterator[str]:
+        classes, known = (
+            (recorded.before, recorded.before_margins)
+            if kind == "before"
+            else (
+                recorded.after,
+                recorded.after_margins,
+            )
+        )
+        now = zip(logits.argmax(axis=1).tolist(), margins(logits, judge.labels).tolist(), strict=True)
+        for k, (found, margin) in zip(self.index, now, strict=True):
+            if found != classes[k]:
+                yield (
+                    f"View {k} {kind}, {recorded.network} in {recorded.renderer}: {judge.class_name(found)!r} with "
+                    f"margin {margin:+.2f}, the manifest says {judge.class_name(classes[k])!r} with {known[k]:+.2f}."
+                )

@@ -1,0 +1,10 @@
+"""Versions of the software that can change a figure."""
+
+from importlib.metadata import version
+
+__all__ = ["versions"]
+
+
+def versions() -> dict[str, str]:
+    """Versions by package."""
+    return {name: version(name) for name in ("trompe", "torch", "numpy", "pyrender", "onnxruntime")}
