@@ -37,6 +37,7 @@ def judgement_page(manifest: Manifest, pictures: Mapping[str, bytes]) -> str:
     return render(
         "judgement.html",
         manifest=manifest,
+        after=manifest.after.source.rsplit("/", 1)[-1],
         style=Markup((STATIC / "trompe.css").read_text()),
         figures={
             (cell.renderer, cell.network, cell.pipeline): shares_in_words(cell.accuracy) for cell in manifest.cells

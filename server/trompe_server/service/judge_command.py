@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["judge"]
 
 MANIFEST, PAGE, KEPT = "judgement.json", "judgement.html", ".judging"
-INTERVAL: Final = 20.0
+INTERVAL: Final = 10.0
 """Seconds between two lines of progress into a pipe."""
 
 
@@ -125,7 +125,7 @@ def _verify(file: Path) -> int:
 
 @contextmanager
 def _shown() -> "Iterator[OnWork]":
-    """Shows the work: a bar on a terminal, else a line at each new kind of work and at least every ``INTERVAL``."""
+    """Shows the work: a bar on a terminal, else a line every ``INTERVAL``."""
     console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
     if not console.is_terminal:
         yield _Lines(console).show
@@ -137,12 +137,12 @@ def _shown() -> "Iterator[OnWork]":
 
 class _Lines:
     def __init__(self, console: Console) -> None:
-        self._console, self._said, self._what = console, 0.0, ""
+        self._console, self._said = console, 0.0
 
     def show(self, work: "Work") -> None:
         """Print a line if it is due."""
-        if work.what != self._what or time.monotonic() > self._said + INTERVAL:
-            self._said, self._what = time.monotonic(), work.what
+        if time.monotonic() > self._said + INTERVAL:
+            self._said = time.monotonic()
             self._console.print(f"{work.done:4.0%}  {_words(work)}")
 
 

@@ -1,0 +1,83 @@
+"""Judgements of the shipped mug over a fake renderer."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.fakes import FAKE, FakeTarget
+from trompe_server.judgement.judge_files import judge_files
+from trompe_server.judgement.manifest import Judged, manifest_of
+from trompe_server.judgement.request import JudgeRequest
+from trompe_server.judgement.work import OnWork
+from trompe_server.renderers import TargetRenderer
+from trompe_shared.api import Manifest
+from trompe_shared.errors import RendererError
+from trompe_shared.object3d import Object3D, load_object
+from trompe_shared.shipped import shipped_objects
+
+
+@dataclass(frozen=True)
+class CountingTarget(FakeTarget):
+    """A fake renderer that counts its images."""
+
+    points: int = 20_000
+    rendered: list[int] = field(default_factory=list)
+
+    def render(self, obj: Object3D, views: Any, **options: Any) -> NDArray[np.uint8]:
+        self.rendered.append(len(views))
+        return super().render(obj, views, **options)
+
+
+@pytest.fixture
+def fake_renderer(monkeypatch: pytest.MonkeyPatch) -> CountingTarget:
+    """The renderer of the name ``fake``; there is no other."""
+    target = CountingTarget(engine=FAKE)
+
+    @contextmanager
+    def running(name: str) -> Iterator[TargetRenderer]:
+        if name != "fake":
+            raise RendererError(f"The renderer worker did not start. There is no engine {name!r}.")
+        yield target
+
+    for module in ("judge_files", "verify"):
+        monkeypatch.setattr(f"trompe_server.judgement.{module}.running", running)
+    return target
+
+
+@pytest.fixture
+def dark(tmp_path: Path) -> Path:
+    """The mug, painted all black but for its handle's side of the texture."""
+    mug = load_object(shipped_objects()["mug"].read())
+    painted = {name: np.where(np.arange(512)[:, None, None] < 400, 0, image) for name, image in mug.textures.items()}
+    file = tmp_path / "dark.zip"
+    file.write_bytes(mug.with_textures({name: image.astype(np.uint8) for name, image in painted.items()}).to_zip())
+    return file
+
+
+Judge = Callable[..., Judged]
+
+
+@pytest.fixture
+def judge(fake_renderer: CountingTarget, tmp_path: Path) -> Judge:
+    """Judges the mug against another file."""
+    assert fake_renderer.rendered == []
+
+    def run(after: Path, *, on_work: OnWork = lambda _: None, **options: Any) -> Judged:
+        return judge_files(request_of(after, **options), tmp_path, kept=tmp_path / "kept", on_work=on_work)
+
+    return run
+
+
+def request_of(after: Path, **options: Any) -> JudgeRequest:
+    asked: dict[str, Any] = {"label": ("mug",), "renderers": ("fake",), "views": 6, **options}
+    return JudgeRequest("mug", str(after), **asked)
+
+
+def manifest_for(judged: Judged, after: Path, **options: Any) -> Manifest:
+    return manifest_of(judged, request_of(after, **options), seconds=1.0)

@@ -1,0 +1,297 @@
+"""A judgement of two files: its figures, its findings, its page, and that it goes on where it stopped."""
+
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.job_runs import run_job
+from tests.server.judgement.conftest import CountingTarget, Judge, manifest_for, request_of
+from trompe_server.image_pipelines import SUITE
+from trompe_server.judgement.judge_files import judge_files
+from trompe_server.judgement.manifest import manifest_of
+from trompe_server.judgement.pictures import judgement_pictures
+from trompe_server.judgement.request import JudgeRequest
+from trompe_server.judgement.suites import SUITES, Suite
+from trompe_server.judgement.verify import verify
+from trompe_server.judgement.work import Timed, Work
+from trompe_server.library import Library
+from trompe_server.pages.judgement import judgement_page
+from trompe_server.renderers import SailenvTarget
+from trompe_shared.api import AS_RENDERED, JobSpec, Manifest
+from trompe_shared.errors import SpecError
+from trompe_shared.object3d import load_object
+from trompe_shared.shipped import shipped_objects
+
+TEXTURE = "mug_ceramic_AlbedoTransparency.png"
+
+# The figures
+
+
+def test_an_attacked_object_gets_the_figures_of_its_job(
+    tmp_path: Path, worker: tuple[str, int], target: SailenvTarget
+) -> None:
+    options = {"epsilon": 0.15, "alpha": 0.04, "steps": 5, "pool": 12, "held_out": 12, "image_pipeline": "none"}
+    run = run_job(JobSpec.of("mug", label="mug", **options), Library(tmp_path / "library"), target=target)
+    job = run.result.held_out
+    assert job is not None
+    assert job.a_drop
+    for ending, seed in ((".zip", 0), (".glb", 0), (".glb", 7)):
+        (tmp_path / f"after{ending}").write_bytes(run.artifacts.read(f"mug-adversarial{ending}"))
+        request = JudgeRequest(
+            "mug",
+            str(tmp_path / f"after{ending}"),
+            label=("mug",),
+            renderers=(f"{worker[0]}:{worker[1]}",),
+            views=12,
+            seed=seed,
+            epsilon=0.15,
+        )
+        judged = judge_files(request, tmp_path, kept=tmp_path / "kept", on_work=lambda _: None)
+        manifest = manifest_of(judged, request, seconds=1.0)
+        found = manifest.cell(request.renderers[0], "tiny")
+        assert found is not None
+        assert manifest.findings == []
+        if (ending, seed) == (".zip", 0):
+            assert found == job
+        assert found.a_drop is not None
+        assert found.a_drop_interval is not None
+        assert job.a_drop_interval is not None
+        assert max(found.a_drop_interval[0], job.a_drop_interval[0]) <= min(found.a_drop, job.a_drop)
+        assert min(found.a_drop_interval[1], job.a_drop_interval[1]) >= max(found.a_drop, job.a_drop)
+        (texture,) = manifest.textures
+        assert texture.texels_altered == run.result.texels_altered
+        assert texture.max_levels <= 0.15 * 255
+
+
+def test_every_cell_has_figures_and_every_view_its_classes(judge: Judge, dark: Path) -> None:
+    manifest = manifest_for(judge(dark), dark)
+    assert [cell.pipeline for cell in manifest.cells] == [AS_RENDERED, *SUITE]
+    assert all(cell.accuracy is not None and cell.accuracy.views == 6 for cell in manifest.cells)
+    (predictions,) = manifest.predictions
+    found = manifest.cell("fake", "tiny")
+    assert found is not None
+    label = manifest.networks[0].labels
+    assert found.a_before == np.isin(predictions.before, label).mean()
+    assert [margin > 0 for margin in predictions.after_margins] == [each in label for each in predictions.after]
+    assert Manifest.model_validate_json(manifest.model_dump_json()) == manifest
+
+
+# Whatever does not fit is said in a sentence, and the rest is judged
+
+
+def test_each_thing_that_does_not_fit_is_a_sentence_and_the_rest_is_judged(judge: Judge, dark: Path) -> None:
+    missing = dark.with_name("nowhere.pt2")
+    options = {
+        "networks": ("tiny", str(missing)),
+        "renderers": ("fake", "none-such"),
+        "image_size": (64, 96),
+        "epsilon": 0.1,
+    }
+    manifest = manifest_for(judge(dark, **options), dark, **options)
+    texts = {(found.kind, found.text.split(":")[0]) for found in manifest.findings}
+    assert texts == {
+        (
+            "epsilon",
+            f"The texture {TEXTURE!r} exceeds the stated epsilon of 0.1 (25 levels of 255)",
+        ),
+        ("network", "The network 'tiny' takes images of 128 x 128; those of 64 x 96 are resized."),
+        ("network", f"No figures of the network {str(missing)!r}"),
+        ("renderer", "No figures of the renderer 'none-such'"),
+    }
+    empty = Counter(cell.accuracy is None for cell in manifest.cells)
+    assert empty == {False: 1 + len(SUITE), True: 3 * (1 + len(SUITE))}
+
+
+def test_an_object_that_is_not_recognised_before_is_said(judge: Judge, dark: Path) -> None:
+    manifest = manifest_for(judge(dark, label=("ball",)), dark, label=("ball",))
+    assert [found.text for found in manifest.findings if found.kind == "views"] == [
+        "fake, tiny: None of the 6 views was recognised before the attack: A_drop is n.a."
+    ]
+
+
+def test_a_label_counts_for_the_networks_that_know_it(judge: Judge, dark: Path) -> None:
+    known = manifest_for(judge(dark, label=("coffee mug", "mug")), dark)
+    assert known.networks[0].label_names == ["mug"]
+    unknown = manifest_for(judge(dark, label=("coffee mug",)), dark)
+    (found,) = unknown.findings
+    assert re.match(
+        "No figures of the network 'tiny': 'tiny' has no class 'coffee mug'; an example of a class", found.text
+    )
+    assert unknown.textures
+
+
+def test_another_object_is_judged_but_its_texels_are_not(judge: Judge, tmp_path: Path) -> None:
+    ball = tmp_path / "ball.zip"
+    ball.write_bytes(shipped_objects()["ball"].read())
+    manifest = manifest_for(judge(ball), ball)
+    assert manifest.findings[0].kind == "object"
+    assert manifest.textures == []
+    visibility = manifest.renderers[0].visibility
+    assert (visibility.texels_altered, visibility.ssim is None) == (None, False)
+    assert manifest.cell("fake", "tiny") is not None
+
+
+# Resume, and the time left
+
+
+class StoppedError(Exception):
+    """Stands for Ctrl-C."""
+
+
+def test_a_stopped_judgement_goes_on_to_the_same_figures(
+    judge: Judge, dark: Path, fake_renderer: CountingTarget, tmp_path: Path
+) -> None:
+    def stop(work: Work) -> None:
+        if work.done > 0.5:
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        judge(dark, on_work=stop)
+    rendered = len(fake_renderer.rendered)
+    assert rendered == 2
+    resumed = manifest_for(judge(dark), dark)
+    assert len(fake_renderer.rendered) == rendered
+    assert any((tmp_path / "kept").iterdir())
+    for file in (tmp_path / "kept").iterdir():
+        file.write_bytes(b"damaged")
+    assert manifest_for(judge(dark), dark) == resumed
+
+
+def test_the_time_left_is_that_of_the_images_to_come() -> None:
+    now, told = [0.0], list[Work]()
+    timed = Timed(Counter({"rendering": 20, "showing": 40, "never": 5}), told.append, clock=lambda: now[0])
+    timed.skip("never")
+    for _ in range(2):
+        with timed.step("rendering", 10):
+            now[0] += 5
+    with timed.step("showing", 10, kept=True):
+        now[0] += 0.001
+    with timed.step("showing", 10):
+        now[0] += 20
+    assert (told[-1].done, told[-1].seconds_left) == (pytest.approx(40 / 60), 40)
+
+
+# The page
+
+
+class References(HTMLParser):
+    """Collects what a page loads or leads to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.tags: Counter[str] = Counter()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags[tag] += 1
+        self.found += [value or "" for name, value in attrs if name in {"src", "href", "srcset", "action", "data"}]
+
+
+def test_the_page_needs_no_network_and_escapes_names(judge: Judge, dark: Path) -> None:
+    named = dark.with_name("<script>x.zip")
+    named.write_bytes(dark.read_bytes())
+    judged = judge(named, renderers=("fake", "none-such"))
+    manifest = manifest_for(judged, named, renderers=("fake", "none-such"))
+    page = judgement_page(manifest, judgement_pictures(judged))
+    references = References()
+    references.feed(page)
+    assert references.found
+    assert all(each.startswith("data:image/jpeg;base64,") for each in references.found)
+    assert not re.search(r"url\((?!data:)|@import|https?://", page)
+    assert not references.tags["script"]
+    drops = [cell.accuracy.a_drop for cell in manifest.cells if cell.accuracy is not None]
+    assert references.tags["circle"] == len(drops) - drops.count(None) > 0
+
+
+# Verification
+
+
+Change = Callable[[Manifest, Path], Manifest]
+
+
+def lied(manifest: Manifest, _dark: Path) -> Manifest:
+    """Another class in one view, and figures that fit it."""
+    (predictions,) = manifest.predictions
+    other = (predictions.after[2] + 1) % 8
+    after = [*predictions.after[:2], other, *predictions.after[3:]]
+    return manifest.model_copy(update={"predictions": [predictions.model_copy(update={"after": after})]})
+
+
+def repainted(manifest: Manifest, dark: Path) -> Manifest:
+    obj = load_object(dark)
+    dark.write_bytes(obj.with_textures({name: image[::-1] for name, image in obj.textures.items()}).to_zip())
+    return manifest
+
+
+def gone(manifest: Manifest, dark: Path) -> Manifest:
+    dark.unlink()
+    return manifest
+
+
+def better(manifest: Manifest, _dark: Path) -> Manifest:
+    first, *others = manifest.cells
+    assert first.accuracy is not None
+    improved = first.accuracy.model_copy(update={"a_after": 0.123})
+    return manifest.model_copy(update={"cells": [first.model_copy(update={"accuracy": improved}), *others]})
+
+
+CHANGES: dict[str, tuple[Change, str]] = {
+    "another class": (lied, r"View 2 after, tiny in fake: '\w+' with margin [+-]\d+\.\d\d, the manifest says '\w+'"),
+    "another file": (repainted, r"dark\.zip has changed: its sha256 is "),
+    "no file": (gone, "The file after cannot be read again"),
+    "other figures": (better, "by the figures in .* and 0.123"),
+}
+
+
+@pytest.mark.parametrize(("change", "fault"), CHANGES.values(), ids=CHANGES.keys())
+def test_verification_names_what_is_not_as_the_manifest_says(
+    judge: Judge, dark: Path, tmp_path: Path, change: Change, fault: str
+) -> None:
+    manifest = manifest_for(judge(dark), dark)
+    assert list(verify(manifest, tmp_path, generator=np.random.default_rng(0))) == []
+    changed = change(manifest, dark)
+    faults = list(verify(changed, tmp_path, generator=np.random.default_rng(0)))
+    assert any(re.search(fault, each) for each in faults), faults
+
+
+# The suite
+
+
+def test_a_suite_never_changes() -> None:
+    named = ("tiny", *(f"torchvision:{name}" for name in ("mobilenet_v2", "inception_v3", "resnet50", "vit_b_16")))
+    assert SUITES["standard-1"] == Suite(100, 20261123, (224, 224), ("pyrender", "three"), named)
+    assert re.sub(r"\w+=(None|1\.0|0\.0)(, )?", "", str([*SUITE.items()])) == (
+        "[('half size', ImagePipeline(resize=(0.5, 0.5), )), ('three quarters', ImagePipeline(resize=(0.75, 0.75), )), "
+        "('JPEG 75', ImagePipeline(jpeg=(75, 75))), ('JPEG 30', ImagePipeline(jpeg=(30, 30))), "
+        "('gamma 0.8', ImagePipeline(gamma=(0.8, 0.8), )), ('gamma 1.25', ImagePipeline(gamma=(1.25, 1.25), )), "
+        "('filmic', ImagePipeline(filmic=(1, 1), )), ('blur 1', ImagePipeline(blur=(1, 1), )), "
+        "('crop', ImagePipeline(zoom=(1.15, 1.15), )), ('grain', ImagePipeline(noise=(0.05, 0.05), ))]"
+    )
+
+
+def test_a_suite_keeps_its_own_and_takes_more_on_top(dark: Path) -> None:
+    request = replace(request_of(dark), networks=("mine.pt2",), renderers=("mitsuba",)).in_suite("standard-1")
+    assert request.networks == (*SUITES["standard-1"].networks, "mine.pt2")
+    assert request.renderers == ("pyrender", "three", "mitsuba")
+    assert (request.views, request.image_size, request.suite) == (100, (224, 224), "standard-1")
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"label": ()}, "needs the object's true class"),
+    ({"views": 0}, "from 1 to 1000; got 0"),
+    ({"epsilon": 12.75}, "at most 1; got 12.75"),
+    ({"background": "room.png"}, "is not a colour"),
+]
+
+
+@pytest.mark.parametrize(("options", "text"), WRONG)
+def test_a_wrong_option_is_an_error(dark: Path, options: dict[str, Any], text: str) -> None:
+    with pytest.raises(SpecError, match=text):
+        request_of(dark, **options)
