@@ -185,16 +185,18 @@ def _findings(
     for warning in faint_warnings(judged.before.obj):
         yield Finding(kind="material", text=warning)
     for network in judged.records:
-        if network.missing is not None:
-            yield Finding(kind="network", text=f"No figures of the network {network.name!r}: {network.missing}")
-        elif network.image_size not in (None, judged.size):
+        if network.image_size not in (None, judged.size):
             sizes = [" x ".join(map(str, size)) for size in (network.image_size, judged.size) if size]
             yield Finding(
                 kind="network",
                 text=f"The network {network.name!r} takes images of {sizes[0]}; those of {sizes[1]} are resized.",
             )
+    lacking = {network.name: network.missing for network in judged.records if network.missing is not None}
+    for reason in dict.fromkeys(lacking.values()):
+        names = ", ".join(repr(name) for name, why in lacking.items() if why == reason)
+        yield Finding(kind="network", text=f"No figures of {names}: {reason}")
     for name, reason in judged.missing.items():
-        yield Finding(kind="renderer", text=f"No figures of the renderer {name!r}: {reason}")
+        yield Finding(kind="renderer", text=f"No figures in {name!r}: {reason}")
     for cell in cells:
         if cell.pipeline == AS_RENDERED and cell.accuracy is not None and (words := drop_warning(cell.accuracy)):
             yield Finding(kind="views", text=f"{cell.renderer}, {cell.network}: {words}")

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 __all__ = ["judge"]
 
 MANIFEST, PAGE, KEPT = "judgement.json", "judgement.html", ".judging"
+WIDTH: Final = 160
+"""Columns of a table into a pipe."""
+
 INTERVAL: Final = 10.0
 """Seconds between two lines of progress into a pipe."""
 
@@ -159,6 +162,7 @@ def _say(manifest: Manifest, out: Path) -> None:
         if cell.pipeline == AS_RENDERED:
             table.add_row(cell.network, cell.renderer, *shares_in_words(cell.accuracy))
     console = Console(markup=False, highlight=False, soft_wrap=True)
+    console.width = console.width if console.is_terminal else WIDTH
     console.print(table)
     for finding in manifest.findings:
         console.print(f"- {finding.text}")

@@ -118,7 +118,7 @@ class Manifest(Schema):
     textures: list[TextureChange]
     cells: list[Cell]
     predictions: list[Predictions]
-    seconds: float
+    seconds: float = Field(description="wall time; of the last run if it was stopped")
     versions: dict[str, str]
 
     def cell(self, renderer: str, network: str, pipeline: str = AS_RENDERED) -> Accuracy | None:

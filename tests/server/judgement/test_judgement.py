@@ -102,8 +102,8 @@ def test_each_thing_that_does_not_fit_is_a_sentence_and_the_rest_is_judged(judge
             f"The texture {TEXTURE!r} exceeds the stated epsilon of 0.1 (25 levels of 255)",
         ),
         ("network", "The network 'tiny' takes images of 128 x 128; those of 64 x 96 are resized."),
-        ("network", f"No figures of the network {str(missing)!r}"),
-        ("renderer", "No figures of the renderer 'none-such'"),
+        ("network", f"No figures of {str(missing)!r}"),
+        ("renderer", "No figures in 'none-such'"),
     }
     empty = Counter(cell.accuracy is None for cell in manifest.cells)
     assert empty == {False: 1 + len(SUITE), True: 3 * (1 + len(SUITE))}
@@ -121,9 +121,7 @@ def test_a_label_counts_for_the_networks_that_know_it(judge: Judge, dark: Path) 
     assert known.networks[0].label_names == ["mug"]
     unknown = manifest_for(judge(dark, label=("coffee mug",)), dark)
     (found,) = unknown.findings
-    assert re.match(
-        "No figures of the network 'tiny': 'tiny' has no class 'coffee mug'; an example of a class", found.text
-    )
+    assert re.match("No figures of 'tiny': 'tiny' has no class 'coffee mug'; an example of a class", found.text)
     assert unknown.textures
 
 
@@ -175,7 +173,8 @@ def test_the_time_left_is_that_of_the_images_to_come() -> None:
         now[0] += 0.001
     with timed.step("showing", 10):
         now[0] += 20
-    assert (told[-1].done, told[-1].seconds_left) == (pytest.approx(40 / 60), 40)
+    assert told[-1].done == pytest.approx(40 / 60)
+    assert told[-1].seconds_left == 40
 
 
 # The page
