@@ -22,13 +22,13 @@ from trompe_server.judgement.sources import JudgedObject, open_judge, read_judge
 from trompe_server.judgement.work import Kept, OnWork, Timed, key_of
 from trompe_server.judging.judge import Judge
 from trompe_server.renderers import TargetRenderer
-from trompe_server.spec.framing import framing_of
-from trompe_shared.api import AS_RENDERED, JudgedNetwork, ViewOptions
+from trompe_server.spec.framing import Framing, framing_of
+from trompe_shared.api import AS_RENDERED, JudgedNetwork
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import ClassifierError, LabelError, RendererError, SpecError
 from trompe_shared.geometry import View, colour_of
 
-__all__ = ["judge_files", "noisy", "views_of"]
+__all__ = ["judge_files", "noisy", "sampled", "views_of"]
 
 SHARE: Final = 10
 """Images between two saves."""
@@ -55,9 +55,11 @@ def judge_files(request: JudgeRequest, folder: Path, *, kept: Path, on_work: OnW
 
 def views_of(request: JudgeRequest, before: JudgedObject) -> list[View]:
     """The random views of a judgement: those of a job's held-out ones if the seed is the same."""
-    framing = framing_of(
-        before.obj, ViewOptions(distance=request.distance, elevation=request.elevation), shipped=before.shipped
-    )
+    return sampled(request, framing_of(before.obj, request.framing, shipped=before.shipped))
+
+
+def sampled(request: JudgeRequest, framing: Framing) -> list[View]:
+    """The random views of a seed in a framing."""
     cameras = ViewDistribution(framing.distance, framing.elevation, centre=framing.centre)
     drawn = cameras.sample(request.views, generator=np.random.default_rng([request.seed, HELD_OUT_STREAM]))
     behind = colour_of(request.background)

@@ -1,10 +1,15 @@
 """What a judgement is asked for."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, Self
 
+from pydantic import ValidationError
+
 from trompe_server.judgement.suites import SUITES
+from trompe_shared.api import ViewOptions
 from trompe_shared.errors import SpecError
+from trompe_shared.faults import faults_of
 from trompe_shared.geometry import colour_of
 
 __all__ = ["VIEWS", "JudgeRequest"]
@@ -49,6 +54,17 @@ class JudgeRequest:
             raise SpecError(f"`epsilon` must be more than 0 and at most 1; got {self.epsilon:g}.")
         if colour_of(self.background) is None:
             raise SpecError(f"The background {self.background!r} is not a colour; use white, black or #rrggbb.")
+        if self.seed < 0:
+            raise SpecError(f"`seed` must be 0 or more; got {self.seed}.")
+        _ = self.framing
+
+    @cached_property
+    def framing(self) -> ViewOptions:
+        """Distance and elevation of the cameras. Raises ``SpecError`` for values out of range."""
+        try:
+            return ViewOptions(distance=self.distance, elevation=self.elevation)
+        except ValidationError as error:
+            raise SpecError(f"Invalid options: {'; '.join(map(str, faults_of(error)))}.") from error
 
     def in_suite(self, name: str) -> Self:
         """The request with the views, images, networks and renderers of a suite, and its own of the latter on top.

@@ -53,7 +53,7 @@ def open_judge(reference: str, label: Sequence[str | int], folder: Path) -> tupl
     judge = Judge.of(network, _known(label, network))
     names = network.classes
     return judge, JudgedNetwork(
-        name=network.name,
+        name=reference if path is None else network.name,
         reference=reference if path is None else _relative(reference, folder),
         sha256=_hash(classifier_file(reference).read_bytes()),
         image_size=network.image_size,

@@ -1,5 +1,5 @@
-"""Verification of a manifest: its files are those it names, its figures follow from its predictions, and random views,
-rendered again, get the same classes.
+"""Verification of a manifest: its views are those of its seed, its files those it names, its figures follow from its
+predictions, and random views, rendered again, get the same classes.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,12 +10,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_server.judgement.judge_files import noisy
-from trompe_server.judgement.manifest import view_of
+from trompe_server.judgement.judge_files import noisy, sampled
+from trompe_server.judgement.manifest import view_of, view_record
+from trompe_server.judgement.request import JudgeRequest
 from trompe_server.judgement.sources import JudgedObject, network_file, open_judge, read_judged, running
 from trompe_server.judging.judge import Judge
 from trompe_server.judging.metrics import margins
 from trompe_server.renderers import TargetRenderer
+from trompe_server.spec.framing import Framing
 from trompe_shared.api import JudgedRenderer, Manifest, Predictions
 from trompe_shared.errors import ClassifierError, LabelError, ObjectError, RendererError
 from trompe_shared.shipped import shipped_objects
@@ -31,6 +33,7 @@ def verify(manifest: Manifest, folder: Path, *, generator: np.random.Generator) 
 
     generator: draws the views that are rendered again, at most ``VIEWS_AGAIN``.
     """
+    yield from _views(manifest)
     yield from _figures(manifest)
     objects, judges = dict[str, JudgedObject](), dict[str, Judge]()
     for kind, file in (("before", manifest.before), ("after", manifest.after)):
@@ -65,6 +68,19 @@ def _source(source: str, folder: Path) -> str:
 def _same_hash(name: str, recorded: str | None, found: str | None) -> Iterator[str]:
     if recorded != found:
         yield f"{name} has changed: its sha256 is {str(found)[:16]}..., the manifest says {str(recorded)[:16]}..."
+
+
+def _views(manifest: Manifest) -> Iterator[str]:
+    """Views that are not the random ones of the seed, or not those of the suite."""
+    request = JudgeRequest("", "", ("",), views=len(manifest.views), seed=manifest.seed)
+    drawn = [view_record(view) for view in sampled(request, Framing((0.0, 0.0, 0.0), 1.0, (0.0, 0.0)))]
+    free = {"distance", "elevation", "centre", "background"}
+    if [view.model_dump(exclude=free) for view in drawn] != [view.model_dump(exclude=free) for view in manifest.views]:
+        yield f"The views are not the random ones of seed {manifest.seed}."
+    if manifest.suite is not None:
+        wanted, size = request.in_suite(manifest.suite), manifest.image_size
+        if (wanted.views, wanted.seed, wanted.image_size) != (request.views, request.seed, size):
+            yield f"The number of views, their seed or the size of the images is not that of {manifest.suite}."
 
 
 def _figures(manifest: Manifest) -> Iterator[str]:

@@ -241,7 +241,18 @@ def better(manifest: Manifest, _dark: Path) -> Manifest:
     return manifest.model_copy(update={"cells": [first.model_copy(update={"accuracy": improved}), *others]})
 
 
+def easier(manifest: Manifest, _dark: Path) -> Manifest:
+    """One view twice."""
+    return manifest.model_copy(update={"views": [manifest.views[0], manifest.views[0], *manifest.views[2:]]})
+
+
+def labelled(manifest: Manifest, _dark: Path) -> Manifest:
+    return manifest.model_copy(update={"suite": "standard-1"})
+
+
 CHANGES: dict[str, tuple[Change, str]] = {
+    "another view": (easier, "The views are not the random ones of seed 0"),
+    "not the suite": (labelled, "is not that of standard-1"),
     "another class": (lied, r"View 2 after, tiny in fake: '\w+' with margin [+-]\d+\.\d\d, the manifest says '\w+'"),
     "another file": (repainted, r"dark\.zip has changed: its sha256 is "),
     "no file": (gone, "The file after cannot be read again"),
@@ -287,6 +298,9 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"views": 0}, "from 1 to 1000; got 0"),
     ({"epsilon": 12.75}, "at most 1; got 12.75"),
     ({"background": "room.png"}, "is not a colour"),
+    ({"seed": -1}, "0 or more; got -1"),
+    ({"distance": -1.0}, "distance: .* greater than 0"),
+    ({"elevation": (50.0, 0.0)}, "low end first; got 50.0 0.0"),
 ]
 
 
