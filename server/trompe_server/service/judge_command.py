@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["judge"]
 
 MANIFEST, PAGE, KEPT = "judgement.json", "judgement.html", ".judging"
+
 WIDTH: Final = 160
 """Columns of a table into a pipe."""
 
@@ -30,10 +31,16 @@ INTERVAL: Final = 10.0
 """Seconds between two lines of progress into a pipe."""
 
 
+def _help(keyword: str) -> str:
+    """The words of a job's option."""
+    words = OPTIONS[keyword].help
+    return words[0].upper() + words[1:]
+
+
 @click.command()
 @click.argument("before", required=False)
 @click.argument("after", required=False)
-@click.option("--label", multiple=True, metavar="NAME_OR_INDEX", help=f"{OPTIONS['label'].help}. *")
+@click.option("--label", multiple=True, metavar="NAME_OR_INDEX", help=f"{_help('label')}. *")
 @click.option("--suite", metavar="NAME", help="Views, networks and renderers by name: standard-1 (docs/benchmark.md).")
 @click.option("--network", "networks", multiple=True, metavar="FILE_OR_NAME", help="A network. Default: tiny. *")
 @click.option(
@@ -46,8 +53,8 @@ INTERVAL: Final = 10.0
 @click.option("--views", type=int, help="Random views and lights. Default: 60.")
 @click.option("--seed", type=int, help="Of the views. Default: 0.")
 @click.option("--epsilon", type=float, help="The budget that AFTER is said to keep, 0..1.")
-@click.option("--distance", type=float, help=f"{OPTIONS['distance'].help}.")
-@click.option("--elevation", type=(float, float), metavar="LO HI", help=f"{OPTIONS['elevation'].help}.")
+@click.option("--distance", type=float, help=f"{_help('distance')}.")
+@click.option("--elevation", type=(float, float), metavar="LO HI", help=f"{_help('elevation')}.")
 @click.option("--background", metavar="COLOUR", help="white, black or '#rrggbb'. Default: white.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Folder for the results.")
 @click.option(
