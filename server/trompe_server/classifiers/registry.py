@@ -12,7 +12,7 @@ reference                                classifier
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -26,10 +26,11 @@ from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, WEIGHTS, load_ti
 from trompe_server.classifiers.vision import load_torchvision, weights_file
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["ENDINGS", "classifier_file", "load_classifier"]
+__all__ = ["LOADERS", "classifier_file", "load_classifier"]
 
-ENDINGS: Final = (".pt2", ".onnx")
-"""Endings of classifier files."""
+LOADERS: Final[Mapping[str, Callable[..., Classifier]]] = {".pt2": load_exported, ".onnx": load_onnx}
+"""By the ending of the file."""
+
 KNOWN: Final = (
     "'tiny' (the shipped network), a .pt2 file (torch.export.save), an .onnx file (scores only) or torchvision:NAME"
 )
@@ -71,7 +72,7 @@ def classifier_file(reference: str) -> Path:
     """The file with the weights of the classifier that ``load_classifier`` loads. Raises ``ClassifierError``."""
     if reference == "tiny":
         return WEIGHTS
-    return Path(reference) if reference.endswith(ENDINGS) else weights_file(reference.rpartition(":")[2])
+    return Path(reference) if reference.endswith(tuple(LOADERS)) else weights_file(reference.rpartition(":")[2])
 
 
 def _by_bare_name(
@@ -84,11 +85,11 @@ def _by_bare_name(
 
 
 def _from_file(path: Path, name: str | None, classes: Sequence[str] | None, device: str) -> Classifier:
-    if path.suffix not in ENDINGS:
+    if path.suffix not in LOADERS:
         raise ClassifierError(f"{str(path)!r} is not a supported classifier; give {KNOWN}.")
     if not path.is_file():
         raise ClassifierError(f"There is no classifier file {str(path)!r}; check the path, or give 'tiny'.")
-    load = load_onnx if path.suffix == ".onnx" else load_exported
+    load = LOADERS[path.suffix]
     return load(path, name=name, classes=classes, device=device)
 
 

@@ -163,8 +163,8 @@ def open_setup(
     classifier = stored(spec.victim.classifier)
     framing = framing_of(obj, spec.views, shipped=info.name if info.shipped else None)
     distribution = ViewDistribution(framing.distance, framing.elevation, spec.views.ranges, centre=framing.centre)
-    drawn = partial(_drawn, spec, distribution)
-    views = _grid(spec, framing) if spec.views.grid else drawn(spec.views.count, POOL_STREAM)
+    drawn = partial(drawn_views, distribution, spec.views.background, seed=spec.search.seed)
+    views = _grid(spec, framing) if spec.views.grid else drawn(spec.views.count, stream=POOL_STREAM)
     first = _first(spec, len(views), renderers=1 + len(more_targets))
     pictures = {name: _picture(name, library) for name in spec.views.background if colour_of(name) is None}
     return JobSetup(
@@ -177,7 +177,7 @@ def open_setup(
         _within(spec, obj, library),
         views[:first],
         views[first:],
-        drawn(spec.views.held_out, HELD_OUT_STREAM),
+        drawn(spec.views.held_out, stream=HELD_OUT_STREAM),
         (
             *(_renderer(spec, each, pictures, attacked=True) for each in (target, *more_targets)),
             *(_renderer(spec, each, pictures, attacked=False) for each in judge_targets),
@@ -198,11 +198,16 @@ def _first(spec: JobSpec, count: int, *, renderers: int) -> int:
 
 
 def _renderer(spec: JobSpec, target: TargetRenderer, pictures: Mapping[str, Image8], *, attacked: bool) -> JobRenderer:
-    engine, noise = target.engine, (0, 0)
-    if not engine.deterministic:
-        own, held_out = np.random.default_rng([spec.search.seed, NOISE_STREAM]).integers(2**31, size=2).tolist()
-        noise = own, held_out
-    return JobRenderer(BackdropTarget(target, pictures) if pictures else target, engine, attacked, noise)
+    noise = noise_numbers(target.engine, spec.search.seed)
+    return JobRenderer(BackdropTarget(target, pictures) if pictures else target, target.engine, attacked, noise)
+
+
+def noise_numbers(engine: EngineInfo, seed: int) -> tuple[int, int]:
+    """Numbers of the noise in pictures of own and of held-out views; 0 for a deterministic engine."""
+    if engine.deterministic:
+        return 0, 0
+    own, held_out = np.random.default_rng([seed, NOISE_STREAM]).integers(2**31, size=2).tolist()
+    return own, held_out
 
 
 def _goal(spec: JobSpec, classifier: Classifier) -> Goal:
@@ -263,10 +268,12 @@ def _stored_classifier(reference: str, *, library: Library, device: str) -> Clas
     return load_classifier(library.classifier_path(reference), name=info.name, classes=info.classes, device=device)
 
 
-def _drawn(spec: JobSpec, distribution: ViewDistribution, count: int, stream: int) -> tuple[View, ...]:
-    """Random views of one ``stream``."""
-    generator = np.random.default_rng([spec.search.seed, stream])
-    return _before(spec.views.background, distribution.sample(count, generator=generator), generator)
+def drawn_views(
+    distribution: ViewDistribution, backgrounds: Sequence[str], count: int, *, seed: int, stream: int
+) -> tuple[View, ...]:
+    """Random views of one ``stream``, in front of colours and pictures by name."""
+    generator = np.random.default_rng([seed, stream])
+    return _before(backgrounds, distribution.sample(count, generator=generator), generator)
 
 
 def _grid(spec: JobSpec, framing: Framing) -> tuple[View, ...]:

@@ -210,7 +210,10 @@ class TextureAttack:
 
         after = self._ascend(before, steps, on_step)
         ended = after.step == total or self._ended(after)
-        self.files.save_end(after) if ended else self.files.save_state(chunk + 1, after)
+        if ended:
+            self.files.save_end(after)
+        else:
+            self.files.save_state(chunk + 1, after)
         if taken:
             self._preview(after)
             queries = (self.setup.queries or 0) - asked

@@ -14,26 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_server.attack import ViewDistribution
-from trompe_server.image_pipelines import SUITE
-from trompe_server.job.setup import HELD_OUT_STREAM, NOISE_STREAM
-from trompe_server.judgement.manifest import Judged
+from trompe_server.job.setup import HELD_OUT_STREAM, drawn_views, noise_numbers
+from trompe_server.judgement.manifest import PIPELINES, Judged
 from trompe_server.judgement.request import JudgeRequest
 from trompe_server.judgement.sources import JudgedObject, open_judge, read_judged, running
 from trompe_server.judgement.work import Kept, OnWork, Timed, key_of
 from trompe_server.judging.judge import Judge
 from trompe_server.renderers import TargetRenderer
 from trompe_server.spec.framing import Framing, framing_of
-from trompe_shared.api import AS_RENDERED, JudgedNetwork
+from trompe_shared.api import JudgedNetwork
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import ClassifierError, LabelError, RendererError, SpecError
-from trompe_shared.geometry import View, colour_of
+from trompe_shared.geometry import View
 
 __all__ = ["judge_files", "noisy", "sampled", "views_of"]
 
 SHARE: Final = 10
 """Images between two saves."""
 
-PIPELINES: Final = {AS_RENDERED: None, **SUITE}
 IMAGE_SIZE: Final = (224, 224)
 """Of the images if no network can be loaded."""
 
@@ -61,17 +59,12 @@ def views_of(request: JudgeRequest, before: JudgedObject) -> list[View]:
 def sampled(request: JudgeRequest, framing: Framing) -> list[View]:
     """The random views of a seed in a framing."""
     cameras = ViewDistribution(framing.distance, framing.elevation, centre=framing.centre)
-    drawn = cameras.sample(request.views, generator=np.random.default_rng([request.seed, HELD_OUT_STREAM]))
-    behind = colour_of(request.background)
-    assert behind is not None  # the request has checked it
-    return [replace(view, background=behind) for view in drawn]
+    return [*drawn_views(cameras, [request.background], request.views, seed=request.seed, stream=HELD_OUT_STREAM)]
 
 
 def noisy(views: Sequence[View], engine: EngineInfo, seed: int) -> Sequence[View]:
-    """``views`` with the number of their noise, as a job's held-out ones, if the engine is random."""
-    if engine.deterministic:
-        return views
-    noise = int(np.random.default_rng([seed, NOISE_STREAM]).integers(2**31, size=2)[1])
+    """``views`` with the number of their noise, as a job's held-out ones."""
+    _, noise = noise_numbers(engine, seed)
     return [replace(view, noise=noise) for view in views]
 
 

@@ -3,15 +3,16 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_server.image_pipelines import SUITE
+from trompe_server.image_pipelines import SUITE, ImagePipeline
 from trompe_server.judgement.request import JudgeRequest
 from trompe_server.judgement.sources import JudgedObject
 from trompe_server.judging.judge import Judge
-from trompe_server.judging.metrics import drop_warning, margins
+from trompe_server.judging.metrics import camera_and_light, drop_warning, margins
 from trompe_server.judging.objects import ObjectPair, texture_changes
 from trompe_server.judging.transparency import faint_warnings
 from trompe_server.judging.visibility import visibility_of
@@ -33,11 +34,12 @@ from trompe_shared.api import (
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import Camera, Light, View
 
-__all__ = ["Judged", "manifest_of", "view_of", "view_record"]
+__all__ = ["PIPELINES", "Judged", "manifest_of", "view_of", "view_record"]
 
 Images = NDArray[np.uint8]
 Logits = NDArray[np.float32]
-PIPELINES = (AS_RENDERED, *SUITE)
+PIPELINES: Final[Mapping[str, ImagePipeline | None]] = {AS_RENDERED: None, **SUITE}
+"""What happens to the images before the networks."""
 
 
 @dataclass(frozen=True)
@@ -107,20 +109,7 @@ def manifest_of(judged: Judged, request: JudgeRequest, *, seconds: float) -> Man
 
 def view_record(view: View) -> ViewRecord:
     """A view in the words of the manifest."""
-    camera, light = view.camera, view.light
-    return ViewRecord(
-        distance=camera.distance,
-        azimuth=camera.azimuth,
-        elevation=camera.elevation,
-        roll=camera.roll,
-        centre=camera.centre,
-        light_azimuth=light.azimuth,
-        light_elevation=light.elevation,
-        light_intensity=light.intensity,
-        light_ambient=light.ambient,
-        light_colour=light.colour,
-        background=view.background,
-    )
+    return ViewRecord(**camera_and_light(view), centre=view.camera.centre, background=view.background)
 
 
 def view_of(record: ViewRecord) -> View:

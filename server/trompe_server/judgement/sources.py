@@ -1,7 +1,6 @@
 """Model files, networks and renderers of a judgement, each with its hash or identity."""
 
 import contextlib
-import hashlib
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from pathlib import Path
 from trompe_server.classifiers import Classifier, classifier_file, load_classifier
 from trompe_server.formats import import_file
 from trompe_server.judging.judge import Judge
+from trompe_server.library.intake import identity_of
 from trompe_server.renderers import SailenvTarget, TargetRenderer, local_renderer
 from trompe_server.renderers.local import COMMAND
 from trompe_server.spec.labels import resolve_label
@@ -35,10 +35,12 @@ def read_judged(source: str, folder: Path) -> JudgedObject:
     """Read a model file, or a shipped object by name, for a manifest in ``folder``. Raises ``ObjectError``."""
     if source in shipped_objects() and not Path(source).exists():
         data = shipped_objects()[source].read()
-        return JudgedObject(load_object(data), HashedFile(source=source, sha256=_hash(data), bytes=len(data)), source)
+        return JudgedObject(
+            load_object(data), HashedFile(source=source, sha256=identity_of(data), bytes=len(data)), source
+        )
     name, content = model_file(Path(source))
     data = content if isinstance(content, bytes) else content.read_bytes()
-    sha256 = _hash_of_files(data) if isinstance(content, bytes) else _hash(data)
+    sha256 = _hash_of_files(data) if isinstance(content, bytes) else identity_of(data)
     file = HashedFile(source=_relative(source, folder), sha256=sha256, bytes=len(data))
     return JudgedObject(load_object(import_file(data, name=name).archive), file)
 
@@ -55,7 +57,7 @@ def open_judge(reference: str, label: Sequence[str | int], folder: Path) -> tupl
     return judge, JudgedNetwork(
         name=reference if path is None else network.name,
         reference=reference if path is None else _relative(reference, folder),
-        sha256=_hash(classifier_file(reference).read_bytes()),
+        sha256=identity_of(classifier_file(reference).read_bytes()),
         image_size=network.image_size,
         labels=list(judge.labels),
         label_names=None if names is None else [names[index] for index in judge.labels],
@@ -100,10 +102,8 @@ def _relative(source: str, folder: Path) -> str:
     return Path(os.path.relpath(Path(source).resolve(), folder.resolve())).as_posix()
 
 
-def _hash(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
-
-
 def _hash_of_files(data: bytes) -> str:
     """Hash of names and contents of the files in a zip that we packed: other packers pack other bytes."""
-    return _hash("".join(f"{_hash(content)} {name}\n" for name, content in sorted(unpack(data).items())).encode())
+    return identity_of(
+        "".join(f"{identity_of(content)} {name}\n" for name, content in sorted(unpack(data).items())).encode()
+    )

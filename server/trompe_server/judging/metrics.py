@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from statistics import NormalDist
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ __all__ = [
     "Agreement",
     "accuracy",
     "agreement",
+    "camera_and_light",
+    "difference",
     "drop_interval",
     "drop_warning",
     "fooled_as",
@@ -211,17 +213,25 @@ def _verdicts(logits: Logits, label: Label) -> list[_Verdict]:
     ]
 
 
+def camera_and_light(view: View) -> dict[str, Any]:
+    """Fields of a record of a view."""
+    camera, light = view.camera, view.light
+    return {
+        "azimuth": camera.azimuth,
+        "elevation": camera.elevation,
+        "distance": camera.distance,
+        "roll": camera.roll,
+        "light_azimuth": light.azimuth,
+        "light_elevation": light.elevation,
+        "light_intensity": light.intensity,
+        "light_ambient": light.ambient,
+        "light_colour": light.colour,
+    }
+
+
 def _prediction(view: View, before: _Verdict, after: _Verdict | _NoVerdict) -> ViewPrediction:
     return ViewPrediction(
-        azimuth=view.camera.azimuth,
-        elevation=view.camera.elevation,
-        distance=view.camera.distance,
-        light_azimuth=view.light.azimuth,
-        light_elevation=view.light.elevation,
-        roll=view.camera.roll,
-        light_intensity=view.light.intensity,
-        light_ambient=view.light.ambient,
-        light_colour=view.light.colour,
+        **camera_and_light(view),
         background=view.backdrop or f"#{bytes(view.background).hex()}",
         before=before[0],
         before_confidence=before[1],
@@ -259,17 +269,17 @@ def _changes(before: Textures, after: Textures) -> list[NDArray[np.uint8]]:
     """|change| (texels, 3) uint8 of each texture. Raises ``ValueError`` if names or sizes differ."""
     if {name: t.shape for name, t in before.items()} != {name: t.shape for name, t in after.items()}:
         raise ValueError("textures before and after must have the same names and sizes")
-    return [_difference(before[name], after[name]).reshape(-1, 3) for name in sorted(before)]
+    return [difference(before[name], after[name]).reshape(-1, 3) for name in sorted(before)]
 
 
-def _difference(a: Images, b: Images) -> Images:
+def difference(a: Images, b: Images) -> Images:
     """|a - b| of uint8 arrays, without overflow or a wider copy."""
     return np.maximum(a, b) - np.minimum(a, b)
 
 
 def max_view_change(images_before: Images, images_after: Images) -> float:
     """Largest |change| of any channel of any pixel between images (views, H, W, 3) uint8, in [0, 1] units."""
-    return int(_difference(images_before, images_after).max()) / 255
+    return int(difference(images_before, images_after).max()) / 255
 
 
 def share_beyond(
@@ -280,6 +290,6 @@ def share_beyond(
     Share of the object's ``pixels`` (views, H, W) that changed by more than ``epsilon`` ([0, 1] units), and share of
     the views with such a pixel. Both are 0.0 if there are none to count.
     """
-    beyond = (_difference(images_before, images_after) > epsilon * 255 + 1e-9).any(axis=-1) & pixels
+    beyond = (difference(images_before, images_after) > epsilon * 255 + 1e-9).any(axis=-1) & pixels
     count, views = int(pixels.sum()), len(pixels)
     return (int(beyond.sum()) / count if count else 0.0, int(beyond.any(axis=(1, 2)).sum()) / views if views else 0.0)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from trompe_server.judging.metrics import difference
 from trompe_shared.api import Finding, TextureChange, levels_within
 from trompe_shared.object3d import Material, Object3D, decode_rgb, open_image
 
@@ -71,7 +72,7 @@ class ObjectPair:
 
     def findings(self) -> list[Finding]:
         """Differences other than of the albedo's colours, each in one sentence."""
-        return list(self._shape()) or [*self._layout(), *self._shading(), *self._maps(), *self._sizes()]
+        return self._shape or [*self._layout(), *self._shading(), *self._maps(), *self._sizes()]
 
     @cached_property
     def textures(self) -> tuple[Textures, Textures]:
@@ -88,24 +89,24 @@ class ObjectPair:
     def _new(self) -> _Triangles:
         return _Triangles.of(self.after, self.before.sphere[1])
 
-    def _shape(self) -> Iterator[Finding]:
+    @cached_property
+    def _shape(self) -> list[Finding]:
+        """Why the two are not one shape; empty if they are."""
         old, new = self._old, self._new
         if len(old) != len(new):
-            yield Finding(
-                kind="object",
-                text=f"These are not one object: the first has {len(old)} triangles, the second {len(new)}. Textures "
-                "are not compared.",
-            )
-            return
+            text = f"These are not one object: the first has {len(old)} triangles, the second {len(new)}. "
+            return [Finding(kind="object", text=f"{text}Textures are not compared.")]
         places, _ = _matched(old.corners, new.corners)
         back, _ = _matched(new.corners, old.corners)
-        if moved := max(int((places < 0).sum()), int((back < 0).sum())):
-            distance = 1000 * self.before.sphere[1] * _farthest(old.corners, new.corners)
-            yield Finding(
-                kind="geometry",
-                text=f"The geometry moved: {moved} of {len(new)} triangles are not where the first object has them, "
-                f"by up to {distance:.3g} mm. A repaint keeps the mesh; textures are not compared.",
-            )
+        moved = max(int((places < 0).sum()), int((back < 0).sum()))
+        if not moved:
+            return []
+        distance = 1000 * self.before.sphere[1] * _farthest(old.corners, new.corners)
+        text = (
+            f"The geometry moved: {moved} of {len(new)} triangles are not where the first object has them, "
+            f"by up to {distance:.3g} mm. A repaint keeps the mesh; textures are not compared."
+        )
+        return [Finding(kind="geometry", text=text)]
 
     @cached_property
     def _places(self) -> tuple[Int[np.ndarray, " F"], Int[np.ndarray, " F"]]:
@@ -143,7 +144,7 @@ class ObjectPair:
     def _albedos(self) -> list[tuple[str, str]]:
         """Albedo textures of matched triangles, before and after; without those that have several partners, or that
         triangles with other coordinates show."""
-        if list(self._shape()):
+        if self._shape:
             return []
         pairs = list(
             dict.fromkeys(
@@ -192,7 +193,7 @@ def texture_changes(before: Textures, after: Textures, *, epsilon: float | None)
 
 
 def _texture_change(name: str, before: Texture, after: Texture, epsilon: float | None) -> TextureChange:
-    change = np.abs(after.astype(np.int16) - before).max(axis=2)
+    change = difference(before, after).max(axis=2)
     altered = change > 0
     beyond = None if epsilon is None else int((change > levels_within(epsilon)).sum())
     return TextureChange(
@@ -255,5 +256,5 @@ def _differ(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
         one, other = (each[:1, :1] if not np.ptp(each, axis=(0, 1)).any() else each for each in (one, other))
         if one.shape != other.shape and 1 not in (one.shape[0], other.shape[0]):
             return True
-    worst: Bool[np.ndarray, ""] = np.abs(one.astype(np.int16) - other).max() > LEVELS
+    worst: Bool[np.ndarray, ""] = difference(one, other).max() > LEVELS
     return bool(worst)

@@ -7,19 +7,15 @@ from typing import Final
 from trompe_server.system.sandbox import run_limited
 from trompe_shared.api import ClassifierInfo
 from trompe_shared.errors import ClassifierError
+from trompe_shared.local_files import LOOKED_UP
 
 __all__ = [
-    "CLASSIFIER_ENDINGS",
-    "TORCHVISION",
     "Inspect",
     "check_classes",
     "inspect_classifier",
     "torchvision_classifier",
 ]
 
-CLASSIFIER_ENDINGS: Final = frozenset({".pt2", ".onnx"})
-TORCHVISION: Final = "torchvision:"
-"""Prefix of the names of torchvision's classifiers."""
 _SECONDS: Final = 300.0
 _MEMORY: Final = 8 * 2**30
 """Bytes of address space; networks for ImageNet take less than half."""
@@ -37,7 +33,7 @@ def inspect_classifier(path_or_name: str) -> dict[str, object]:
 @cache
 def torchvision_classifier(reference: str) -> ClassifierInfo:
     """The classifier ``torchvision:NAME``. Raises ``ClassifierError`` if torchvision has no such one."""
-    name = reference.removeprefix(TORCHVISION)
+    name = reference.removeprefix(LOOKED_UP)
     return ClassifierInfo.model_validate(inspect_classifier(reference) | {"id": reference, "name": name})
 
 

@@ -9,8 +9,6 @@ from typing import BinaryIO, Final
 from trompe_server.formats import import_file
 from trompe_server.library.catalogue import Catalogue
 from trompe_server.library.inspection import (
-    CLASSIFIER_ENDINGS,
-    TORCHVISION,
     Inspect,
     check_classes,
     inspect_classifier,
@@ -22,6 +20,7 @@ from trompe_server.storage.folders import Folder, LocalArtifacts
 from trompe_server.system.files import write_whole
 from trompe_shared.api import BackgroundInfo, ClassifierInfo, ObjectInfo
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
+from trompe_shared.local_files import CLASSIFIER_SUFFIXES, LOOKED_UP
 from trompe_shared.object3d import decode_rgb
 from trompe_shared.shipped import shipped_objects
 
@@ -108,13 +107,13 @@ class Library:
 
         Raises ``NotFoundError``, ``AmbiguousError``, or ``ClassifierError`` if torchvision has no such one.
         """
-        if reference.startswith(TORCHVISION):
+        if reference.startswith(LOOKED_UP):
             return torchvision_classifier(reference)
         return self._classifiers.find(reference)
 
     def classifier_path(self, reference: str) -> str:
         """Argument for ``load_classifier``: the path of an upload, or the name of any other classifier."""
-        if reference.startswith(TORCHVISION):
+        if reference.startswith(LOOKED_UP):
             return reference
         info = self.classifier(reference)
         if info.shipped:
@@ -141,7 +140,7 @@ class Library:
         Raises ``ClassifierError`` for an invalid file and stores nothing then.
         """
         suffix = Path(filename).suffix.lower()
-        if suffix not in CLASSIFIER_ENDINGS:
+        if suffix not in CLASSIFIER_SUFFIXES:
             raise ClassifierError(
                 f"{filename!r} is not a supported classifier: upload a .pt2 (torch.export) or .onnx file."
             )

@@ -7,6 +7,7 @@ from typing import Final
 
 from markupsafe import Markup
 
+from trompe_server.pages.chart import COLOURS
 from trompe_server.pages.serving import STATIC, render
 from trompe_shared.api import Accuracy, Cell, Manifest
 
@@ -15,7 +16,6 @@ __all__ = ["judgement_page", "shares_in_words"]
 LEFT, RIGHT, TOP, BOTTOM = 50.0, 700.0, 15.0, 250.0
 SPREAD: Final = 8.0
 """Distance of the points of one image pipeline."""
-COLOURS: Final = 8
 
 
 @dataclass(frozen=True)

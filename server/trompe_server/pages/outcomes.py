@@ -21,11 +21,6 @@ class Outcome:
     drop: float | None
     unseen: bool
 
-    @property
-    def bar(self) -> float:
-        """Length of the drop's bar, of 60."""
-        return round(60 * max(0.0, self.drop or 0.0), 1)
-
 
 class Outcomes:
     """Outcomes of ended jobs by the files of the job; results never change. Thread-safe."""

@@ -60,8 +60,6 @@ MEASURES: Final = {
     "probe_renders": "Probe renders",
 }
 SHARES: Final = {"disagreement", "texels_altered"}
-BAR: Final = 120
-"""Length of the bar of a drop of 1, in SVG units."""
 PICTURES: Final = {
     "textures.png": "The texture: before, after, and the difference",
     "saliency_object.png": "Saliency on the object",
@@ -279,17 +277,9 @@ def _accuracies(result: Result) -> Iterable[dict[str, Any]]:
                 "name": name,
                 "views": accuracy.counted,
                 "cells": [*map(_share, shares), ends],
-                "bar": _bar(accuracy),
+                "drop": accuracy.a_drop,
+                "ends": interval,
             }
-
-
-def _bar(accuracy: Accuracy) -> dict[str, float] | None:
-    """A drop and the ends of its interval as lengths; ``None`` if no view was recognised before."""
-    if accuracy.a_drop is None:
-        return None
-    low, high = accuracy.a_drop_interval or (accuracy.a_drop, accuracy.a_drop)
-    ends = {"drop": accuracy.a_drop, "low": low, "high": high}
-    return {name: round(BAR * min(1.0, max(0.0, value)), 1) for name, value in ends.items()}
 
 
 def _share(value: float | None) -> str:

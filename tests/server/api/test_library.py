@@ -11,7 +11,7 @@ import pytest
 
 from tests.server.api.conftest import CLASSES, GIF, Api
 from trompe_server.api.library import UPLOADS
-from trompe_server.classifiers.registry import ENDINGS
+from trompe_server.classifiers.registry import LOADERS
 from trompe_server.library import Library
 from trompe_shared.api import ObjectInfo
 from trompe_shared.local_files import CLASSIFIER_SUFFIXES
@@ -91,7 +91,7 @@ def test_an_upload_over_the_limit_is_refused_however_it_comes(api: Api) -> None:
 
 
 def test_the_client_uploads_the_files_that_classifiers_are_read_from() -> None:
-    assert set(CLASSIFIER_SUFFIXES) == set(ENDINGS)
+    assert set(CLASSIFIER_SUFFIXES) == set(LOADERS)
 
 
 def test_shipped_things_are_named_by_name(stocked: Api, triangle_zip: Callable[..., bytes]) -> None:
