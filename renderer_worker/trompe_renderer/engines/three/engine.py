@@ -31,10 +31,12 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError
 from trompe_shared.geometry import FIELD_OF_VIEW
 from trompe_shared.opacity import CUTOFF
+from trompe_shared.three import FOLDER, LIGHTS, THREE
 
 __all__ = ["ThreeEngine", "ThreeOptions"]
 
-FOLDER: Final = Path(__file__).parent
+SCRIPTS: Final = {"page.js": Path(__file__).parent, THREE: FOLDER, LIGHTS: FOLDER}
+"""Folders of the scripts by name."""
 ORIGIN: Final = "http://three.invalid"
 PAGE: Final = '<script type="module" src="page.js"></script>'
 START_LIMIT: Final = 60_000
@@ -150,12 +152,12 @@ def _page() -> Page:
 
 
 def _answer(route: Route) -> None:
-    """Serve the files of this folder and nothing else."""
+    """Serve the scripts and nothing else."""
     path = route.request.url.removeprefix(f"{ORIGIN}/")
     if not path:
         route.fulfill(body=PAGE, content_type="text/html")
-    elif path in {"page.js", "vendor/three.module.min.js"}:
-        route.fulfill(path=FOLDER / path, content_type="text/javascript")
+    elif path in SCRIPTS:
+        route.fulfill(path=SCRIPTS[path] / path, content_type="text/javascript")
     else:
         route.abort()
 

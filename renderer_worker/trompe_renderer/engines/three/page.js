@@ -1,5 +1,6 @@
 // One picture at a time for engine.py: meshes and textures by key, then `draw`. Matrices are column-major.
-import * as THREE from "./vendor/three.module.min.js";
+import { aimSun, setAmbient, setLight } from "./lights.js";
+import * as THREE from "./three.module.min.js";
 
 const meshes = new Map(), textures = new Map(), slots = [];
 const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera();
@@ -100,27 +101,17 @@ function light(lights, number, make, item) {
   const each = lights[number];
   each.visible = !!item;
   if (!item) return each;
-  each.color.setRGB(...item.color, THREE.LinearSRGBColorSpace);
-  each.intensity = Math.PI * item.intensity;
+  setLight(each, item);
   return each;
 }
 
 function shine(world) {
-  ambient.color.setRGB(...world.ambient, THREE.LinearSRGBColorSpace);
-  ambient.intensity = Math.PI;
+  setAmbient(ambient, world.ambient);
   for (let number = 0; number < Math.max(suns.length, world.suns.length); number++) {
     const item = world.suns[number], sun = light(suns, number, () => new THREE.DirectionalLight(), item);
     if (!item) continue;
-    sun.target.position.copy(ball.center);
-    sun.position.fromArray(item.towards).multiplyScalar(2 * ball.radius).add(ball.center);
+    aimSun(sun, item.towards, ball);
     sun.castShadow = options.shadows;
-    const box = sun.shadow.camera;
-    [box.left, box.bottom, box.right, box.top] = [-1, -1, 1, 1].map(side => 1.01 * side * ball.radius);
-    [box.near, box.far] = [0.9 * ball.radius, 3.1 * ball.radius];
-    box.updateProjectionMatrix();
-    sun.shadow.mapSize.set(1024, 1024);
-    sun.shadow.normalBias = 0.01 * ball.radius;
-    sun.shadow.bias = -0.002;
   }
   for (let number = 0; number < Math.max(lamps.length, world.lamps.length); number++) {
     const item = world.lamps[number], lamp = light(lamps, number, () => new THREE.PointLight(), item);
