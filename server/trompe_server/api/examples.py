@@ -117,6 +117,12 @@ CLASSIFIER: Final = _json(_CLASSIFIER)
 CLASSIFIER_LIST: Final = _json([_CLASSIFIER])
 BACKGROUND: Final = _json(_BACKGROUND)
 BACKGROUND_LIST: Final = _json([_BACKGROUND])
+CLASSIFICATIONS: Final = _json(
+    [
+        {"index": 5, "name": "mug", "confidence": 0.97, "true_confidence": 0.97, "correct": True},
+        {"index": 1, "name": "bottle", "confidence": 0.81, "true_confidence": 0.09, "correct": False},
+    ]
+)
 WORKER_LIST: Final = _json([_WORKER])
 RENDERER_LIST: Final = _json(
     [{"address": "127.0.0.1:8085", "alive": True, "engine": "pyrender", "version": "0.1.45", "settings": ""}]

@@ -6,14 +6,16 @@ from typing import Final
 
 from fastapi import FastAPI
 
-from trompe_server.api import experiments, fleet, health, jobs, library, metrics
+from trompe_server.api import classify, experiments, fleet, health, jobs, library, metrics
 from trompe_server.api.contract import contract
 from trompe_server.api.downloads import Digests
 from trompe_server.api.guard import Guard
 from trompe_server.api.metrics import HttpMetrics
 from trompe_server.api.middleware import BodyLimit, Envelope, Failures
 from trompe_server.api.problems import answer_with_problems
+from trompe_server.api.rate import RateLimit
 from trompe_server.api.services import Services
+from trompe_server.library.classification import Networks
 from trompe_server.pages import add_pages
 
 __all__ = ["create_app"]
@@ -24,6 +26,7 @@ each response carries `X-Request-ID`. If the server has tokens, send `Authorizat
 
 ROUTERS: Final = (
     library.router,
+    classify.router,
     jobs.router,
     experiments.router,
     fleet.router,
@@ -37,6 +40,7 @@ def create_app(services: Services) -> FastAPI:
     app = FastAPI(title="Trompe", version=version("trompe"), description=DESCRIPTION, docs_url=None, redoc_url=None)
     app.state.services, app.state.metrics, app.state.digests = services, HttpMetrics(), Digests()
     app.state.uploads = asyncio.Semaphore(library.UPLOADS)
+    app.state.networks, app.state.classifications = Networks(), RateLimit(classify.RATE)
     _wrap(app, services)
     answer_with_problems(app)
     for router in ROUTERS:

@@ -20,7 +20,7 @@ from typing import IO, Any, Final
 
 from trompe_shared.errors import TrompeError
 
-__all__ = ["run_limited"]
+__all__ = ["run_limited", "start_limited"]
 
 MAX_FILE: Final = 2**29
 """Largest file the process may write, in bytes; its standard output counts as a file."""
@@ -39,17 +39,8 @@ def run_limited(
 
     Raises ``failure`` with the refusal of the process, or with the cause of its end. Kills all of its children.
     """
-    limits = [str(memory), str(math.ceil(seconds))]
-    command = [sys.executable, "-m", "trompe_server.system.sandbox", *limits, module, *arguments]
     with tempfile.TemporaryFile() as out:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=out,
-            stderr=subprocess.DEVNULL,
-            env=_environment(),
-            start_new_session=True,
-        )
+        process = start_limited(module, arguments, memory=memory, seconds=seconds, stdin=subprocess.DEVNULL, stdout=out)
         try:
             code = process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -64,6 +55,27 @@ def run_limited(
     if code == 0 and answer:
         return answer
     raise failure(_ended(code, memory, seconds))
+
+
+def start_limited(
+    module: str,
+    arguments: Sequence[str] = (),
+    *,
+    memory: int,
+    seconds: float,
+    stdin: int = subprocess.PIPE,
+    stdout: int | IO[bytes] = subprocess.PIPE,
+) -> subprocess.Popen[bytes]:
+    """Start ``python -m module arguments`` with ``memory`` bytes of address space and ``seconds`` of CPU time."""
+    limits = [str(memory), str(math.ceil(seconds))]
+    return subprocess.Popen(
+        [sys.executable, "-m", "trompe_server.system.sandbox", *limits, module, *arguments],
+        stdin=stdin,
+        stdout=stdout,
+        stderr=subprocess.DEVNULL,
+        env=_environment(),
+        start_new_session=True,
+    )
 
 
 def _environment() -> dict[str, str]:

@@ -87,6 +87,16 @@ class ViewPrediction(Schema):
     fidelity: Annotated[ViewFidelity | None, Field(description="of attacked views whose image changed")] = None
 
 
+class Classification(Schema):
+    """A classifier's answer to one image; probabilities in [0, 1]."""
+
+    index: int = Field(description="the most probable class")
+    name: str | None = Field(description="its name, if known")
+    confidence: float = Field(description="its probability")
+    true_confidence: float = Field(description="probability of the object's classes together")
+    correct: bool = Field(description="whether the most probable class is one of the object's")
+
+
 class Judgement(Schema):
     """Accuracies of another classifier on the same target images."""
 
