@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 from urllib.parse import quote
 
 from playwright.sync_api import Page, sync_playwright
@@ -19,8 +19,21 @@ from playwright.sync_api import Page, sync_playwright
 from trompe_client import Client
 
 OUT: Final = Path(__file__).parents[1] / "docs" / "images" / "pages"
-FLAGS: Final = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
-WIDTH, HEIGHT = 1100, 1250
+FLAGS: Final = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-background-networking",
+    "--disable-component-update",
+]
+HEIGHT: Final = 1250
+LOOKS: Final[Mapping[str, tuple[int, Literal["light", "dark"]]]] = {
+    "": (1100, "light"),
+    "-dark": (1100, "dark"),
+    "-phone": (390, "light"),
+}
+"""Ending of the file: width in pixels and colours."""
 
 
 def main() -> None:
@@ -34,11 +47,10 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-        for scheme in ("light", "dark"):
-            page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme=scheme)
+        for look, (width, scheme) in LOOKS.items():
+            page = browser.new_page(viewport={"width": width, "height": HEIGHT}, color_scheme=scheme)
             for name, path in pages(options.server).items():
-                if scheme == "light" or name == "result":
-                    shoot(page, options.server + path, options.out / f"{name}{'-dark' if scheme == 'dark' else ''}.png")
+                shoot(page, options.server + path, options.out / f"{name}{look}.png")
         browser.close()
 
 
@@ -50,7 +62,7 @@ def pages(server: str) -> Mapping[str, str]:
         sys.exit("The server needs two jobs that succeeded; submit some with trompe attack.")
     experiments = {job.labels["experiment"] for job in done if "experiment" in job.labels}
     grid = {"experiment": f"/experiments/{quote(experiments.pop())}"} if experiments else {}
-    compared = f"/jobs/compare?a={done[0].id}&b={done[1].id}"
+    compared = f"/jobs/compare?job={done[0].id}&job={done[1].id}"
     return {
         "start": "/",
         "new": "/jobs/new",
@@ -62,9 +74,15 @@ def pages(server: str) -> Mapping[str, str]:
 
 
 def shoot(page: Page, address: str, file: Path) -> None:
-    """Save a picture of the page at ``address``, two seconds after it was opened."""
+    """Save a picture of the page at ``address``, two seconds after it was opened; of a result also its 3D view."""
     page.goto(address)
+    start = page.get_by_role("button", name="Show it in 3D")
+    if start.is_visible():
+        start.click()
+        page.wait_for_selector("trompe-orbit[data-answered]")
+        page.locator("trompe-orbit").screenshot(path=file.with_stem(f"{file.stem}-3d"))
     page.wait_for_timeout(2000)
+    page.evaluate("scrollTo(0, 0)")
     page.screenshot(path=file)
     print(file)
 

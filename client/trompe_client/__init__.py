@@ -22,6 +22,7 @@ from trompe_client._errors import (
 )
 from trompe_client._job import AsyncJobHandle, JobHandle
 from trompe_client._many import Attack, Outcome
+from trompe_client._page import ResultPage
 from trompe_client._retry import Retries
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "JobHandle",
     "NotFound",
     "Outcome",
+    "ResultPage",
     "Retries",
     "ServerFault",
     "ServerUnreachable",

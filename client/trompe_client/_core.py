@@ -134,6 +134,11 @@ def artifact(job_id: str, name: str) -> Request[bytes]:
     return _file(job_id, f"artifacts/{quote(name)}")
 
 
+def page(job_id: str) -> Request[str]:
+    path = f"/jobs/{quote(job_id, safe='')}/result.html"
+    return Request("GET", path, lambda body: body.decode(), job_id=job_id)
+
+
 def archive(job_id: str) -> Request[bytes]:
     return _file(job_id, "archive")
 

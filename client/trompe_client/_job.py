@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Self
 from trompe_client import _core
 from trompe_client._following import Followed, follow, wait
 from trompe_client._operations import send
+from trompe_client._page import ResultPage
 from trompe_client._port import Port, blocking, finish, iterate
 from trompe_client._progress import Progress, shown
 from trompe_client._transfer import fetch, fetch_all
@@ -53,6 +54,13 @@ class AsyncJobHandle(_Handle):
         self.status, paths = await fetch_all(self._port, self.id, Path(folder))
         return paths
 
+    async def show(self) -> ResultPage:
+        """The result as one page: a notebook shows it, and ``.html`` opens from a file without a network.
+
+        Raises ``NotFound`` before there is a result.
+        """
+        return ResultPage(await send(self._port, _core.page(self.id)))
+
     async def archive(self, path: str | Path) -> Path:
         """Download all artifacts as one zip file."""
         return await fetch(self._port, _core.archive(self.id), Path(path))
@@ -88,6 +96,7 @@ class JobHandle(_Handle):
     refresh = blocking(AsyncJobHandle.refresh)
     result = blocking(AsyncJobHandle.result)
     download = blocking(AsyncJobHandle.download)
+    show = blocking(AsyncJobHandle.show)
     archive = blocking(AsyncJobHandle.archive)
     cancel = blocking(AsyncJobHandle.cancel)
     delete = blocking(AsyncJobHandle.delete)

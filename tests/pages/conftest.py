@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +13,9 @@ from trompe_client import Client
 
 FLAGS = [
     "--no-sandbox",
-    "--disable-gpu",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
@@ -49,6 +52,19 @@ class Service(Served):
         with self.client() as client:
             client.job(job).wait(timeout=480)
         return job
+
+
+def drop(page: Page, file: Path) -> None:
+    """Drop a file on the form, as a hand does."""
+    transfer = page.evaluate_handle(
+        """([name, bytes]) => {
+            const transfer = new DataTransfer();
+            transfer.items.add(new File([new Uint8Array(bytes)], name));
+            return transfer;
+        }""",
+        [file.name, list(file.read_bytes())],
+    )
+    page.dispatch_event("#drop", "drop", {"dataTransfer": transfer})
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +116,7 @@ def page(context: BrowserContext, faults: list[str]) -> Iterator[Page]:
             faults.append(message.text)
 
     def on_request(request: Request) -> None:
-        if not request.url.startswith(("http://127.0.0.1:", "blob:")):
+        if not request.url.startswith(("http://127.0.0.1:", "blob:", "data:", "file:")):
             faults.append(f"asked {request.url}")
 
     page.on("console", on_console)

@@ -12,11 +12,10 @@ from typing import Any
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, BrowserContext, Page, Response, expect
+from playwright.sync_api import Browser, Page, Response, expect
 
-from tests.pages.conftest import LIMIT, Service
+from tests.pages.conftest import LIMIT, Service, drop
 from trompe_shared.api import OPTIONS
-from trompe_shared.shipped import shipped_objects
 
 pytestmark = pytest.mark.timeout(1200)
 
@@ -25,19 +24,6 @@ pytestmark = pytest.mark.timeout(1200)
 def done(service: Service) -> str:
     """A job that has ended well, in an experiment."""
     return service.finished(labels={"experiment": "tries"})
-
-
-def drop(page: Page, file: Path) -> None:
-    """Drop a file on the form, as a hand does."""
-    transfer = page.evaluate_handle(
-        """([name, bytes]) => {
-            const transfer = new DataTransfer();
-            transfer.items.add(new File([new Uint8Array(bytes)], name));
-            return transfer;
-        }""",
-        [file.name, list(file.read_bytes())],
-    )
-    page.dispatch_event("#drop", "drop", {"dataTransfer": transfer})
 
 
 def test_the_start_page_shows_an_example_before_there_is_any_job(service: Service, page: Page) -> None:
@@ -52,27 +38,6 @@ def test_the_start_page_shows_an_example_before_there_is_any_job(service: Servic
             "image => image.decode().then(() => image.naturalWidth)"
         )
     assert sum(len(each.body()) for each in responses if "stream" not in each.url) < 200_000
-
-
-def test_a_file_is_dropped_watched_and_its_result_opened(
-    service: Service, page: Page, tmp_path: Path, context: BrowserContext
-) -> None:
-    file = tmp_path / "my_teapot.zip"
-    file.write_bytes(shipped_objects()["teapot"].read())
-    page.goto(f"{service.url}/jobs/new")
-
-    drop(page, file)
-    expect(page.locator("#file-says")).to_contain_text("triangles")
-    expect(page.locator(".turntable")).to_be_visible()
-    page.fill("[name='goal.label']", "teapot")
-    page.check("[name=preset][value=fast]")
-    page.get_by_role("button", name="Submit").click()
-    page.wait_for_url(re.compile(r"/jobs/[0-9a-f]+$"))
-
-    expect(page.locator("[data-field=step]")).to_contain_text("of")
-    page.reload()
-    expect(page.get_by_role("heading", name="What the classifier sees")).to_be_visible(timeout=600_000)
-    assert "my_teapot" in page.inner_text("h1")
 
 
 def test_a_wrong_file_and_a_wrong_class_are_told_in_the_servers_words(
@@ -226,13 +191,30 @@ def test_a_new_job_appears_in_the_list_by_itself(service: Service, page: Page, d
     expect(page.locator(f"#job-{job} .state")).to_have_text("succeeded", timeout=600_000)
 
 
+def test_the_list_is_sorted_and_filtered(service: Service, page: Page, done: str) -> None:
+    for epsilon in (0.2, 0.1):
+        service.finished(epsilon=epsilon, steps=1)
+    page.goto(f"{service.url}/jobs")
+    epsilons = page.locator("tbody tr:visible td:nth-child(4)")
+    for order in (sorted, lambda found: sorted(found, reverse=True)):
+        page.get_by_role("button", name="Epsilon").click()
+        found = [float(text) for text in epsilons.all_inner_texts()]
+        assert len(set(found)) > 2
+        assert found == order(found)
+
+    page.get_by_label("Find on this page").fill("no such object")
+    expect(epsilons).to_have_count(0)
+    page.get_by_label("Find on this page").fill("MUG")
+    expect(epsilons).not_to_have_count(0)
+
+
 def test_two_jobs_are_compared(service: Service, page: Page, done: str) -> None:
     other = service.finished(epsilon=0.2)
     page.goto(f"{service.url}/jobs")
 
     for job in (done, other):
         page.locator(f"#job-{job}").get_by_role("checkbox").check()
-    page.get_by_role("link", name="Compare the two").click()
+    page.get_by_role("link", name="Compare these 2").click()
 
     differing = page.locator("tr.differs th").all_inner_texts()
     assert "epsilon" in differing
@@ -267,7 +249,7 @@ def test_no_serious_fault_of_accessibility(service: Service, browser: Browser, d
         "/jobs",
         "/jobs/new",
         f"/jobs/{done}",
-        f"/jobs/compare?a={done}&b={done}",
+        f"/jobs/compare?job={done}&job={done}",
         "/experiments/tries",
         "/docs",
         "/login",
@@ -295,6 +277,13 @@ def test_a_server_that_restarts_in_mid_job_is_waited_for(service: Service, page:
     page.goto(f"{service.url}/jobs/{job}")
     expect(page.locator("[data-field=step]")).to_contain_text("of")
 
+    for name in ("loss", "fooled"):
+        curve = page.locator(f"[data-curve={name}]")
+        expect(curve).to_be_visible()
+        points = curve.locator("polyline").get_attribute("points")
+        assert points is not None
+        steps = [float(each.split(",")[0]) for each in points.split()]
+        assert steps == sorted(steps)
     expect(page.locator("#preview img")).to_be_visible()
     assert page.locator("#preview img").evaluate("image => image.naturalWidth / image.naturalHeight") == 2
 

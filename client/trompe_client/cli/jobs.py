@@ -99,10 +99,14 @@ def watch(client: Client, job: str, timeout: float | None) -> None:
 @click.command()
 @_job
 @out_option(required=False, help="Folder for the results. Default: print the table only.")
+@click.option("--html", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Write one HTML page.")
 @with_client
-def report(client: Client, job: str, out: Path | None) -> None:
-    """Print the table of JOB and download its results."""
-    deliver(client.job(job), out)
+def report(client: Client, job: str, out: Path | None, html: Path | None) -> None:
+    """Print the table of JOB and download its results. The HTML page opens without a network."""
+    handle = client.job(job)
+    if html is not None:
+        html.write_text(handle.show().html, encoding="utf-8")
+    deliver(handle, out)
 
 
 def _say_states(found: list[Job]) -> None:

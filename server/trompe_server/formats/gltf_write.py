@@ -22,7 +22,10 @@ Json = dict[str, Any]
 
 
 def write_glb(obj: Object3D) -> bytes:
-    """``obj`` as GLB 2.0: one mesh, a primitive for each part, all images inside."""
+    """``obj`` as GLB 2.0: one mesh, a primitive for each part, all images inside.
+
+    ``extras.centre`` of its scene is the middle of the bounding sphere (x, y, z), metres, at which cameras look.
+    """
     writer = _Writer(obj)
     document = writer.document()
     return glb(json.dumps(document, separators=(",", ":")).encode(), [(BIN_CHUNK, bytes(writer.binary))])
@@ -44,7 +47,7 @@ class _Writer:
         return {
             "asset": {"version": "2.0", "generator": "trompe"},
             "scene": 0,
-            "scenes": [{"nodes": [0]}],
+            "scenes": [{"nodes": [0], "extras": {"centre": self._obj.sphere[0]}}],
             "nodes": [{"mesh": 0, "name": self._obj.name}],
             "meshes": [{"name": self._obj.name, "primitives": primitives}],
             "samplers": [TRILINEAR],

@@ -12,6 +12,7 @@ from trompe_shared.api import JobState, Progress
 from trompe_shared.errors import TrompeError
 
 __all__ = [
+    "SAILENV",
     "THUMBNAIL",
     "VIEWS_AFTER",
     "VIEWS_BEFORE",
@@ -26,6 +27,9 @@ __all__ = [
 
 VIEWS_BEFORE, VIEWS_AFTER = "views_before", "views_after"
 """Names of the arrays (``.npz``) with all target images, ``own`` and ``held_out``: (views, H, W, 3) uint8."""
+
+SAILENV = ".sailenv.zip"
+"""Ending of the repainted object as SAILenv's zip, if the upload is a zip in another format."""
 
 THUMBNAIL = "thumbnail.png"
 """Name of a small picture of one view, before on the left and after on the right."""

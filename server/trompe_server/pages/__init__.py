@@ -8,6 +8,7 @@ from trompe_server.pages.outcomes import Outcomes
 from trompe_server.pages.pictures import Pictures
 from trompe_server.pages.routes import router
 from trompe_server.pages.serving import STATIC
+from trompe_shared.three import FOLDER
 
 __all__ = ["add_pages"]
 
@@ -16,5 +17,6 @@ def add_pages(app: FastAPI) -> None:
     """Add the pages to ``app``, which serves the API. Problem details become pages for browsers."""
     app.state.pictures, app.state.outcomes = Pictures(), Outcomes()
     app.include_router(router)
+    app.mount("/static/three", StaticFiles(directory=FOLDER), name="three")
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     app.add_middleware(HtmlProblems)

@@ -24,7 +24,7 @@ AMPLIFIED: Final = 10
 JOBS: Final = 4
 """Image files in memory, each of some tens of MiB."""
 
-Images = NDArray[np.uint8]
+Image8 = NDArray[np.uint8]
 
 
 class Pictures:
@@ -36,15 +36,17 @@ class Pictures:
     def one(self, artifacts: JobArtifacts, view_set: ViewSet, index: int, kind: Kind) -> bytes:
         """One image as PNG. Raises ``FileNotFoundError`` or ``IndexError``."""
         if kind != "difference":
-            return encode_png(self._images(artifacts, kind, view_set)[index])
-        before = self._images(artifacts, "before", view_set)[index].astype(np.int16)
-        change = self._images(artifacts, "after", view_set)[index] - before
+            return encode_png(self.image(artifacts, view_set, index, kind))
+        before = self.image(artifacts, view_set, index, "before").astype(np.int16)
+        change = self.image(artifacts, view_set, index, "after") - before
         return encode_png((128 + AMPLIFIED * change).clip(0, 255).astype(np.uint8))
 
-    def _images(self, artifacts: JobArtifacts, kind: Kind, view_set: ViewSet) -> Images:
+    def image(self, artifacts: JobArtifacts, view_set: ViewSet, index: int, kind: Kind) -> Image8:
+        """One image (H, W, 3) uint8, not the difference. Raises as ``one``."""
         name, _, renderer = view_set.partition("-")
-        return self._load(artifacts, f"{numbered(FILES[kind], int(renderer or 0))}.npz")[name]
+        image: Image8 = self._load(artifacts, f"{numbered(FILES[kind], int(renderer or 0))}.npz")[name][index]
+        return image
 
 
-def _load(artifacts: JobArtifacts, name: str) -> dict[str, Images]:
+def _load(artifacts: JobArtifacts, name: str) -> dict[str, Image8]:
     return unpack_arrays(artifacts.read(name))

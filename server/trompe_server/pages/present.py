@@ -30,6 +30,7 @@ __all__ = [
     "differences",
     "job_row",
     "present",
+    "span",
     "value_text",
     "viewer_record",
 ]
@@ -238,15 +239,22 @@ def _views(views: Sequence[ViewPrediction], result: Result, names: ClassNames, p
 def viewer_record(view: ViewPrediction, labels: Sequence[int], names: ClassNames, place: str) -> dict[str, Any]:
     """One view for the viewer; the addresses of its pictures begin with ``place``."""
     attacked, known = view.after is not None, view.before in labels
-    after, confidence = (view.after, view.after_confidence) if attacked else (view.before, view.before_confidence)
+    after, confidence, truth = (
+        (view.after, view.after_confidence, view.after_true_confidence)
+        if attacked
+        else (view.before, view.before_confidence, view.before_true_confidence)
+    )
     assert after is not None
     assert confidence is not None
+    assert truth is not None
     return {
         "before": f"{place}/before.png",
         "after": f"{place}/{'after' if attacked else 'before'}.png",
         "difference": f"{place}/difference.png" if attacked else None,
         "says_before": f"{names(view.before)} {view.before_confidence:.0%}",
         "says_after": f"{names(after)} {confidence:.0%}",
+        "truth_before": f"{view.before_true_confidence:.0%}",
+        "truth_after": f"{truth:.0%}",
         "kept_before": known,
         "kept_after": after in labels,
         "fate": "kept" if after in labels else "fooled" if known else "never",
@@ -330,7 +338,7 @@ def _word(value: Any) -> str:
 
 
 def differences(asked: Sequence[Mapping[str, Any]], results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Options and results of two jobs, as rows of a table."""
+    """Options and results of several jobs, as rows of a table."""
     lines = [{"name": name, "cells": [value_text(options[name]) for options in asked]} for name in asked[0]]
     for field, title in {"target": "target", "held_out": "held-out"}.items():
         judged: list[Accuracy | None] = [getattr(side, field) for side in results]
@@ -340,7 +348,7 @@ def differences(asked: Sequence[Mapping[str, Any]], results: Sequence[Result]) -
         lines.append({"name": name, "cells": [value_text(getattr(side, field)) for side in results]})
     seconds = [sum(side.seconds.values()) for side in results]
     lines.append({"name": "seconds", "cells": [f"{took:.1f}" for took in seconds]})
-    return [line | {"differs": line["cells"][0] != line["cells"][1]} for line in lines]
+    return [line | {"differs": len(set(line["cells"])) > 1} for line in lines]
 
 
 def value_text(value: Any) -> str:

@@ -5,7 +5,7 @@ import json
 from collections.abc import AsyncIterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Form, Query, Request
@@ -17,10 +17,14 @@ from trompe_server.api.experiments import LABEL
 from trompe_server.api.jobs import RESULT, Cursor, labels_of
 from trompe_server.api.services import Services, ServicesDep
 from trompe_server.errors import NotFoundError
+from trompe_server.formats import write_glb
 from trompe_server.pages.chart import chart
+from trompe_server.pages.estimate import Effort, estimate
 from trompe_server.pages.experiment import columns_and_lines, differing_options, points_of
 from trompe_server.pages.form import form_fields
 from trompe_server.pages.naming import Names
+from trompe_server.pages.offline import offline_page
+from trompe_server.pages.orbit import orbit, painted
 from trompe_server.pages.pictures import Kind, ViewSet
 from trompe_server.pages.present import TERMS, JobRow, Shown, differences, present
 from trompe_server.pages.serving import COOKIE, page, render
@@ -40,6 +44,9 @@ GALLERY: Final[Mapping[str, Any]] = json.loads((Path(__file__).parent / "gallery
 
 LATEST: Final = 8
 PAGE: Final = 50
+MOST_COMPARED: Final = 6
+RECENT: Final = 200
+"""Jobs from which an estimate is made."""
 STREAM_INTERVAL: Final = 1.0
 LASTING: Final = {"Cache-Control": "private, max-age=31536000, immutable"}
 
@@ -117,6 +124,24 @@ def new_job(request: Request, services: ServicesDep) -> HTMLResponse:
     )
 
 
+@router.get("/jobs/estimate")
+def show_estimate(
+    request: Request,
+    services: ServicesDep,
+    classifier: str,
+    pool: int,
+    steps: int,
+    epsilon: Annotated[float, Query(gt=0)],
+) -> Mapping[str, str | None]:
+    """Seconds and drop of stored jobs of this effort against this classifier, in words."""
+    info = services.library.classifier(classifier)
+    reference = info.name if info.shipped else info.id
+    found = services.store.page(state=JobState.succeeded, classifier=reference, limit=RECENT).jobs
+    outcomes = request.app.state.outcomes
+    ended = [(job, outcome) for job in found if (outcome := outcomes.of(services.artifacts(job.id)))]
+    return {"text": estimate(Effort(pool, steps, epsilon), ended)}
+
+
 @router.get("/jobs/turntable/{reference}.png")
 def show_turntable(
     services: ServicesDep,
@@ -131,16 +156,18 @@ def show_turntable(
 
 
 @router.get("/jobs/compare")
-def compare(request: Request, services: ServicesDep, a: str, b: str) -> HTMLResponse:
-    """Two results side by side."""
+def compare(
+    request: Request, services: ServicesDep, job: Annotated[list[str], Query(min_length=2, max_length=MOST_COMPARED)]
+) -> HTMLResponse:
+    """Several results side by side."""
     names, sides, asked, results = Names(services.library), [], [], []
-    for each in (a, b):
-        job = services.store.get(each)
-        result = _result(services, job)
+    for each in job:
+        found = services.store.get(each)
+        result = _result(services, found)
         if result is None:
-            raise NotFoundError(f"Job {each} is {job.state} and has no result to compare.")
-        row = names.row(job)
-        asked.append(names.options(job))
+            raise NotFoundError(f"Job {each} is {found.state} and has no result to compare.")
+        row = names.row(found)
+        asked.append(names.options(found))
         results.append(result)
         sides.append({"job": row, "shown": _shown(services, row, result)})
     return page(request, "compare.html", sides=sides, lines=differences(asked, results))
@@ -151,8 +178,31 @@ def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
     """One job: its progress, or its result."""
     found = services.store.get(job)
     row, result = _row(request, services, found), _result(services, found)
-    shown = _shown(services, row, result) if result else None
-    return page(request, "job.html", job=row, shown=shown, terms=TERMS)
+    if result is None:
+        return page(request, "job.html", job=row, shown=None)
+    turned = orbit(result, job, services.library.classifiers())
+    return page(request, "job.html", job=row, shown=_shown(services, row, result), orbit=turned, terms=TERMS)
+
+
+@router.get("/jobs/{job}/result.html")
+def result_file(request: Request, services: ServicesDep, job: str) -> Response:
+    """The result as one HTML file to keep. It has scripts of its own, so it is not to be opened on this server."""
+    found = services.store.get(job)
+    result = _result(services, found)
+    if result is None:
+        raise NotFoundError(f"Job {job} is {found.state} and has no result.")
+    names = Names(services.library)
+    known = names.classes(result.spec.victim.classifier)
+    text = offline_page(services, request.app.state.pictures, found, names.row(found), result, names=known)
+    disposition = {"Content-Disposition": f'attachment; filename="{found.id}.html"'}
+    return Response(text, media_type="text/html", headers=disposition)
+
+
+@router.get("/jobs/{job}/models/{side}.glb")
+def show_model(services: ServicesDep, job: str, side: Literal["before", "after"]) -> Response:
+    """The object before or after the attack, for the orbit."""
+    model = write_glb(painted(services, services.store.get(job), side))
+    return Response(model, media_type="model/gltf-binary", headers=LASTING)
 
 
 @router.get("/jobs/{job}/preview.png")

@@ -14,14 +14,15 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from markupsafe import Markup, escape
 
 from trompe_server.api.guard import COOKIE
+from trompe_shared import three
 
-__all__ = ["COOKIE", "STATIC", "page", "render"]
+__all__ = ["COOKIE", "STATIC", "page", "render", "static"]
 
 _HERE: Final = Path(__file__).parent
 STATIC: Final = _HERE / "static"
 
 HEADERS: Final = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
     "connect-src 'self'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'",
     "Referrer-Policy": "same-origin",
 }
@@ -45,15 +46,16 @@ _TEMPLATES.env.filters["code"] = _code
 
 
 @cache
-def _static(name: str) -> str:
+def static(name: str) -> str:
     """Address of a static file, with a hash of its content, so that browsers may cache it."""
-    mark = hashlib.sha256((STATIC / name).read_bytes()).hexdigest()[:12]
+    folder = three.FOLDER.parent if name.startswith(f"{three.FOLDER.name}/") else STATIC
+    mark = hashlib.sha256((folder / name).read_bytes()).hexdigest()[:12]
     return f"/static/{name}?v={mark}"
 
 
 def page(request: Request, template: str, /, status: int = 200, **values: Any) -> HTMLResponse:
     """Render a page."""
-    values |= {"version": version("trompe"), "static": _static, "signed_in": COOKIE in request.cookies}
+    values |= {"version": version("trompe"), "static": static, "signed_in": COOKIE in request.cookies}
     return _TEMPLATES.TemplateResponse(request, template, values, status_code=status, headers=HEADERS)
 
 

@@ -1,17 +1,14 @@
 """The repainted object as files."""
 
 import re
-from typing import Final
 
 from trompe_server.formats import repaint_limited, write_glb
+from trompe_server.job.protocol import SAILENV
 from trompe_shared.api import ADVERSARIAL
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D
 
 __all__ = ["model_files"]
-
-SAILENV: Final = ".sailenv.zip"
-"""Ending of SAILenv's zip if the upload is a zip in another format."""
 
 
 def model_files(painted: Object3D, name: str, original: tuple[bytes, str] | None) -> tuple[dict[str, bytes], list[str]]:

@@ -20,6 +20,22 @@ function left(progress) {
 
 const span = (seconds) => (seconds < 90 ? `${Math.round(seconds)} s` : `${Math.round(seconds / 60)} min`);
 
+// Curves over the steps, from the events of the whole job, which the stream repeats from the first one.
+const curves = { loss: new Map(), fooled: new Map() };
+function draw(progress) {
+  for (const [name, points] of Object.entries(curves)) {
+    if (progress.step == null || progress[name] == null) continue;
+    points.set(progress.step, progress[name]);
+    const values = [...points.values()], steps = [...points.keys()];
+    const low = Math.min(0, ...values), high = Math.max(name === "fooled" ? 1 : low + 1e-9, ...values), last = Math.max(2, ...steps);
+    const figure = live.querySelector(`[data-curve=${name}]`);
+    const at = (step) => `${(300 * (step - 1)) / (last - 1)},${85 - (80 * (points.get(step) - low)) / (high - low)}`;
+    figure.querySelector("polyline").setAttribute("points", steps.sort((a, b) => a - b).map(at).join(" "));
+    figure.querySelector("figcaption span").textContent = `${low.toPrecision(2)} to ${high.toPrecision(2)}, steps 1 to ${last}`;
+    figure.hidden = points.size < 2;
+  }
+}
+
 let shown = null;
 function preview(progress) {
   const figure = document.getElementById("preview");
@@ -39,6 +55,7 @@ if (live) {
   const stop = follow(`/v1/jobs/${live.dataset.job}/events`, "progress", (data) => {
     const event = JSON.parse(data);
     show(event.progress);
+    draw(event.progress);
     preview(event.progress);
     if (!["queued", "running"].includes(event.state)) {
       stop();

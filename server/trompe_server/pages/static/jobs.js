@@ -2,7 +2,7 @@
 import { follow } from "./common.js";
 
 const table = document.querySelector("table[data-stream]");
-const compare = document.getElementById("compare");
+const compare = document.getElementById("compare"), find = document.getElementById("find");
 
 function put(html) {
   const holder = document.createElement("tbody");
@@ -18,12 +18,39 @@ function put(html) {
   }
 }
 
-if (table) follow(table.dataset.stream, "rows", put);
+// Rows by a column; empty cells last.
+function sort(heading) {
+  const column = heading.cellIndex, down = heading.ariaSort !== "ascending";
+  const key = (row) => row.cells[column].dataset.value ?? row.cells[column].textContent.trim();
+  const order = (one, other) => one - other || one.localeCompare(other);
+  for (const each of table.tHead.rows[0].cells) each.removeAttribute("aria-sort");
+  heading.ariaSort = down ? "ascending" : "descending";
+  const rows = [...table.tBodies[0].rows].sort((a, b) => {
+    const [one, other] = [key(a), key(b)];
+    return !one - !other || (down ? order(one, other) : order(other, one));
+  });
+  table.tBodies[0].append(...rows);
+}
+
+function filter() {
+  const wanted = find?.value.trim().toLowerCase() ?? "";
+  for (const row of table.tBodies[0].rows) row.hidden = !row.textContent.toLowerCase().includes(wanted);
+}
+
+if (table) {
+  follow(table.dataset.stream, "rows", (html) => {
+    put(html);
+    filter();
+  });
+  table.tHead.addEventListener("click", (event) => event.target.matches("button") && sort(event.target.closest("th")));
+  if (find) find.oninput = filter;
+}
 
 if (table && compare) {
   table.addEventListener("change", () => {
     const picked = [...table.querySelectorAll("input[name=compare]:checked")].map((box) => box.value);
-    compare.hidden = picked.length !== 2;
-    compare.href = `/jobs/compare?a=${picked[0]}&b=${picked[1]}`;
+    compare.hidden = picked.length < 2;
+    compare.textContent = `Compare these ${picked.length}`;
+    compare.href = `/jobs/compare?${picked.map((job) => `job=${job}`).join("&")}`;
   });
 }

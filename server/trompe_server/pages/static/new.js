@@ -103,9 +103,19 @@ function request() {
 const send = (path, headers = {}) =>
   ask(path, { method: "POST", body: request(), headers: { "Content-Type": "application/json", ...headers } });
 
+async function foresee() {
+  const { victim, views, search, paint } = JSON.parse(request());
+  const asked = new URLSearchParams({ classifier: victim.classifier, pool: views.pool, steps: search.steps, epsilon: paint.epsilon });
+  const { text } = await ask(`/jobs/estimate?${asked}`).catch(() => ({ text: null }));
+  const place = document.getElementById("estimate");
+  place.textContent = text ?? "";
+  place.hidden = !text;
+}
+
 let timer;
 function check() {
   clearTimeout(timer);
+  foresee();
   timer = setTimeout(() => label.value && send("/v1/jobs/check").then(() => complain(null), (error) => complain(error)), 400);
 }
 
@@ -153,4 +163,4 @@ form.addEventListener("submit", async (event) => {
     button.disabled = false;
   }
 });
-await Promise.all([chosen(), classes()]);
+await Promise.all([chosen(), classes(), foresee()]);

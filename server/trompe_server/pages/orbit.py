@@ -1,0 +1,81 @@
+"""Input of the orbit: the object before and after in the browser, to be turned and classified."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from trompe_server.api.services import Services
+from trompe_server.errors import NotFoundError
+from trompe_server.job.protocol import SAILENV
+from trompe_server.pages.serving import static
+from trompe_shared.api import ADVERSARIAL, ClassifierInfo, Job, Result, ViewPrediction
+from trompe_shared.geometry import FIELD_OF_VIEW
+from trompe_shared.object3d import Object3D, load_object
+from trompe_shared.three import FOLDER, LIGHTS, THREE
+
+__all__ = ["orbit", "painted"]
+
+ARCHIVES: Final = (ADVERSARIAL + SAILENV, f"{ADVERSARIAL}.zip")
+"""Endings of the repainted object's SAILenv zip, the first one if there are both."""
+PLAIN: Final = "#ffffff"
+"""Background in place of a picture."""
+
+
+def orbit(result: Result, job: str, classifiers: Sequence[ClassifierInfo]) -> Mapping[str, Any] | None:
+    """The orbit's JSON, which begins at a fooled view; ``None`` without an attack."""
+    views = result.held_out_views or result.views
+    start = next((view for view in views if _fooled(view, result.labels)), views[0])
+    if start.after is None:
+        return None
+    own = result.spec.victim.classifier
+    return {
+        "files": {name: static(f"{FOLDER.name}/{file}") for name, file in (("three", THREE), ("lights", LIGHTS))},
+        "models": {side: f"/jobs/{job}/models/{side}.glb" for side in ("before", "after")},
+        "label": " or ".join(map(str, result.label_names or result.labels)),
+        "labels": result.label_names or result.labels,
+        "classifiers": _choices(classifiers, own),
+        "classifier": own,
+        "size": result.image_size,
+        "fov": FIELD_OF_VIEW,
+        "centred": result.spec.views.looks_at == "object",
+        "start": _pose(start),
+    }
+
+
+def painted(services: Services, job: Job, side: str) -> Object3D:
+    """The object ``before`` or ``after`` the attack. Raises ``NotFoundError`` if it is not stored any more."""
+    if side == "before":
+        return load_object(services.library.object_bytes(job.spec.object))
+    for ending in ARCHIVES:
+        for name in job.artifacts:
+            if name.endswith(ending):
+                return load_object(services.artifacts(job.id).read(name))
+    raise NotFoundError(f"Job {job.id} has no repainted object.")
+
+
+def _fooled(view: ViewPrediction, labels: Sequence[int]) -> bool:
+    return view.before in labels and view.after not in labels
+
+
+def _choices(classifiers: Sequence[ClassifierInfo], own: str) -> list[dict[str, str]]:
+    """Networks to choose from, ``own`` first, also if it is not stored, as torchvision's are."""
+    stored = {info.name if info.shipped else info.id: info.name for info in classifiers}
+    return [{"reference": each, "name": name} for each, name in ({own: stored.get(own, own)} | stored).items()]
+
+
+def _pose(view: ViewPrediction) -> Mapping[str, Any]:
+    """Camera, light and background. Angles in degrees, azimuths in [-180, 180); distance in metres."""
+    return {
+        "azimuth": _centred(view.azimuth),
+        "elevation": view.elevation,
+        "distance": view.distance,
+        "light_azimuth": _centred(view.light_azimuth),
+        "light_elevation": view.light_elevation,
+        "intensity": view.light_intensity,
+        "ambient": view.light_ambient,
+        "colour": [channel / 255 for channel in view.light_colour],
+        "background": view.background if view.background.startswith("#") else PLAIN,
+    }
+
+
+def _centred(azimuth: float) -> float:
+    return (azimuth + 180) % 360 - 180
