@@ -41,7 +41,7 @@ def checked_spec(spec: Spec, library: Library) -> tuple[Spec, dict[str, str]]:
     judges = [library.classifier(judge) for judge in spec.judges.networks]
     for other in (*members, *judges):  # an index means the same class only among as many classes
         resolve_labels(spec.goal.label, other.classes or classifier.classes, other.n_classes, other.name)
-    victim = {"classifier": _reference(classifier), "ensemble": [_reference(member) for member in members]}
+    victim = {"classifier": classifier.reference, "ensemble": [member.reference for member in members]}
     masks = {texture: _mask(texture, picture, obj, library) for texture, picture in spec.paint.masks.items()}
     pictures = {name: library.background(name) for name in spec.views.background if not _COLOUR.fullmatch(name)}
     background = [pictures[name].id if name in pictures else name for name in spec.views.background]
@@ -50,9 +50,9 @@ def checked_spec(spec: Spec, library: Library) -> tuple[Spec, dict[str, str]]:
     names |= {picture.id: picture.name for picture in (*masks.values(), *pictures.values())}
     checked = spec.model_copy(
         update={
-            "object": _reference(obj),
+            "object": obj.reference,
             "victim": spec.victim.model_copy(update=victim),
-            "judges": spec.judges.model_copy(update={"networks": [_reference(judge) for judge in judges]}),
+            "judges": spec.judges.model_copy(update={"networks": [judge.reference for judge in judges]}),
             "paint": spec.paint.model_copy(update={"masks": {name: mask.id for name, mask in masks.items()}}),
             "views": spec.views.model_copy(update={"background": background}),
         }
@@ -83,7 +83,3 @@ def _mask(texture: str, picture: str, obj: ObjectInfo, library: Library) -> Back
     pixels = decode_rgb(library.background_bytes(picture), picture)
     check_mask_size(texture, size=obj.textures[texture], mask=pixels.shape[:2])
     return library.background(picture)
-
-
-def _reference(info: ObjectInfo | ClassifierInfo) -> str:
-    return info.name if info.shipped else info.id

@@ -58,7 +58,7 @@ def _fooled(view: ViewPrediction, labels: Sequence[int]) -> bool:
 
 def _choices(classifiers: Sequence[ClassifierInfo], own: str) -> list[dict[str, str]]:
     """Networks to choose from, ``own`` first, also if it is not stored, as torchvision's are."""
-    stored = {info.name if info.shipped else info.id: info.name for info in classifiers}
+    stored = {info.reference: info.name for info in classifiers}
     return [{"reference": each, "name": name} for each, name in ({own: stored.get(own, own)} | stored).items()]
 
 

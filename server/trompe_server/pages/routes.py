@@ -103,11 +103,11 @@ def new_job(request: Request, services: ServicesDep) -> HTMLResponse:
     """The form of a new job."""
     labels = {name: shipped.label for name, shipped in shipped_objects().items()}
     objects = [
-        {"reference": info.name if info.shipped else info.id, "name": info.name, "label": labels.get(info.name, "")}
+        {"reference": info.reference, "name": info.name, "label": labels.get(info.name, "")}
         for info in services.library.objects()
     ]
     classifiers = [
-        {"reference": info.name if info.shipped else info.id, "name": info.name, "white_box": info.white_box}
+        {"reference": info.reference, "name": info.name, "white_box": info.white_box}
         for info in services.library.classifiers()
     ]
     return page(
@@ -134,8 +134,7 @@ def show_estimate(
     epsilon: Annotated[float, Query(gt=0)],
 ) -> Mapping[str, str | None]:
     """Seconds and drop of stored jobs of this effort against this classifier, in words."""
-    info = services.library.classifier(classifier)
-    reference = info.name if info.shipped else info.id
+    reference = services.library.classifier(classifier).reference
     found = services.store.page(state=JobState.succeeded, classifier=reference, limit=RECENT).jobs
     outcomes = request.app.state.outcomes
     ended = [(job, outcome) for job in found if (outcome := outcomes.of(services.artifacts(job.id)))]
