@@ -1,77 +1,137 @@
-"""What a job costs apart from its attack: python -m bench.job_engine [--jobs N] [--workers N] [--database URL]...
+"""What a job costs apart from its attack: python -m bench.job_engine [--jobs N] [--executor NAME] [--database URL]...
 
-Jobs of nine phases that do nothing (as many as an attack of 30 steps has) are submitted, and run by workers in threads
-of this process: seconds of submitting and of running one job, jobs a second, and bytes a job of database.
+Jobs of nine phases that do nothing (as many as an attack of 30 steps has) run on one worker of an executor: ``local``,
+``ray-local`` or ``ray://HOST:PORT``. Then the worker of a running phase is killed: seconds until it begins again.
 """
 
 import argparse
+import os
+import signal
+import statistics
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
+
+from tests.service.processes import listening
 
 from bench.job_list import size
-from trompe_server.executor.runner import JobRunner, OpenedJob
+from trompe_server.executor.choice import open_executor
+from trompe_server.executor.dispatcher import Dispatcher
 from trompe_server.job.protocol import OnProgress, PhaseReport
 from trompe_server.queue.claims import Claims
 from trompe_server.queue.store import JobStore
-from trompe_shared.api import JobRequest, Progress
+from trompe_server.renderers.discovery import RendererAddresses
+from trompe_server.settings import Settings
+from trompe_server.storage.folders import JobArtifacts, LocalArtifacts
+from trompe_shared.api import JobRequest, JobSpec, Progress
 
 PHASES = [f"phase-{number}" for number in range(9)]
+LOSSES = 8
+"""Workers killed, two in each job: the third loss in one phase would fail it."""
+NAME = "bench"
 
 
 class Idle:
-    """A pipeline that does nothing."""
+    """Phases that do nothing. With the label ``wait`` the last one notes its time and process, and waits."""
+
+    def __init__(self, waits: bool, artifacts: JobArtifacts) -> None:
+        assert isinstance(artifacts.folder, LocalArtifacts)
+        self._notes = artifacts.folder.folder / "notes.txt" if waits else None
 
     def phases(self) -> list[str]:
         """As many as an attack of 30 steps has."""
         return PHASES
 
     def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
-        """Nothing at all."""
-        return PhaseReport(Progress(phase=phase, fraction=(PHASES.index(phase) + 1) / len(PHASES)))
+        """Nothing at all, or wait until cancelled."""
+        progress = Progress(phase=phase, fraction=(PHASES.index(phase) + 1) / len(PHASES))
+        if self._notes is not None and phase == PHASES[-1]:
+            with self._notes.open("a") as file:
+                file.write(f"{time.time()} {os.getpid()}\n")
+            while True:
+                on_progress(progress)
+                time.sleep(0.02)
+        return PhaseReport(progress)
 
 
-def work(store: JobStore, name: str) -> int:
-    """Run jobs until there are none; how many it were."""
-    runner = JobRunner(Claims(store.engine, name), lambda _: OpenedJob(Idle(), lambda: None))
-    count = 0
-    while (claim := runner.claims.claim(("any",))) is not None:
-        runner.run(claim)
-        count += 1
-    return count
+def open_job(spec: JobSpec, *, artifacts: JobArtifacts, **_: Any) -> Idle:
+    """Open a job with the signature of ``trompe_server.job.texture_attack.open_job``, and with its imports."""
+    import trompe_server.job.texture_attack  # noqa: F401
+
+    return Idle(spec.goal.label == ["wait"], artifacts)
 
 
-def bench(url: str, count: int, workers: int) -> None:
-    """Print what jobs cost in the empty database at ``url``."""
-    store = JobStore(url)
+def bench(settings: Settings, count: int) -> None:
+    """Print what jobs cost in the empty database of ``settings``."""
+    store = JobStore(settings.database_url)
     store.migrate()
     before, began = size(store), time.perf_counter()
-    for _ in range(count):
-        store.create(JobRequest.of("mug", label="mug", labels={"run": "1"}))
-    submitted, began = time.perf_counter() - began, time.perf_counter()
-    with ThreadPoolExecutor(workers) as pool:
-        done = sum(pool.map(lambda number: work(store, f"w{number}"), range(workers)))
-    took = time.perf_counter() - began
-    assert done == count
+    jobs = [submit(store, "mug") for _ in range(count)]
+    submitted = time.perf_counter() - began
+    with listening() as port:
+        renderers = RendererAddresses((("127.0.0.1", port),))
+        executor = partial(open_executor, settings, renderers, mark=NAME)
+        dispatcher = Dispatcher(Claims(store.engine), executor, name=NAME, silence=30, stall_timeout=600)
+        began = time.perf_counter()
+        with dispatcher.running():
+            wait_for(lambda: store.get(jobs[0]).state.final)
+            print(f"{settings.executor}: first job ended after {time.perf_counter() - began:.1f} s")
+            wait_for(lambda: store.get(jobs[-1]).state.final)
+            ends = sorted(finished.timestamp() for job in jobs if (finished := store.get(job).finished))
+            grown = (size(store) - before) / count
+            losses = [loss for _ in range(LOSSES // 2) for loss in losses_of_a_job(store, Path(settings.store_url))]
+    overhead = statistics.median(after - before for before, after in pairwise(ends))
     print(
         f"{store.engine.dialect.name:12}{1000 * submitted / count:8.1f} ms to submit"
-        f"{1000 * took / count:8.1f} ms to run"
-        f"{count / took:8.1f} jobs/s by {workers} workers{(size(store) - before) / count:8.0f} bytes a job"
+        f"{1000 * overhead:8.1f} ms to run (median of {count}){grown:8.0f} bytes a job\n"
+        f"worker killed, phase begun again: median {statistics.median(losses):.2f} s, longest {max(losses):.2f} s"
     )
     store.close()
+
+
+def submit(store: JobStore, label: str) -> str:
+    """Queue a job."""
+    return store.create(JobRequest.of("mug", label=label, labels={"run": "1"}))[0].id
+
+
+def losses_of_a_job(store: JobStore, files: Path) -> list[float]:
+    """Kill the worker of a job twice: seconds until its phase begins again."""
+    job = submit(store, "wait")
+    notes = files / "jobs" / job / "notes.txt"
+    seconds = []
+    for number in (1, 2):
+        wait_for(lambda number=number: notes.exists() and len(notes.read_text().splitlines()) == number)  # type: ignore[misc]
+        killed = time.time()
+        os.kill(int(notes.read_text().split()[-1]), signal.SIGKILL)
+        wait_for(lambda number=number: len(notes.read_text().splitlines()) > number)  # type: ignore[misc]
+        seconds.append(float(notes.read_text().split()[-2]) - killed)
+    store.request_cancel(job)
+    wait_for(lambda: store.get(job).state.final)
+    return seconds
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    """Poll ``condition``."""
+    while not condition():
+        time.sleep(0.01)
 
 
 def main() -> None:
     """Measure each database that is named; SQLite in a temporary folder where none is."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=int, default=300)
-    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=200)
+    parser.add_argument("--executor", default="local", help="local, ray-local or ray://HOST:PORT")
     parser.add_argument("--database", action="append", help="an empty database; repeatable")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        for url in options.database or [f"sqlite:///{Path(folder, 'trompe.sqlite')}"]:
-            bench(url, options.jobs, options.workers)
+    for url in options.database or [""]:
+        with tempfile.TemporaryDirectory() as folder:
+            pipeline = "bench.job_engine:open_job"
+            named = {"executor": options.executor, "database": url, "pipeline": pipeline}
+            bench(Settings(data=Path(folder), **named), options.jobs)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from trompe_server.queue.claims import Claims, Ending
 from trompe_server.queue.store import JobStore
 from trompe_server.queue.tables import jobs, labels
 from trompe_server.storage.database import write
-from trompe_shared.api import JobRequest, JobSpec, JobState, Progress
+from trompe_shared.api import JobRequest, JobSpec, JobState, Needs, Progress
 
 BATCH = 1000
 CALLS = 50
@@ -43,7 +43,7 @@ def fill(store: JobStore, count: int) -> None:
                     "object": f"object-{number % 50}",
                     "classifier": f"net-{number % 5}",
                     "priority": 100,
-                    "needs": "any",
+                    "needs": "{}",
                     "labels": mine,
                     "created": float(number),
                     "finished": float(number) if state != JobState.queued else None,
@@ -93,14 +93,14 @@ def cases(store: JobStore, count: int) -> Iterator[tuple[str, Callable[[], objec
     yield "object", lambda: store.page(object="object-7")
     yield "counts", store.counts
     yield "statistics", store.statistics
-    claims = Claims(store.engine, "bench")
+    claims = Claims(store.engine)
     yield "claim and finish", lambda: take(claims)
     yield "submit", lambda: store.create(JobRequest.of("mug", label="mug"))
 
 
 def take(claims: Claims) -> None:
     """Take a job and end it."""
-    claim = claims.claim(("any", "cpu"))
+    claim = claims.claim(Needs(), "bench")
     assert claim is not None
     claims.finish(claim, Ending(JobState.succeeded))
 

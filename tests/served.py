@@ -138,13 +138,12 @@ class Served(Queue):
         return found if all(each["engine"] for each in found) else []
 
     def children(self) -> dict[str, int]:
-        """Process ids of the supervised children, by command."""
-        found = {}
+        """Process ids of the children, by command; an attack worker is ``worker``."""
+        found: dict[str, int] = {}
         for entry in Path("/proc").iterdir():
             if entry.name.isdecimal() and self.process.pid == parent(int(entry.name)):
-                words = command_line(entry)
-                if CHILD[-1] in words:
-                    found[words[words.index(CHILD[-1]) + 1]] = int(entry.name)
+                command = command_of(entry)
+                found |= {command: int(entry.name)} if command is not None else {}
         return found
 
 
@@ -153,6 +152,14 @@ def command_line(process: Path) -> list[str]:
     with suppress(FileNotFoundError, ProcessLookupError):
         return (process / "cmdline").read_text().split("\0")
     return []
+
+
+def command_of(process: Path) -> str | None:
+    """Command of one of our processes; ``worker`` for an attack worker, ``None`` for processes of others."""
+    words = command_line(process)
+    if CHILD[-1] in words:
+        return words[words.index(CHILD[-1]) + 1]
+    return "worker" if "--multiprocessing-fork" in words else None
 
 
 def parent(pid: int) -> int | None:

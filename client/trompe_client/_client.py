@@ -106,7 +106,7 @@ class AsyncClient(_Connected["AsyncPort"]):
         return await send(self.port, _core.listed(BackgroundInfo))
 
     async def workers(self) -> list[WorkerInfo]:
-        """Processes that run jobs."""
+        """Attack workers: processes, or nodes of a cluster."""
         return await send(self.port, _core.listed(WorkerInfo))
 
     async def renderers(self) -> list[RendererInfo]:

@@ -121,14 +121,14 @@ def _classifier_cells(one: ClassifierInfo) -> list[str]:
 
 def _worker_cells(one: WorkerInfo) -> list[str]:
     times = [f"{time:%Y-%m-%d %H:%M:%S}" for time in (one.started, one.seen)]
-    return [one.id, one.host, one.device, _yes(one.alive), one.job or "", *times]
+    return [one.id, one.host, one.device, _yes(one.alive), one.fault or " ".join(one.jobs), *times]
 
 
 _RECORDS: Final[Mapping[type, tuple[Sequence[str], Callable[[Any], Sequence[str]]]]] = {
     ObjectInfo: (("name", "id", "triangles", "textures", "radius", "origin"), _object_cells),
     ClassifierInfo: (("name", "id", "use", "input", "classes", "origin"), _classifier_cells),
     BackgroundInfo: (("name", "id"), lambda one: (one.name, one.id)),
-    WorkerInfo: (("worker", "host", "device", "alive", "job", "started", "seen"), _worker_cells),
+    WorkerInfo: (("worker", "host", "device", "alive", "jobs", "started", "seen"), _worker_cells),
     RendererInfo: (("renderer", "alive", "engine"), lambda one: (one.address, _yes(one.alive), one.identity or "")),
 }
 

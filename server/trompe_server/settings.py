@@ -26,16 +26,19 @@ class Settings(BaseSettings):
     """Largest upload, bytes."""
     rate_limit: Annotated[float, Field(ge=0)] = 100.0
     """Requests per second allowed to each token, or to each address without a token; 0: no limit."""
-    stall_timeout: float = 1800.0
-    """Seconds without progress after which the worker of a job is restarted."""
+    executor: Annotated[str, Field(pattern=r"^(local|ray-local|ray://[^:/]+:\d+)$")] = "local"
+    """What runs the jobs: ``local``, processes of this machine; ``ray://HOST:PORT``, a Ray cluster; ``ray-local``, Ray
+    on this machine alone."""
+    stall_timeout: Annotated[float, Field(gt=0)] = 1800.0
+    """Seconds without progress after which a job loses its attempt and goes on in another one."""
     silence: Annotated[float, Field(ge=1.0)] = 30.0
-    """Seconds without a heartbeat after which a worker counts as dead and its job is requeued."""
+    """Seconds without a sign of life after which the dispatcher counts as dead and another one takes over."""
     retention_days: Annotated[float, Field(ge=0)] = 0.0
     """Days after which ended jobs, their artifacts and unused calibrations are deleted; 0 keeps them."""
     device: str = "cpu"
     """Device of the attack workers, by torch's name: cpu, cuda, cuda:1."""
     workers: Annotated[int, Field(ge=0, le=64)] = 1
-    """Attack workers started by ``serve``; they share the cores. 0: all workers run elsewhere."""
+    """Attack workers of this machine; they share the cores. 0: ``serve`` leaves the jobs to a ``trompe worker``."""
     renderers: Annotated[int, Field(ge=0, le=64)] = 1
     """Renderer workers started by ``serve``."""
     engine: str = DEFAULT_ENGINE
@@ -47,7 +50,7 @@ class Settings(BaseSettings):
     pipeline: str = "trompe_server.job.texture_attack:open_job"
     """``module:function`` that opens a job, with the signature of the default; replaced by tests."""
     metrics_port: Annotated[int, Field(ge=0, le=65535)] = 0
-    """Port at which ``trompe worker`` serves its Prometheus metrics; 0: none."""
+    """Port at which ``trompe worker`` serves the Prometheus metrics of its processes; 0: none."""
 
     @property
     def engine_flags(self) -> list[str]:
@@ -67,5 +70,5 @@ class Settings(BaseSettings):
 
     @property
     def metrics_folder(self) -> Path:
-        """Folder of the metrics of the workers started by ``serve``, in Prometheus' multi-process format."""
+        """Folder of the metrics of the attack workers, in Prometheus' multi-process format."""
         return self.data.absolute() / "metrics"

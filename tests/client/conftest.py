@@ -54,7 +54,7 @@ SPEC = JobSpec.of("mug", label="mug")
 MUG = ObjectInfo(
     id="m" * 8, name="mug", materials=["m"], textures={"a.png": (4, 8)}, triangles=12, radius=0.1, shipped=True
 )
-WORKER = WorkerInfo(id="w1", host="here", device="cpu", alive=True, started=NOW, seen=NOW, job="job-1")
+WORKER = WorkerInfo(id="w1", host="here", device="cpu", alive=True, started=NOW, seen=NOW, jobs=["job-1"])
 RENDERER = RendererInfo(address="127.0.0.1:8085", alive=True)
 TINY = ClassifierInfo(
     id="t" * 8, name="tiny", white_box=True, image_size=(32, 32), n_classes=10, classes=None, shipped=True

@@ -45,9 +45,9 @@ def test_an_attack_answers_with_job_result_and_files(ask: Ask, tmp_path: Path) -
 
 
 def test_a_detached_attack_answers_with_the_job_at_once(ask: Ask, server: FakeServer) -> None:
-    said = ask("attack", "mug", "--label", 0, "--detach", "--tag", "a=b", "--priority", "sweep", "--needs", "cuda")
+    said = ask("attack", "mug", "--label", 0, "--detach", "--tag", "a=b", "--priority", "sweep", "--needs", "gpu=0.5")
     job = Job.model_validate(said)
-    assert (job.state, job.labels, job.priority, job.needs) == (JobState.queued, {"a": "b"}, "sweep", "cuda")
+    assert (job.state, job.labels, job.priority, job.needs.gpu) == (JobState.queued, {"a": "b"}, "sweep", 0.5)
     assert not [path for _, path, _ in server.requests if path.endswith("/events")]
 
 

@@ -25,7 +25,7 @@ import pytest
 from tests.fake_job import PHASES, trace
 from tests.served import FAKE, Served, wait_until
 from trompe_server.api.guard import FRESH
-from trompe_server.executor.worker import prepare_data
+from trompe_server.service.dispatch import prepare_data
 from trompe_server.storage.tokens import Right, Tokens
 from trompe_shared.api import JobState, in_parts
 from trompe_shared.shipped import shipped_objects

@@ -10,11 +10,11 @@ import pytest
 from fastapi import FastAPI
 
 from trompe_server.api.services import Services
-from trompe_server.executor.worker import prepare_data
 from trompe_server.library import Library
 from trompe_server.pages.serving import _code
 from trompe_server.queue.store import JobStore
 from trompe_server.service.app import create_app
+from trompe_server.service.dispatch import prepare_data
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import open_folder
 from trompe_server.storage.tokens import Tokens

@@ -7,7 +7,6 @@ import os
 import random
 import re
 import signal
-import socket
 import subprocess
 import threading
 import time
@@ -19,11 +18,11 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from tests.fake_job import PHASES, trace
-from tests.served import CHILD, FAKE, reserved_port, wait_until
+from tests.served import CHILD, FAKE, command_line, command_of, reserved_port, wait_until
 from trompe_client import Client, Retries
 from trompe_client._job import JobHandle
-from trompe_server.executor.worker import prepare_data
 from trompe_server.queue.store import JobStore
+from trompe_server.service.dispatch import prepare_data
 from trompe_server.settings import Settings
 from trompe_shared.api import Event, Job, JobRequest, JobState
 
@@ -33,9 +32,9 @@ WORKERS: Final = 3
 RENDERERS: Final = 3
 REAL_EVERY: Final = 12
 """One in this many jobs is a real attack."""
-KINDS: Final = {"serve": "API", "worker": "attack worker", "render": "renderer worker"}
+KINDS: Final = {"serve": "API", "dispatcher": "dispatcher", "worker": "attack worker", "render": "renderer worker"}
 """Kinds of processes, by command."""
-SHARES: Final = ["API", *["attack worker"] * WORKERS, *["renderer worker"] * RENDERERS]
+SHARES: Final = ["API", "dispatcher", *["attack worker"] * WORKERS, *["renderer worker"] * RENDERERS]
 RESTART: Final = 0.5
 """Seconds before a dead process is restarted."""
 
@@ -93,17 +92,27 @@ class Kept:
 class Site:
     """Three attack workers, three renderer workers and the API on the database at ``url``, all under ``folder``.
 
-    With ``scattered=False``, `trompe serve` supervises the others. Otherwise each process stands alone, and the workers
-    share only the database and the store. ``phase_seconds``: length of the phases of fake jobs.
+    With ``scattered=False``, `trompe serve` has them all. Otherwise API, renderers and two dispatchers, of which one
+    waits, share only the database and the store. ``phase_seconds``: length of the phases of fake jobs.
     """
 
-    def __init__(self, folder: Path, url: str, *, scattered: bool, silence: float, phase_seconds: float) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        url: str,
+        *,
+        scattered: bool,
+        silence: float,
+        phase_seconds: float,
+        stall_timeout: float = 1800.0,
+    ) -> None:
         self.folder = folder
         self.settings = Settings(data=folder / "api", database=url, store=str(folder / "store"), silence=silence)
         self._environment = {
             "TROMPE_DATABASE": self.settings.database_url,
             "TROMPE_STORE": self.settings.store_url,
             "TROMPE_SILENCE": str(silence),
+            "TROMPE_STALL_TIMEOUT": str(stall_timeout),
             "TROMPE_RATE_LIMIT": "0",
             "TROMPE_RENDERER_PATIENCE": "120",
             "TROMPE_PIPELINE": "tests.service.chaos_pipeline:open_job",
@@ -129,8 +138,9 @@ class Site:
         ports = [self._free_port() for _ in range(RENDERERS)]
         known = [word for port in ports for word in ("--renderer", f"127.0.0.1:{port}")]
         renderers = [self._keep(f"renderer-{port}", "render", "--port", str(port)) for port in ports]
-        workers = [self._keep(f"worker-{number}", "worker", *known) for number in range(WORKERS)]
-        return [self._serve(workers=0, renderers=0), *workers, *renderers]
+        many = ["--workers", str(WORKERS)]
+        dispatchers = [self._keep(f"dispatcher-{number}", "worker", *many, *known) for number in range(2)]
+        return [self._serve(workers=0, renderers=0), *dispatchers, *renderers]
 
     def _keep(self, name: str, *arguments: str) -> Kept:
         """A process with its own data folder."""
@@ -226,21 +236,20 @@ class Faults:
             self.counts[f"{kind} killed"] += 1
 
     def freeze(self, *, seconds: float) -> None:
-        """Stop an attack worker with a job, preferably a real attack, for ``seconds``."""
-        busy = {job.worker: is_real(job.spec.search.seed) for job in self._site.store.page(state=JobState.running).jobs}
-        pids = [pid for pid in self._site.processes()["attack worker"] if worker_name_of(pid) in busy]
-        pids = [pid for pid in pids if busy.get(worker_name_of(pid))] or pids
+        """Stop an attack worker for ``seconds``."""
+        pids = self._site.processes()["attack worker"]
         if not pids:
             return
         pid = self._random.choice(pids)
-        self.tell(f"SIGSTOP {worker_name_of(pid)} {pid}, of {pids}; running: {self._running()}")
+        self.tell(f"SIGSTOP attack worker {pid}, of {pids}; running: {self._running()}")
         os.kill(pid, signal.SIGSTOP)
         self.counts["attack worker frozen"] += 1
         try:
             time.sleep(seconds)
         finally:
             self.tell(f"SIGCONT {pid}")
-            os.kill(pid, signal.SIGCONT)
+            with suppress(ProcessLookupError):  # it was replaced
+                os.kill(pid, signal.SIGCONT)
 
     def _running(self) -> str:
         try:
@@ -414,18 +423,10 @@ def ancestry(pid: int, table: Mapping[int, int]) -> Iterator[int]:
 
 def kind_of(pid: int) -> str | None:
     """Kind of one of our processes; ``None`` for others."""
-    with suppress(FileNotFoundError, ProcessLookupError, PermissionError):
-        words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
-        if CHILD[-1] in words:
-            return KINDS.get(words[words.index(CHILD[-1]) + 1])
-    return None
-
-
-def worker_name_of(pid: int) -> str | None:
-    """Name of an attack worker, from its lock file."""
-    with suppress(FileNotFoundError, ProcessLookupError, PermissionError):
-        for entry in Path(f"/proc/{pid}/fd").iterdir():
-            file = Path(os.readlink(entry))
-            if slot := re.fullmatch(r"worker-(\d+)\.lock", file.name):
-                return f"{socket.gethostname()}-{slot[1]}-{file.with_suffix('.token').read_text()}"
+    folder = Path("/proc", str(pid))
+    with suppress(PermissionError):
+        command = command_of(folder)
+        if command == "worker" and CHILD[-1] in command_line(folder):
+            command = "dispatcher"
+        return KINDS.get(command or "")
     return None

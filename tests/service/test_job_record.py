@@ -22,14 +22,14 @@ from pydantic import ValidationError
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.queue import migrations
 from trompe_server.queue.claims import Claim, Claims, Ending, LostJobError
-from trompe_server.queue.leases import take_lease
+from trompe_server.queue.leases import end_lease, take_lease
 from trompe_server.queue.migrations import HEAD
 from trompe_server.queue.store import JobStore
-from trompe_server.queue.tables import jobs, metadata, workers
-from trompe_server.queue.workers import WorkerRegistry
+from trompe_server.queue.tables import events, jobs, metadata, workers
+from trompe_server.queue.workers import Worker, forget_workers, record_workers
 from trompe_server.storage import tokens
 from trompe_server.storage.database import write
-from trompe_shared.api import JobRequest, JobState, Progress
+from trompe_shared.api import JobRequest, JobState, Needs, Progress
 from trompe_shared.errors import SpecError
 
 DONE = Ending(JobState.succeeded, note="done")
@@ -44,33 +44,25 @@ def create(store: JobStore, **options: Any) -> str:
     return store.create(request(**options))[0].id
 
 
-def claims_of(store: JobStore, name: str = "w") -> Claims:
-    return Claims(store.engine, name)
+def claims_of(store: JobStore) -> Claims:
+    return Claims(store.engine)
 
 
-def claim(store: JobStore, name: str = "w", needs: tuple[str, ...] = ("any", "cpu")) -> Claim:
-    found = claims_of(store, name).claim(needs)
+def claim(store: JobStore, worker: str = "w") -> Claim:
+    """Claim the next job, whatever it needs."""
+    claims = claims_of(store)
+    found = claims.claim(claims.upcoming()[0], worker)
     assert found is not None
     return found
 
 
-def fall_silent(store: JobStore, name: str, *, seconds: float = 100.0) -> None:
-    """Make the last heartbeat of a worker old."""
-    with write(store.engine) as connection:
-        connection.execute(workers.update().where(workers.c.id == name).values(seen=workers.c.seen - seconds))
-
-
-def registry(store: JobStore, name: str) -> WorkerRegistry:
-    return WorkerRegistry(store.engine, name, device="cpu")
-
-
 def test_a_job_is_kept_as_it_was_asked_for(store: JobStore) -> None:
-    asked = request(priority="sweep", labels={"a": "1", "b": "two words"}, needs="cuda", epsilon=0.1)
+    asked = request(priority="sweep", labels={"a": "1", "b": "two words"}, needs={"gpu": 0.5}, epsilon=0.1)
     job, new = store.create(asked)
     assert new
     assert job == store.get(job.id)
     assert (job.state, job.spec, job.priority, job.labels) == ("queued", asked.spec(), "sweep", asked.labels)
-    assert (job.needs, job.attempts, job.worker, job.started) == ("cuda", 0, None, None)
+    assert (job.needs, job.attempts, job.worker, job.started) == (Needs(gpu=0.5), 0, None, None)
     assert abs(job.created.timestamp() - time.time()) < 60
 
 
@@ -144,23 +136,29 @@ def test_a_malformed_row_is_an_error(store: JobStore, change: dict[str, Any]) ->
         store.get(job)
 
 
-def test_a_worker_takes_what_it_can_serve_and_no_more(store: JobStore) -> None:
-    cuda, either, cpu = (create(store, needs=needs) for needs in ("cuda", "any", "cpu"))
-    assert claim(store, "c", ("any", "cpu")).job.id == either
-    assert claim(store, "d", ("any", "cpu")).job.id == cpu
-    assert claims_of(store, "e").claim(("any", "cpu")) is None
-    assert claim(store, "f", ("any", "cuda")).job.id == cuda
+def test_each_need_is_told_once_first_that_of_the_next_job_and_claimed_by_itself(store: JobStore) -> None:
+    many = [create(store, needs={"gpu": 1}, priority="sweep") for _ in range(3)]
+    plain = create(store)
+    half = create(store, needs={"gpu": 0.5, "cpu": 0}, priority="interactive")
+    claims, gpu, share = claims_of(store), Needs(gpu=1), Needs(gpu=0.5, cpu=0)
+    assert claims.waiting() == {gpu: 3, Needs(): 1, share: 1}
+    assert claims.upcoming() == [share, Needs(), gpu]
+    taken = [claims.claim(needs, "w") for needs in (gpu, gpu, Needs(), share)]
+    assert [each.job.id for each in taken if each] == [*many[:2], plain, half]
+    assert claims.claim(share, "w") is None
+    assert claims.upcoming() == [gpu]
 
 
-def test_many_workers_take_each_job_once(store: JobStore) -> None:
+def test_many_claimers_take_each_job_once(store: JobStore) -> None:
     made = {create(store) for _ in range(30)}
     taken: list[str] = []
 
     def work(name: str) -> None:
-        mine = claims_of(store, name)
-        while (found := mine.claim(("any",))) is not None:
-            taken.append(found.job.id)
-            mine.finish(found, DONE)
+        mine = claims_of(store)
+        while mine.upcoming():
+            if (found := mine.claim(Needs(), name)) is not None:
+                taken.append(found.job.id)
+                mine.finish(found, DONE)
 
     with ThreadPoolExecutor(6) as pool:
         list(pool.map(work, [f"w{number}" for number in range(6)]))
@@ -169,11 +167,36 @@ def test_many_workers_take_each_job_once(store: JobStore) -> None:
     assert store.counts()[JobState.succeeded] == 30
 
 
-def test_a_claim_whose_answer_was_lost_is_given_again(store: JobStore) -> None:
-    create(store)
-    create(store)
-    assert claim(store) == claim(store)
-    assert store.counts()[JobState.running] == 1
+def test_a_claim_whose_answer_was_lost_is_a_running_job_that_nobody_knows(store: JobStore) -> None:
+    forgotten, known = create(store), create(store)
+    claim(store)
+    mine = {known: claim(store)}
+    assert claims_of(store).lose_unknown(mine, "nobody runs it") == [forgotten]
+    assert claims_of(store).lose_unknown(mine, "nobody runs it") == []
+    assert store.get(forgotten).state is JobState.queued
+    assert store.get(known).state is JobState.running
+
+
+def test_queued_jobs_are_told_once_why_they_wait_and_forget_it_when_they_run(store: JobStore) -> None:
+    large, small = create(store, needs={"gpu": 8}), create(store)
+    for _ in range(2):
+        claims_of(store).explain({Needs(gpu=8): "too large"})
+    assert [event.message for event in store.events(large)] == ["queued", "too large"]
+    assert (store.get(large).note, store.get(small).note) == ("too large", None)
+    assert claims_of(store).claim(Needs(gpu=8), "w") is not None
+    assert store.get(large).note is None
+
+
+def test_a_running_job_without_events_stands_still(store: JobStore) -> None:
+    still, lively = create(store), create(store)
+    claim(store)
+    taken = claim(store)
+    with write(store.engine) as connection:
+        connection.execute(events.update().values(time=events.c.time - 100))
+    claims_of(store).advance(taken, HALF)
+    assert claims_of(store).still(50) == {still: 1}
+    assert claims_of(store).still(200) == {}
+    assert lively == taken.job.id
 
 
 def test_events_tell_the_whole_story_and_their_ids_grow_by_one(store: JobStore) -> None:
@@ -206,10 +229,8 @@ def test_phases_that_are_done_are_remembered_with_their_artifacts(store: JobStor
 
 def test_whoever_lost_a_job_can_write_nothing_more(store: JobStore) -> None:
     job = create(store)
-    registry(store, "frozen").register()
-    frozen, old = claims_of(store, "frozen"), claim(store, "frozen")
-    fall_silent(store, "frozen")
-    assert registry(store, "healthy").reap(30) == [job]
+    frozen, old = claims_of(store), claim(store, "frozen")
+    claims_of(store).lose(old, "no progress")
     new = claim(store, "healthy")
     before = store.get(job), store.events(job)
     for write_late in (
@@ -220,9 +241,9 @@ def test_whoever_lost_a_job_can_write_nothing_more(store: JobStore) -> None:
         with pytest.raises(LostJobError, match=r"Attempt 1 of job .* is over"):
             write_late()
     assert (store.get(job), store.events(job)) == before
-    assert not frozen.holds(old)
-    assert claims_of(store, "healthy").holds(new)
-    claims_of(store, "healthy").finish(new, DONE)
+    claims_of(store).lose(old, "no progress")
+    assert store.get(job) == before[0]
+    claims_of(store).finish(new, DONE)
     with pytest.raises(LostJobError):
         frozen.finish(old, Ending(JobState.failed, error="late"))
     assert store.get(job).state is JobState.succeeded
@@ -241,26 +262,24 @@ def test_ending_a_job_twice_is_as_good_as_once(store: JobStore) -> None:
 def test_a_job_that_three_workers_died_of_is_failed_with_the_reason(store: JobStore) -> None:
     job = create(store)
     for _ in range(3):
-        registry(store, "w").register()
-        claim(store)
-    registry(store, "w").register()
+        claims_of(store).lose(claim(store), "w died (signal 9)")
     found = store.get(job)
     assert (found.state, found.attempts) == (JobState.failed, 3)
     assert found.error is not None
     assert "3 workers died" in found.error
-    assert "w died and was restarted" in found.error
+    assert "w died (signal 9)" in found.error
     assert found.finished is not None
 
 
 def test_a_job_that_gets_on_outlives_any_number_of_workers(store: JobStore) -> None:
     job = create(store)
     for done in range(1, 6):
-        for _ in range(2):
-            registry(store, "w").register()
-            taken = claim(store)
-        claims_of(store, "w").advance(taken, Progress(phase="attack", fraction=0.1), done=done)
-    claims_of(store, "w").finish(taken, DONE)
-    assert (store.get(job).state, store.get(job).attempts) == (JobState.succeeded, 10)
+        claims_of(store).lose(claim(store), "it died")
+        taken = claim(store)
+        claims_of(store).advance(taken, Progress(phase="attack", fraction=0.1), done=done)
+        claims_of(store).lose(taken, "it died")
+    claims_of(store).finish(claim(store), DONE)
+    assert (store.get(job).state, store.get(job).attempts) == (JobState.succeeded, 11)
 
 
 def test_a_job_given_back_does_not_count_as_lost(store: JobStore) -> None:
@@ -271,54 +290,43 @@ def test_a_job_given_back_does_not_count_as_lost(store: JobStore) -> None:
     assert (store.get(job).state, store.get(job).attempts) == (JobState.succeeded, 6)
 
 
-def test_only_the_silent_lose_their_jobs(store: JobStore) -> None:
-    jobs = {name: create(store) for name in ("alive", "dead", "struck off")}
-    for name in jobs:
-        registry(store, name).register()
-        claim(store, name)
-    fall_silent(store, "dead")
-    registry(store, "struck off").unregister()
-    assert set(registry(store, "alive").reap(30)) == {jobs["dead"], jobs["struck off"]}
-    assert store.get(jobs["alive"]).state is JobState.running
-    assert registry(store, "alive").reap(30) == []
-
-
-def test_two_reapers_at_once_count_a_lost_attempt_once(store: JobStore) -> None:
-    job = create(store)
-    registry(store, "dead").register()
-    claim(store, "dead")
-    fall_silent(store, "dead")
+def test_a_loss_is_counted_once_whoever_notices_it(store: JobStore) -> None:
+    job, taken = create(store), claim(store)
     with ThreadPoolExecutor(4) as pool:
-        reaped = list(pool.map(lambda number: registry(store, f"r{number}").reap(30), range(4)))
-    assert sorted(map(len, reaped)) == [0, 0, 0, 1]
-    lost = [event for event in store.events(job) if event.message and "heartbeat" in event.message]
-    assert len(lost) == 1
+        found = list(pool.map(lambda _: claims_of(store).lose_unknown({}, "nobody runs it"), range(4)))
+        list(pool.map(lambda _: claims_of(store).lose(taken, "it died"), range(4)))
+    assert [job] in found
+    assert len([event for event in store.events(job) if event.message == "nobody runs it"]) == 1
+    assert not [event for event in store.events(job) if event.message == "it died"]
 
 
 def test_a_job_that_was_to_be_cancelled_when_its_worker_died_is_cancelled(store: JobStore) -> None:
     job = create(store)
-    registry(store, "w").register()
     taken = claim(store)
     assert store.request_cancel(job).state is JobState.running
     assert claims_of(store).advance(taken, HALF)
-    fall_silent(store, "w")
-    registry(store, "other").reap(30)
+    claims_of(store).lose(taken, "it died")
     assert store.get(job).state is JobState.cancelled
 
 
 def test_workers_are_listed_with_what_they_do(store: JobStore) -> None:
-    registry(store, "a").register()
-    registry(store, "b").register()
-    registry(store, "a").beat("job1")
-    registry(store, "b").beat(None)
-    fall_silent(store, "b")
+    mine = [create(store), create(store)]
+    for _ in mine:
+        claim(store, "a")
+    a, b = Worker("a", "here", "16 CPU"), Worker("b", "there", "cpu", "no store")
+    record_workers(store.engine, [a, b])
+    with write(store.engine) as connection:
+        connection.execute(workers.update().values(seen=workers.c.seen - 100))
+    record_workers(store.engine, [a])
     infos = store.workers()
-    assert [(info.id, info.alive, info.job, info.device) for info in infos] == [
-        ("a", True, "job1", "cpu"),
-        ("b", False, None, "cpu"),
+    assert [(info.id, info.alive, info.jobs, info.device, info.fault) for info in infos] == [
+        ("a", True, mine, "16 CPU", None),
+        ("b", False, [], "cpu", "no store"),
     ]
-    registry(store, "b").beat(None)
+    record_workers(store.engine, [a, b])
     assert all(info.alive for info in store.workers())
+    forget_workers(store.engine)
+    assert store.workers() == []
 
 
 def test_statistics_count_jobs_and_tell_how_long_the_oldest_waits(store: JobStore) -> None:
@@ -348,57 +356,55 @@ def test_only_jobs_that_have_ended_are_deleted_and_nothing_of_them_stays(store: 
         assert connection.execute(sa.text("SELECT count(*) FROM job_labels")).scalar_one() == 0
 
 
-def test_work_for_one_is_given_to_one_until_its_time_is_over(store: JobStore) -> None:
+def test_work_for_one_is_given_to_one_until_its_lease_is_over(store: JobStore) -> None:
+    def take(holder: str) -> bool:
+        return take_lease(store.engine, "dispatcher", holder=holder, seconds=60)
+
+    names = ["a", "b", "c", "d"]
     with ThreadPoolExecutor(4) as pool:
-        given = list(pool.map(lambda _: take_lease(store.engine, "retention", seconds=60), range(4)))
-    assert given.count(True) == 1
-    assert not take_lease(store.engine, "retention", seconds=0)
+        given = dict(zip(names, pool.map(take, names), strict=True))
+    (holder,) = [name for name in names if given[name]]
+    assert [name for name in names if take(name)] == [holder]
+    end_lease(store.engine, "dispatcher", holder="nobody")
+    assert not take("e")
+    end_lease(store.engine, "dispatcher", holder=holder)
+    assert take("e")
     with write(store.engine) as connection:
         connection.execute(sa.text("UPDATE leases SET until = 0"))
-    assert take_lease(store.engine, "retention", seconds=60)
+    assert take("f")
 
 
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
-@given(
-    moves=st.lists(st.sampled_from(["claim", "advance", "finish", "give back", "die", "reap", "cancel"]), max_size=25)
-)
+@given(moves=st.lists(st.sampled_from(["claim", "advance", "finish", "give back", "lose", "cancel"]), max_size=25))
 def test_whatever_happens_a_job_is_held_by_one_and_ends_once(store: JobStore, moves: list[str]) -> None:
-    """Two workers play with one job; the one whose claim is older never gets anything through."""
-    job = create(store)
-    names = ("left", "right")
-    for name in names:
-        registry(store, name).register()
-    claims: dict[str, Claim] = {}
+    """Two attempts play with one job; the older one never gets anything through."""
+    job, claims = create(store), claims_of(store)
+    held: dict[int, Claim] = {}
     endings = 0
     for number, move in enumerate(moves):
-        name = names[number % 2]
-        mine, held = claims_of(store, name), claims.get(name)
-        current = held is not None and mine.holds(held)
+        side = number % 2
+        mine, found = held.get(side), store.get(job)
+        current = mine is not None and found.state is JobState.running and found.attempts == mine.attempt
         if move == "claim" and not current:
-            taken = mine.claim(("any",))
-            claims |= {name: taken} if taken is not None and taken.job.id == job else {}
-        elif move in {"advance", "finish", "give back"} and held is not None:
+            taken = claims.claim(Needs(), "w")
+            held |= {side: taken} if taken is not None and taken.job.id == job else {}
+        elif move == "lose" and mine is not None:
+            claims.lose(mine, "it died")
+            assert current or store.get(job) == found
+        elif move in {"advance", "finish", "give back"} and mine is not None:
             write_it: dict[str, Callable[[], object]] = {
-                "advance": partial(mine.advance, held, HALF),
-                "finish": partial(mine.finish, held, DONE),
-                "give back": partial(mine.give_back, held),
+                "advance": partial(claims.advance, mine, HALF),
+                "finish": partial(claims.finish, mine, DONE),
+                "give back": partial(claims.give_back, mine),
             }
             if current:
                 write_it[move]()
                 endings += move == "finish"
-            elif not (move == "finish" and store.get(job).attempts == held.attempt and store.get(job).state.final):
+            elif not (move == "finish" and found.attempts == mine.attempt and found.state.final):
                 with pytest.raises(LostJobError):
                     write_it[move]()
-        elif move == "die":
-            fall_silent(store, name)
-        elif move == "reap":
-            registry(store, name).reap(30)
-            registry(store, name).beat(None)
         elif move == "cancel":
             store.request_cancel(job)
-        holders = [each for each in names if each in claims and claims_of(store, each).holds(claims[each])]
-        found = store.get(job)
-        assert len(holders) == (found.state is JobState.running)
         assert endings <= 1
         assert [event.id for event in store.events(job)] == list(range(1, len(store.events(job)) + 1))
 
@@ -424,12 +430,22 @@ def test_processes_that_migrate_at_once_make_the_tables_once(database_url: str) 
 
 
 def test_the_tables_of_an_earlier_version_are_upgraded_with_their_jobs(store: JobStore) -> None:
-    job = create(store)
+    large, small = create(store, needs={"gpu": 1}), create(store)
     with write(store.engine) as connection:
-        for statement in ("ALTER TABLE jobs DROP COLUMN names", "UPDATE alembic_version SET version_num = '1'"):
-            connection.exec_driver_sql(statement)
+        for statement in (
+            "ALTER TABLE jobs DROP COLUMN names",
+            "UPDATE jobs SET needs = CASE needs WHEN '{}' THEN 'any' ELSE 'cuda' END",
+            "ALTER TABLE leases DROP COLUMN holder",
+            "DELETE FROM leases WHERE name = 'dispatcher'",
+            "ALTER TABLE workers DROP COLUMN fault",
+            "ALTER TABLE workers ADD COLUMN job VARCHAR",
+            "UPDATE alembic_version SET version_num = '1'",
+        ):
+            connection.execute(sa.text(statement))
     store.migrate()
-    assert store.get(job).names == {}
+    assert store.get(large).names == {}
+    assert (store.get(large).needs, store.get(small).needs) == (Needs(gpu=1), Needs())
+    assert take_lease(store.engine, "dispatcher", holder="a", seconds=60)
     assert store.get(store.create(request(), names={"0af3": "cup"})[0].id).names == {"0af3": "cup"}
 
 

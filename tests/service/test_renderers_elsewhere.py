@@ -10,8 +10,8 @@ from tests.served import Served
 from tests.service.processes import listening
 from trompe_client import Client, ServerFault
 from trompe_client._core import Request
-from trompe_server.executor.supervisor import Supervisor
 from trompe_server.renderers.discovery import RendererAddresses
+from trompe_server.service.supervisor import Supervisor
 from trompe_server.settings import Settings
 
 

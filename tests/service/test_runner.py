@@ -9,15 +9,12 @@ from typing import Any, TypeVar
 import pytest
 from prometheus_client import REGISTRY
 
-from trompe_server.executor.heartbeat import Heartbeat
 from trompe_server.executor.runner import JobRunner, OpenedJob
 from trompe_server.job.protocol import DamagedFileError, OnProgress, PhaseReport
-from trompe_server.queue.claims import Claim, Claims, Ending, lose
+from trompe_server.queue.claims import Claims, Ending
 from trompe_server.queue.store import JobStore
-from trompe_server.queue.tables import fresh
-from trompe_server.queue.workers import WorkerRegistry
-from trompe_server.storage.database import DatabaseDownError, write
-from trompe_shared.api import JobRequest, JobState, Progress
+from trompe_server.storage.database import DatabaseDownError
+from trompe_shared.api import JobRequest, JobState, Needs, Progress
 from trompe_shared.errors import RendererError
 
 T = TypeVar("T")
@@ -64,11 +61,10 @@ def submit(store: JobStore) -> str:
 def run(store: JobStore, scripted: Scripted, *, claims: Claims | None = None, **options: Any) -> JobState | None:
     """Submit a job and run it."""
     job = submit(store)
-    runner = runner_of(claims or Claims(store.engine, "w"), scripted, **options)
-    claim = runner.claims.claim(("any",))
+    runner = runner_of(claims or Claims(store.engine), scripted, **options)
+    claim = runner.claims.claim(Needs(), "w")
     assert claim is not None
     state = runner.run(claim)
-    assert runner.current is None
     assert state is None or store.get(job).state is state
     return state
 
@@ -112,7 +108,7 @@ class Deaf(Claims):
 
 def test_a_database_that_goes_away_at_every_write_costs_time_alone(store: JobStore) -> None:
     pipeline = Scripted(a=nothing, b=nothing, c=nothing)
-    assert run(store, pipeline, claims=Deaf(store.engine, "w")) is JobState.succeeded
+    assert run(store, pipeline, claims=Deaf(store.engine)) is JobState.succeeded
     assert pipeline.ran == ["a", "b", "c"]
     (job,) = store.page().jobs
     assert (job.attempts, job.progress.fraction) == (1, 1.0)
@@ -125,9 +121,7 @@ def test_progress_that_cannot_be_written_stops_nothing(store: JobStore) -> None:
         for _ in range(4):
             on_progress(Progress(phase="only", fraction=0.5))
 
-    assert (
-        run(store, Scripted(only=chatty), claims=Deaf(store.engine, "w"), progress_interval=0.0) is JobState.succeeded
-    )
+    assert run(store, Scripted(only=chatty), claims=Deaf(store.engine), progress_interval=0.0) is JobState.succeeded
 
 
 def test_a_phase_that_finds_damage_has_the_one_before_run_again(store: JobStore) -> None:
@@ -186,21 +180,15 @@ def test_a_full_disk_is_told_in_words(store: JobStore, tmp_path: Path, monkeypat
     assert list((tmp_path / "job").iterdir()) == []
 
 
-def test_a_job_that_is_lost_unwinds_at_its_next_step(store: JobStore) -> None:
+def test_a_job_that_is_lost_unwinds_at_its_next_write(store: JobStore) -> None:
     def robbed(on_progress: OnProgress) -> None:
-        registry.register()  # as if another process had started under this name
-        heartbeat.beat()
+        assert claims.lose_unknown({}, "nobody runs it")
         on_progress(Progress(phase="a", fraction=0.5))
         pytest.fail("it went on")
 
+    claims = Claims(store.engine)
     pipeline = Scripted(a=robbed, b=nothing)
-    submit(store)
-    runner = runner_of(Claims(store.engine, "w"), pipeline)
-    registry = WorkerRegistry(store.engine, "w", device="cpu")
-    heartbeat = Heartbeat(registry, runner, silence=30)
-    claim = runner.claims.claim(("any",))
-    assert claim is not None
-    assert runner.run(claim) is None
+    assert run(store, pipeline, claims=claims) is None
     assert pipeline.ran == ["a"]
     assert store.counts()[JobState.queued] == 1
 
@@ -217,10 +205,9 @@ def test_a_lost_attempt_tidies_up_after_itself_where_nobody_else_will(
     store: JobStore, meanwhile: str, kept: list[list[str]]
 ) -> None:
     def overtaken(on_progress: OnProgress) -> None:
-        with write(store.engine) as connection:
-            lose(connection, fresh(connection, job), "it was silent")
-        other = Claims(store.engine, "other")
-        taken = other.claim(("any",))
+        other = Claims(store.engine)
+        other.lose_unknown({}, "it was silent")
+        taken = other.claim(Needs(), "other")
         assert taken is not None
         if meanwhile != "taken":
             other.finish(taken, Ending(JobState.succeeded, public=("result.json",)))
@@ -231,42 +218,11 @@ def test_a_lost_attempt_tidies_up_after_itself_where_nobody_else_will(
 
     tidied: list[list[str]] = []
     job = submit(store)
-    runner = runner_of(Claims(store.engine, "w"), Scripted(a=overtaken), tidy_job=lambda _, names: tidied.append(names))
-    claim = runner.claims.claim(("any",))
+    runner = runner_of(Claims(store.engine), Scripted(a=overtaken), tidy_job=lambda _, names: tidied.append(names))
+    claim = runner.claims.claim(Needs(), "w")
     assert claim is not None
     assert runner.run(claim) is None
     assert tidied == kept
-
-
-def test_nobody_is_called_dead_right_after_all_were_held_up(store: JobStore) -> None:
-    now = 0.0
-
-    class HeldUp(WorkerRegistry):
-        """The database is locked during the beat at 35 s."""
-
-        def beat(self, job: str | None) -> None:
-            nonlocal now
-            now += 20.0 if now == 35.0 else 0.0
-            super().beat(job)
-
-    job = submit(store)
-    registry, runner = HeldUp(store.engine, "w", device="cpu"), JobRunner(Claims(store.engine, "w"), _nothing)
-    heartbeat = Heartbeat(registry, runner, silence=30, clock=lambda: now)
-    while now < 30.0:
-        now += 5.0
-        heartbeat.beat()
-    assert Claims(store.engine, "never seen").claim(("any",)) is not None
-    now = 35.0
-    heartbeat.beat()
-    assert store.get(job).state is JobState.running, "the other one could not be heard, either"
-    while now < 90.0:
-        now += 5.0
-        heartbeat.beat()
-    assert store.get(job).state is JobState.queued
-
-
-def _nothing(_: Claim) -> OpenedJob:
-    raise AssertionError("there is nothing to open")
 
 
 def test_phases_count_their_seconds_and_their_work_by_kind(store: JobStore) -> None:

@@ -22,7 +22,7 @@ from trompe_server.queue.store import JobStore
 from trompe_server.storage.database import connect
 from trompe_server.storage.folders import Folder, JobArtifacts, LocalArtifacts, job_artifacts, open_folder
 from trompe_server.system.files import exclusive
-from trompe_shared.api import JobRequest, JobState
+from trompe_shared.api import JobRequest, JobState, Needs
 from trompe_shared.errors import ClassifierError, SpecError
 from trompe_shared.object3d import pack_zip
 
@@ -215,7 +215,7 @@ def test_retention_deletes_what_is_old_and_nothing_else(store: JobStore, tmp_pat
     for job in (old, running, queued):
         job_artifacts(files, job, attempt=1).write("result.json", b"{}")
     _end(store)
-    assert Claims(store.engine, "w").claim(("any",)) is not None
+    assert Claims(store.engine).claim(Needs(), "w") is not None
     calibrations = LocalArtifacts(tmp_path / "files" / "library" / "calibrations")
     for name, age in (("used.npz", 0.0), ("unused.npz", 10 * 86400.0)):
         calibrations.write(name, b"0")
@@ -294,8 +294,8 @@ def _job(store: JobStore) -> str:
 
 def _end(store: JobStore) -> None:
     """Claim the next job and end it."""
-    claims = Claims(store.engine, "w")
-    claim = claims.claim(("any",))
+    claims = Claims(store.engine)
+    claim = claims.claim(Needs(), "w")
     assert claim is not None
     claims.finish(claim, Ending(JobState.succeeded))
 

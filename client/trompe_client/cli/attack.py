@@ -12,7 +12,7 @@ from trompe_client.cli.connection import out_option, server_option, service, tok
 from trompe_client.cli.following import deliver, follow, follow_our_own
 from trompe_client.cli.options import Sectioned, SectionOption, tag_option
 from trompe_client.cli.output import json_option, say
-from trompe_shared.api import OPTIONS, VIEW_LIMITS, JobRequest, Option, ViewRanges, in_flags
+from trompe_shared.api import OPTIONS, VIEW_LIMITS, JobRequest, Needs, Option, ViewRanges, in_flags
 from trompe_shared.errors import SpecError
 
 
@@ -66,16 +66,29 @@ def flag_of(option: Option) -> SectionOption:
     )
 
 
-def _queue_flag(name: str) -> click.Option:
-    info = JobRequest.model_fields[name]
+def _amounts(_ctx: click.Context, _option: click.Parameter, words: tuple[str, ...]) -> dict[str, str]:
+    pairs = [word.partition("=") for word in words]
+    if wrong := [word for word, pair in zip(words, pairs, strict=True) if not all(pair)]:
+        raise click.BadParameter(f"{wrong[0]!r} should be a name and an amount: gpu=0.5.")
+    return {name: amount for name, _, amount in pairs}
+
+
+def _priority() -> click.Option:
+    info = JobRequest.model_fields["priority"]
     words = f"{info.description}; default: {info.default}."
-    return click.Option([f"--{name}"], type=click.Choice(get_args(info.annotation)), help=words.capitalize())
+    return click.Option(["--priority"], type=click.Choice(get_args(info.annotation)), help=words.capitalize())
+
+
+def _needs() -> click.Option:
+    fields = ", ".join(f"{name} ({info.description})" for name, info in Needs.model_fields.items())
+    words = f"What the job occupies: {fields}. Default: cpu=1. *"
+    return click.Option(["--needs"], multiple=True, metavar="NAME=AMOUNT", callback=_amounts, help=words)
 
 
 PARAMETERS: Final = [click.Argument(["object"]), *map(flag_of, OPTIONS.values())]
 
 
-@click.command(cls=Sectioned, params=[*PARAMETERS, _queue_flag("priority"), _queue_flag("needs")])
+@click.command(cls=Sectioned, params=[*PARAMETERS, _priority(), _needs()])
 @server_option(None)
 @token_option
 @tag_option("Label of your own, to find the job by. *")

@@ -40,7 +40,7 @@ def _group(kind: type[Any], plural: str) -> Callable[[click.Command], click.Grou
     return grouped
 
 
-workers = _list_command(WorkerInfo, "workers", "List the processes that run jobs.")
+workers = _list_command(WorkerInfo, "workers", "List the attack workers.")
 renderers = _list_command(RendererInfo, "renderers", "List the renderer workers.")
 
 

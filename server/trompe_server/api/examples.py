@@ -55,7 +55,7 @@ _JOB: Final[dict[str, Any]] = {
     "names": {},
     "priority": "sweep",
     "labels": {"experiment": "mugs"},
-    "needs": "any",
+    "needs": {"cpu": 1.0, "gpu": 0.0, "memory": 0.0},
     "worker": "gpu-1-4711",
     "created": "2026-01-31T12:00:00Z",
     "started": "2026-01-31T12:00:01Z",
@@ -95,13 +95,14 @@ _CLASSIFIER: Final = {
 }
 _BACKGROUND: Final = {"id": "19581e27de7ced00ff1ce50b2047e7a567c76b1cbaebabe5ef03f7c3017bb5b7", "name": "beach"}
 _WORKER: Final = {
-    "id": "gpu-1-4711",
+    "id": "gpu-1-3f29c1",
     "host": "gpu-1",
-    "device": "cuda:0",
+    "device": "16 CPU, 2 GPU",
     "alive": True,
     "started": "2026-01-31T09:00:00Z",
     "seen": "2026-01-31T12:00:03Z",
-    "job": "8f14e45fceea167a",
+    "jobs": ["8f14e45fceea167a"],
+    "fault": None,
 }
 _EXPERIMENT: Final = {
     "name": "mugs",

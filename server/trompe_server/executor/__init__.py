@@ -1,1 +1,1 @@
-"""Processes that run attempts of jobs: worker, runner, heartbeat, supervisor."""
+"""Who runs attempts of jobs where: the dispatcher over the port ``Executor``, on this machine or on a Ray cluster."""

@@ -1,11 +1,10 @@
-"""Runs one job phase by phase. Each finished phase is recorded, so that another worker can continue after it."""
+"""Runs one attempt of a job phase by phase. Each finished phase is recorded: the next attempt continues after it."""
 
 import logging
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from trompe_server.errors import NotFoundError
@@ -49,34 +48,24 @@ class _Cancelled(_Stop):
 
 
 class _Lost(_Stop):
-    """Another worker has the job."""
+    """The job has a newer attempt or has ended."""
 
 
 @dataclass
 class JobRunner:
-    """Runs jobs one at a time. ``current`` is the running one, ``touched`` the time of its last progress (monotonic).
-
-    Setting ``lost`` unwinds the running job at its next step. Setting ``stopped`` ends the wait for an unreachable
-    database. Progress is written every ``progress_interval`` seconds at most.
-    """
+    """Runs jobs one at a time. Progress is written every ``progress_interval`` seconds at most."""
 
     claims: Claims
     open_job: OpenJob
     tidy_job: TidyJob = lambda _claim, _kept: None
     progress_interval: float = 1.0
     retry_waits: tuple[float, float] = RETRY_WAITS
-    current: Claim | None = None
-    touched: float = field(default_factory=time.monotonic)
-    lost: threading.Event = field(default_factory=threading.Event)
-    stopped: threading.Event = field(default_factory=threading.Event)
 
     def run(self, claim: Claim) -> JobState | None:
-        """Run a job, or continue it. Returns its final state, or ``None`` if another worker took it.
+        """Run a job, or continue it. Returns its final state, or ``None`` if the attempt was lost.
 
         Never raises for errors of the job.
         """
-        self.lost.clear()
-        self.current, self.touched = claim, time.monotonic()
         try:
             ending = self._ending(claim)
             kept = self.patiently(lambda: self.claims.finish(claim, ending))
@@ -86,12 +75,10 @@ class JobRunner:
             logger.warning("job %s was lost: %s", claim.job.id, error)
             self._tidy_after(claim)
             return None
-        finally:
-            self.current = None
 
     def patiently(self, action: Callable[[], T]) -> T:
         """Repeat ``action`` while the database cannot be reached."""
-        return patiently(action, stopped=self.stopped.is_set, waits=self.retry_waits)
+        return patiently(action, waits=self.retry_waits)
 
     def _tidy_after(self, claim: Claim) -> None:
         """Delete the files this attempt wrote after another attempt had ended the job and tidied."""
@@ -178,18 +165,15 @@ class _Phases:
         cancelled = self._runner.patiently(
             lambda: claims.advance(self._claim, report.progress, done=done, public=report.public)
         )
-        self._runner.touched = self._written = time.monotonic()
+        self._written = time.monotonic()
         if cancelled:
             raise _Cancelled
 
     def _on_progress(self, progress: Progress) -> None:
         """Write progress, and unwind the phase if the job was cancelled or lost."""
-        self._runner.touched = time.monotonic()
-        if self._runner.lost.is_set():
-            raise _Lost("another worker has it")
-        if self._runner.touched - self._written < self._runner.progress_interval:
+        if time.monotonic() - self._written < self._runner.progress_interval:
             return
-        self._written = self._runner.touched
+        self._written = time.monotonic()
         try:
             cancelled = self._runner.claims.advance(self._claim, progress)
         except DatabaseDownError as error:

@@ -1,33 +1,33 @@
-"""A worker's view of the queue: claim a job, report progress, end the job or give it back.
+"""The queue as its dispatcher and the attempts see it: claim a job, report progress, end the job or give it back.
 
-Each claim starts a new attempt, and every write names its attempt. After another worker has claimed the job, writes of
-the old attempt raise ``LostJobError``, so a worker that was frozen and comes back changes nothing.
+Each claim starts a new attempt, and every write names its attempt. After the job was claimed again, writes of the old
+attempt raise ``LostJobError``, so a worker that was frozen and comes back changes nothing.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 import sqlalchemy as sa
 
 from trompe_server.errors import NotFoundError
-from trompe_server.queue.tables import Row, fresh, job_of, jobs, locked, update_job
+from trompe_server.queue.tables import Row, events, fresh, job_of, jobs, locked, needs_text, update_job
 from trompe_server.storage.database import clock, write
-from trompe_shared.api import Job, JobState, Progress
+from trompe_shared.api import Job, JobState, Needs, Progress
 
-__all__ = ["MAX_LOST", "Claim", "Claims", "Ending", "LostJobError", "lose"]
+__all__ = ["MAX_LOST", "Claim", "Claims", "Ending", "LostJobError"]
 
 MAX_LOST: Final = 3
-"""Workers that may die in the same phase of a job before the job is failed."""
+"""Attempts that may be lost in the same phase of a job before the job is failed."""
 
 
 class LostJobError(Exception):
-    """The attempt is over: another worker has the job, or the job has ended."""
+    """The attempt is over: the job is queued again, has a newer attempt, or has ended."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A job held by a worker. ``attempt`` counts from 1; ``done`` is the number of finished phases."""
+    """A job held by an attempt. ``attempt`` counts from 1; ``done`` is the number of finished phases."""
 
     job: Job
     attempt: int
@@ -46,33 +46,51 @@ class Ending:
 
 
 class Claims:
-    """Claims of ``worker`` on the jobs in the database of ``engine``. Every call may be repeated after an outage."""
+    """Claims on the jobs in the database of ``engine``. Every call but ``claim`` may be repeated after an outage."""
 
-    def __init__(self, engine: sa.Engine, worker: str) -> None:
-        self._engine, self.worker = engine, worker
+    def __init__(self, engine: sa.Engine) -> None:
+        self.engine = engine
 
-    def claim(self, needs: Sequence[str]) -> Claim | None:
-        """Claim the next queued job with one of these ``needs``; ``None`` if there is none."""
-        if not self._any(_queued(needs)) and not self._any(self._mine()):
-            return None
-        with write(self._engine) as connection:
-            mine = connection.execute(sa.select(jobs).where(self._mine())).first()
-            if mine is not None:  # the answer to the last claim was lost
-                return _claim(mine)
-            found = [row for need in needs if (row := _next(connection, need)) is not None]
-            return self._take(connection, min(found, key=lambda row: (row.priority, row.number))) if found else None
+    def waiting(self) -> dict[Needs, int]:
+        """Number of queued jobs by their needs."""
+        query = sa.select(jobs.c.needs, sa.func.count().label("amount")).where(jobs.c.state == JobState.queued.value)
+        with self.engine.connect() as connection:
+            rows = connection.execute(query.group_by(jobs.c.needs)).all()
+        return {Needs.model_validate_json(row.needs): row.amount for row in rows}
 
-    def _take(self, connection: sa.Connection, row: Row) -> Claim:
-        message = "started" if row.attempts == 0 else f"continued by {self.worker}"
-        values = {"state": JobState.running.value, "worker": self.worker, "attempts": row.attempts + 1}
-        started = sa.func.coalesce(jobs.c.started, clock())
-        return _claim(update_job(connection, row.id, message=message, started=started, **values))
+    def upcoming(self) -> list[Needs]:
+        """Different needs of the queued jobs; first those of the job to run next. Takes no longer for more jobs."""
+        found, text = [], ""
+        following = sa.select(sa.func.min(jobs.c.needs)).where(jobs.c.state == JobState.queued.value)
+        with self.engine.connect() as connection:
+            while (text := connection.scalar(following.where(jobs.c.needs > text))) is not None:
+                needs = Needs.model_validate_json(text)
+                found.append((*connection.execute(_first(needs)).one(), needs))
+        return [needs for *_, needs in sorted(found, key=lambda each: each[:2])]
+
+    def claim(self, needs: Needs, worker: str) -> Claim | None:
+        """Claim the next queued job with these ``needs`` for ``worker``; ``None`` if there is none.
+
+        A claim whose answer is lost is a running job that the dispatcher does not know: ``lose_unknown``.
+        """
+        query = _first(needs).with_only_columns(*jobs.c)
+        with write(self.engine) as connection:
+            row = connection.execute(query.with_for_update(skip_locked=True)).first()
+            return None if row is None else _take(connection, row, worker)
+
+    def explain(self, reasons: Mapping[Needs, str]) -> None:
+        """Tell the queued jobs with these needs why they wait."""
+        for needs, reason in reasons.items():
+            told = sa.and_(_queued(needs), jobs.c.note.is_distinct_from(reason))
+            with write(self.engine) as connection:
+                for job in connection.execute(sa.select(jobs.c.id).where(told).with_for_update()).scalars().all():
+                    update_job(connection, job, message=reason, note=reason)
 
     def advance(
         self, claim: Claim, progress: Progress, *, done: int | None = None, public: tuple[str, ...] = ()
     ) -> bool:
         """Write progress, the number of finished phases and public artifacts. Returns whether to cancel the job."""
-        with write(self._engine) as connection:
+        with write(self.engine) as connection:
             row = _held(connection, claim)
             values: dict[str, Any] = {"progress": progress.model_dump(mode="json")}
             if done is not None:
@@ -83,7 +101,7 @@ class Claims:
 
     def finish(self, claim: Claim, ending: Ending) -> list[str]:
         """End the job and return its artifacts. Ending it again in the same attempt changes nothing."""
-        with write(self._engine) as connection:
+        with write(self.engine) as connection:
             row = locked(connection, claim.job.id)
             if JobState(row.state).final and row.attempts == claim.attempt:
                 return list(row.artifacts)
@@ -96,37 +114,59 @@ class Claims:
             return artifacts
 
     def give_back(self, claim: Claim) -> None:
-        """Requeue the job at an orderly stop of the worker. It does not count as lost."""
-        with write(self._engine) as connection:
+        """Requeue the job at an orderly stop. It does not count as lost."""
+        with write(self.engine) as connection:
             row = _held(connection, claim)
             message = "the worker stopped; the next one continues the job"
             update_job(connection, row.id, message=message, state=JobState.queued.value)
 
-    def holds(self, claim: Claim) -> bool:
-        """Return whether the claim is still valid."""
-        with self._engine.connect() as connection:
-            return _is_held(fresh(connection, claim.job.id), claim)
+    def lose(self, claim: Claim, reason: str) -> None:
+        """Take the job from its attempt, which died or stands still, unless the attempt is over."""
+        with write(self.engine) as connection:
+            row = locked(connection, claim.job.id)
+            if _is_held(row, claim):
+                _lose(connection, row, reason)
+
+    def lose_unknown(self, known: Mapping[str, Claim], reason: str) -> list[str]:
+        """Take the running jobs whose attempts are not ``known`` (by job). Returns their ids."""
+        ours = {job: claim.attempt for job, claim in known.items()}
+        running = sa.select(jobs.c.id, jobs.c.attempts).where(jobs.c.state == JobState.running.value)
+        with self.engine.connect() as connection:
+            unknown = [row.id for row in connection.execute(running) if ours.get(row.id) != row.attempts]
+        for job in unknown:
+            with write(self.engine) as connection:
+                row = locked(connection, job)
+                if row.state == JobState.running and ours.get(job) != row.attempts:
+                    _lose(connection, row, reason)
+        return unknown
+
+    def still(self, seconds: float) -> dict[str, int]:
+        """Running jobs without an event for ``seconds``: their attempts, by job."""
+        last = sa.and_(events.c.job == jobs.c.id, events.c.id == jobs.c.events)
+        query = sa.select(jobs.c.id, jobs.c.attempts).join(events, last)
+        query = query.where(jobs.c.state == JobState.running.value, events.c.time < clock() - seconds)
+        with self.engine.connect() as connection:
+            return {row.id: row.attempts for row in connection.execute(query)}
 
     def ended_artifacts(self, claim: Claim) -> list[str] | None:
         """Artifacts of the job if it has ended, none if it was deleted; ``None`` while it is queued or running."""
         try:
-            with self._engine.connect() as connection:
+            with self.engine.connect() as connection:
                 row = fresh(connection, claim.job.id)
         except NotFoundError:
             return []
         return list(row.artifacts) if JobState(row.state).final else None
 
-    def _any(self, condition: sa.ColumnElement[bool]) -> bool:
-        """Return whether such a job exists, without a lock."""
-        with self._engine.connect() as connection:
-            return connection.execute(sa.select(jobs.c.number).where(condition).limit(1)).first() is not None
 
-    def _mine(self) -> sa.ColumnElement[bool]:
-        return sa.and_(jobs.c.state == JobState.running.value, jobs.c.worker == self.worker)
+def _take(connection: sa.Connection, row: Row, worker: str) -> Claim:
+    message = "started" if row.attempts == 0 else f"continued by {worker}"
+    values = {"state": JobState.running.value, "worker": worker, "attempts": row.attempts + 1, "note": None}
+    started = sa.func.coalesce(jobs.c.started, clock())
+    return _claim(update_job(connection, row.id, message=message, started=started, **values))
 
 
-def lose(connection: sa.Connection, row: Row, reason: str) -> None:
-    """Take a running job from its dead worker: requeue it, or fail it at ``MAX_LOST`` lost workers."""
+def _lose(connection: sa.Connection, row: Row, reason: str) -> None:
+    """Requeue a running job, or fail it at ``MAX_LOST`` lost attempts."""
     lost = row.lost + 1
     ended = {"lost": lost, "finished": clock()}
     if row.cancel_requested:
@@ -138,14 +178,14 @@ def lose(connection: sa.Connection, row: Row, reason: str) -> None:
         update_job(connection, row.id, message=reason, state=JobState.queued.value, lost=lost)
 
 
-def _queued(needs: Sequence[str]) -> sa.ColumnElement[bool]:
-    return sa.and_(jobs.c.state == JobState.queued.value, jobs.c.needs.in_(needs))
+def _queued(needs: Needs) -> sa.ColumnElement[bool]:
+    return sa.and_(jobs.c.state == JobState.queued.value, jobs.c.needs == needs_text(needs))
 
 
-def _next(connection: sa.Connection, need: str) -> Row | None:
-    """The next job with this need, except jobs another worker is claiming right now."""
-    query = sa.select(jobs).where(_queued([need])).order_by(jobs.c.priority, jobs.c.number).limit(1)
-    return connection.execute(query.with_for_update(skip_locked=True)).first()
+def _first(needs: Needs) -> sa.Select[tuple[int, int]]:
+    """Priority and number of the queued job with these needs that runs next."""
+    query = sa.select(jobs.c.priority, jobs.c.number).where(_queued(needs))
+    return query.order_by(jobs.c.priority, jobs.c.number).limit(1)
 
 
 def _held(connection: sa.Connection, claim: Claim) -> Row:

@@ -1,4 +1,4 @@
-"""Leases: periodic work done by one process at a time."""
+"""Leases: work done by one process at a time."""
 
 from typing import Final
 
@@ -7,13 +7,35 @@ import sqlalchemy as sa
 from trompe_server.queue.tables import leases
 from trompe_server.storage.database import clock, write
 
-__all__ = ["RETENTION", "take_lease"]
+__all__ = ["DISPATCHER", "RETENTION", "end_lease", "is_leased", "lease_holder", "take_lease"]
 
+DISPATCHER: Final = "dispatcher"
 RETENTION: Final = "retention"
 
 
-def take_lease(engine: sa.Engine, name: str, *, seconds: float) -> bool:
-    """Return whether this process may do the work ``name`` now. No other process gets it for ``seconds``."""
-    free = sa.and_(leases.c.name == name, leases.c.until < clock())
+def take_lease(engine: sa.Engine, name: str, *, holder: str, seconds: float) -> bool:
+    """Take or renew the lease of the work ``name``; return whether ``holder`` has it for the next ``seconds``."""
+    free = sa.and_(leases.c.name == name, sa.or_(leases.c.until < clock(), leases.c.holder == holder))
+    taken = leases.update().where(free).values(until=clock() + seconds, holder=holder)
     with write(engine) as connection:
-        return connection.execute(leases.update().where(free).values(until=clock() + seconds)).rowcount == 1
+        return connection.execute(taken).rowcount == 1
+
+
+def lease_holder(engine: sa.Engine, name: str) -> str | None:
+    """Who has, or had last, the lease of the work ``name``."""
+    with engine.connect() as connection:
+        return connection.scalar(sa.select(leases.c.holder).where(leases.c.name == name))
+
+
+def is_leased(engine: sa.Engine, name: str) -> bool:
+    """Whether anybody has the lease of the work ``name`` now."""
+    with engine.connect() as connection:
+        held = sa.select(leases.c.name).where(leases.c.name == name, leases.c.until > clock())
+        return connection.scalar(held) is not None
+
+
+def end_lease(engine: sa.Engine, name: str, *, holder: str) -> None:
+    """End the lease of ``holder`` now, if it has it."""
+    held = sa.and_(leases.c.name == name, leases.c.holder == holder)
+    with write(engine) as connection:
+        connection.execute(leases.update().where(held).values(until=0.0))

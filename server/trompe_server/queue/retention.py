@@ -1,6 +1,7 @@
 """Deletes jobs with their files: one on request, and old ones after a number of days."""
 
 import logging
+import secrets
 import time
 from typing import Final
 
@@ -34,13 +35,14 @@ class Retention:
 
     def __init__(self, store: JobStore, files: Folder, *, days: float) -> None:
         self._store, self._files, self._kept = store, files, days * DAY
+        self._name = secrets.token_hex(4)
         self.interval = max(1.0, min(INTERVAL, self._kept / 4))
 
     def run_forever(self) -> None:
         """Run periodically, unless another process holds the lease."""
         while self._kept:
             try:
-                if take_lease(self._store.engine, RETENTION, seconds=self.interval * 0.9):
+                if take_lease(self._store.engine, RETENTION, holder=self._name, seconds=self.interval * 0.9):
                     self.run()
             except Exception:
                 logger.exception("cannot delete old jobs; retry in %.0f s", self.interval)

@@ -22,6 +22,7 @@ from trompe_server.queue.tables import (
     jobs,
     labels,
     locked,
+    needs_text,
     time_of,
     update_job,
     workers,
@@ -54,7 +55,7 @@ class JobStore:
     """Jobs and their events in the database at ``url``. Safe to use from many threads and processes.
 
     Every method raises ``DatabaseDownError``, a ``ServiceError``, if the database cannot be reached.
-    ``silence``: seconds without a heartbeat after which a worker counts as dead.
+    ``silence``: seconds without being seen after which a worker counts as dead.
     """
 
     def __init__(self, url: str, *, silence: float = 30.0) -> None:
@@ -191,14 +192,17 @@ class JobStore:
             return list(connection.execute(query).scalars())
 
     def workers(self) -> list[WorkerInfo]:
-        """Registered workers, dead ones included."""
+        """Recorded workers with their running jobs, dead ones included."""
         alive = (workers.c.seen > clock() - self._silence).label("alive")
+        running = sa.select(jobs.c.worker, jobs.c.id).where(jobs.c.state == JobState.running.value)
         with self.engine.connect() as connection:
             rows = connection.execute(sa.select(workers, alive).order_by(workers.c.id)).all()
+            at_work = connection.execute(running.order_by(jobs.c.number)).all()
         return [
             WorkerInfo.model_validate(
-                {name: getattr(row, name) for name in ("id", "host", "device", "alive", "job")}
+                {name: getattr(row, name) for name in ("id", "host", "device", "alive", "fault")}
                 | {"started": time_of(row.started), "seen": time_of(row.seen)}
+                | {"jobs": [job.id for job in at_work if job.worker == row.id]}
             )
             for row in rows
         ]
@@ -225,7 +229,7 @@ def _row(request: JobRequest, names: Mapping[str, str], key: str | None) -> dict
         "object": request.object,
         "classifier": request.victim.classifier,
         "priority": PRIORITIES[request.priority],
-        "needs": request.needs,
+        "needs": needs_text(request.needs),
         "labels": request.labels,
         "idempotency_key": key,
         "created": clock(),

@@ -1,5 +1,6 @@
 """Tables of jobs and workers, and conversion of their rows. The queue is the set of jobs in state ``queued``."""
 
+import json
 from datetime import UTC, datetime
 from typing import Any, Final
 
@@ -7,10 +8,10 @@ import sqlalchemy as sa
 
 from trompe_server.errors import NotFoundError
 from trompe_server.storage.database import clock
-from trompe_shared.api import Event, Job
+from trompe_shared.api import Event, Job, Needs
 
 __all__ = ["PRIORITIES", "Row", "append_event", "event_of", "events", "fresh", "job_of", "jobs", "labels", "leases"]
-__all__ += ["locked", "metadata", "time_of", "update_job", "workers"]
+__all__ += ["locked", "metadata", "needs_text", "time_of", "update_job", "workers"]
 
 PRIORITIES: Final = {"interactive": 10, "normal": 100, "sweep": 1000}
 """Lower numbers run first."""
@@ -49,8 +50,9 @@ jobs = sa.Table(
     sa.Column("names", sa.JSON, nullable=False, server_default="{}"),
     sqlite_autoincrement=True,
 )
-"""``attempts`` counts claims, and a worker must name its attempt to write; ``lost`` counts workers that died with the
-job since its last finished phase; ``done`` counts finished phases; ``events`` counts the rows in ``job_events``.
+"""``attempts`` counts claims, and an attempt must name itself to write; ``lost`` counts attempts lost since the last
+finished phase; ``done`` counts finished phases; ``events`` counts the rows in ``job_events``. ``needs`` is JSON without
+defaults.
 """
 sa.Index("jobs_by_state", jobs.c.state, jobs.c.number)
 sa.Index("jobs_by_object", jobs.c.object, jobs.c.number)
@@ -86,7 +88,7 @@ workers = sa.Table(
     sa.Column("device", sa.String, nullable=False),
     sa.Column("started", sa.Double, nullable=False),
     sa.Column("seen", sa.Double, nullable=False),
-    sa.Column("job", sa.String),
+    sa.Column("fault", sa.String),
 )
 
 leases = sa.Table(
@@ -94,8 +96,9 @@ leases = sa.Table(
     metadata,
     sa.Column("name", sa.String, primary_key=True),
     sa.Column("until", sa.Double, nullable=False),
+    sa.Column("holder", sa.String, nullable=False, server_default=""),
 )
-"""Work done by one process at a time. ``until``: end of the current lease."""
+"""Work done by one process at a time. ``until``: end of the holder's lease."""
 
 
 def fresh(connection: sa.Connection, job: str) -> Row:
@@ -129,6 +132,11 @@ def append_event(connection: sa.Connection, row: Row, message: str | None) -> No
     connection.execute(events.insert().values(time=clock(), **values))
 
 
+def needs_text(needs: Needs) -> str:
+    """The needs as the column has them: the same text for the same needs."""
+    return needs.model_dump_json(exclude_defaults=True)
+
+
 def time_of(seconds: float | None) -> datetime | None:
     """Seconds since 1970 as a UTC time."""
     return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
@@ -140,7 +148,6 @@ _SAME: Final = (
     "spec",
     "names",
     "labels",
-    "needs",
     "worker",
     "progress",
     "attempts",
@@ -155,7 +162,8 @@ def job_of(row: Row) -> Job:
     """Convert a row of ``jobs`` to the API's model. Raises pydantic's ``ValidationError`` for a malformed row."""
     same = {name: getattr(row, name) for name in _SAME}
     times = {name: time_of(getattr(row, name)) for name in ("created", "started", "finished")}
-    return Job.model_validate(same | times | {"priority": _PRIORITY_NAMES.get(row.priority, row.priority)})
+    asked = {"priority": _PRIORITY_NAMES.get(row.priority, row.priority), "needs": json.loads(row.needs)}
+    return Job.model_validate(same | times | asked)
 
 
 def event_of(row: Row) -> Event:

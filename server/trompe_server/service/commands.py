@@ -62,6 +62,18 @@ _renderers_dns = click.option(
 _device = click.option("--device", metavar="DEVICE", help="cpu, cuda or cuda:1 (or TROMPE_DEVICE). Default: cpu.")
 
 
+_workers = click.option(
+    "--workers",
+    type=click.IntRange(0, 64),
+    help="Attack workers, which share the cores (or TROMPE_WORKERS); 0: `trompe worker` runs the jobs. Default: 1.",
+)
+_executor = click.option(
+    "--executor",
+    metavar="NAME",
+    help="local, ray://HOST:PORT or ray-local (or TROMPE_EXECUTOR): what runs the jobs. Default: local.",
+)
+
+
 def for_people(command: Callable[P, R]) -> Callable[P, R]:
     """Print errors as one sentence instead of a traceback."""
 
@@ -91,11 +103,8 @@ def _announce(line: str) -> None:
 @click.command()
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option("--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="Port; 0: a free one.")
-@click.option(
-    "--workers",
-    type=click.IntRange(0, 64),
-    help="Attack workers, which share the cores (or TROMPE_WORKERS); 0: all run elsewhere. Default: 1.",
-)
+@_workers
+@_executor
 @click.option(
     "--renderers",
     type=click.IntRange(0, 64),
@@ -142,13 +151,16 @@ def serve(
 @_renderer
 @_renderers_dns
 @_device
+@_workers
+@_executor
 @for_people
-def worker(data: Path | None, listed: tuple[str, ...], names: tuple[str, ...], **options: str | None) -> None:
-    """Run an attack worker for the jobs of a shared database and store.
+def worker(data: Path | None, listed: tuple[str, ...], names: tuple[str, ...], **options: str | int | None) -> None:
+    """Run the jobs of a database, without the API: in processes of this machine, or on a Ray cluster.
 
-    TROMPE_METRICS_PORT serves its Prometheus metrics at that port.
+    A second `trompe worker` on the same database waits until the first one stops or dies. --executor ray://HOST:PORT
+    needs the cluster extra. TROMPE_METRICS_PORT serves the workers' Prometheus metrics at that port.
     """
-    from trompe_server.executor.worker import run_worker
+    from trompe_server.service.dispatch import run_worker
 
     if not listed and not names:
         raise click.UsageError("Name the renderer workers by --renderer HOST:PORT or --renderers-dns NAME:PORT.")
@@ -162,7 +174,7 @@ def worker(data: Path | None, listed: tuple[str, ...], names: tuple[str, ...], *
 @for_people
 def migrate(data: Path | None, database: str | None) -> None:
     """Create or upgrade the tables in the database."""
-    from trompe_server.executor.worker import prepare_data
+    from trompe_server.service.dispatch import prepare_data
 
     log_to_stderr()
     prepare_data(settings_of(data, database=database))

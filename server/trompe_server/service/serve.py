@@ -2,10 +2,10 @@
 
 import ipaddress
 import resource
-import shutil
 import signal
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Final, NoReturn
 
@@ -14,12 +14,12 @@ import uvicorn
 
 from trompe_server.api.services import Services
 from trompe_server.errors import ServiceError
-from trompe_server.executor.supervisor import Supervisor
-from trompe_server.executor.worker import prepare_data
 from trompe_server.library import Library
 from trompe_server.queue.store import JobStore
 from trompe_server.renderers.discovery import RendererAddresses
 from trompe_server.service.app import create_app
+from trompe_server.service.dispatch import dispatching, prepare_data
+from trompe_server.service.supervisor import Supervisor
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import open_folder
 from trompe_server.storage.tokens import Tokens
@@ -55,14 +55,27 @@ def run_service(
         _listen(host, port) as listener,
         Supervisor(settings, elsewhere) as supervisor,
     ):
-        shutil.rmtree(settings.metrics_folder, ignore_errors=True)
-        settings.metrics_folder.mkdir()
         supervisor.start()
-        _serve_http(settings, supervisor, listener, announce)
+        with _attack_workers(settings, supervisor.addresses) as missing:
+            _serve_http(settings, supervisor, lambda: [*supervisor.missing(), *missing()], listener, announce)
+
+
+@contextmanager
+def _attack_workers(settings: Settings, renderers: RendererAddresses) -> Iterator[Callable[[], list[str]]]:
+    """Dispatch jobs during the block, unless all workers are elsewhere. Yields what is wrong with them, in words."""
+    if not settings.workers:
+        yield list
+        return
+    with dispatching(settings, renderers) as dispatcher:
+        yield lambda: [dispatcher.fault] if dispatcher.fault else []
 
 
 def _serve_http(
-    settings: Settings, supervisor: Supervisor, listener: socket.socket, announce: Callable[[str], None]
+    settings: Settings,
+    supervisor: Supervisor,
+    missing: Callable[[], list[str]],
+    listener: socket.socket,
+    announce: Callable[[str], None],
 ) -> None:
     store, files = JobStore(settings.database_url, silence=settings.silence), open_folder(settings.store_url)
     if store.engine.dialect.name == "sqlite":
@@ -70,7 +83,7 @@ def _serve_http(
     library = Library(files.within("library"), cache=settings.data / "cache")
     library.objects()  # reads the shipped ones before the first request
     tokens = Tokens(store.engine)
-    services = Services(settings, library, store, files, tokens, supervisor.renderer_infos, supervisor.missing)
+    services = Services(settings, library, store, files, tokens, supervisor.renderer_infos, missing)
     app = create_app(services)
     _allow_many_connections()
     config = uvicorn.Config(

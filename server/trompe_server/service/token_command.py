@@ -83,8 +83,8 @@ def revoke(name: str, data: Path | None, database: str | None) -> None:
 @contextmanager
 def _tokens(settings: Settings) -> Iterator[Tokens]:
     """Open the tokens in the database of ``settings``; create the database if it is missing."""
-    from trompe_server.executor.worker import prepare_data
     from trompe_server.queue.store import JobStore
+    from trompe_server.service.dispatch import prepare_data
 
     prepare_data(settings)
     store = JobStore(settings.database_url)

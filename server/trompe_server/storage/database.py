@@ -105,10 +105,9 @@ def write(engine: sa.Engine) -> Iterator[sa.Connection]:
 def patiently(
     action: Callable[[], T],
     *,
-    stopped: Callable[[], bool] = lambda: False,
     waits: tuple[float, float] = RETRY_WAITS,
 ) -> T:
-    """Call ``action`` until the database can be reached, or raise ``DatabaseDownError`` once ``stopped``.
+    """Call ``action`` until the database can be reached.
 
     ``action`` must be idempotent: its answer can be lost after the database has committed it.
     """
@@ -117,8 +116,6 @@ def patiently(
         try:
             return action()
         except DatabaseDownError as error:
-            if stopped():
-                raise
             logger.warning("%s Retrying.", error)
         time.sleep(wait * random.uniform(0.5, 1.0))
         wait = min(wait * 2, longest)

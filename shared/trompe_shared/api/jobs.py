@@ -25,7 +25,6 @@ Loss = Literal["margin", "cross_entropy"]
 PipelineName = Literal["none", "robust", "transfer"]
 Conditions = Literal["usual", "wide"]
 Priority = Literal["interactive", "normal", "sweep"]
-Needs = Literal["any", "cpu", "cuda"]
 Labels = Annotated[
     dict[
         Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,62}$")],
@@ -49,6 +48,17 @@ VIEWS_PER_STEP: Final = 40
 
 class _Part(Schema):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Needs(_Part):
+    """What an attempt of a job occupies while it runs."""
+
+    cpu: float = Field(default=1.0, ge=0, description="cores; several small jobs may share one")
+    gpu: float = Field(default=0.0, ge=0, description="CUDA devices; 0.5: two such jobs share one")
+    memory: float = Field(default=0.0, ge=0, description="GiB")
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name} {value:g}" for name, value in self if value) or "nothing"
 
 
 class ViewRanges(_Part):
@@ -427,7 +437,7 @@ class JobRequest(JobSpec):
 
     priority: Priority = Field("normal", description="interactive jobs run first, sweeps last")
     labels: Labels = Field(default_factory=dict)
-    needs: Needs = Field("any", description="device of the worker")
+    needs: Needs = Field(default_factory=Needs, description="what the job occupies: cpu, gpu, memory (GiB)")
 
     def spec(self) -> JobSpec:
         """The job alone."""

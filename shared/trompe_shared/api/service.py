@@ -53,7 +53,7 @@ class Job(Schema):
     names: dict[str, str] = Field(default_factory=dict, description="names of stored things in ``spec``, by id")
     priority: Priority = "normal"
     labels: Labels = Field(default_factory=dict)
-    needs: Needs = "any"
+    needs: Needs = Field(default_factory=Needs)
     worker: str | None = Field(None, description="worker of the latest attempt")
     created: datetime
     started: datetime | None = None
@@ -73,7 +73,7 @@ class JobList(Schema):
 
 
 class WorkerInfo(Schema):
-    """An attack worker by its latest heartbeat. ``job`` is its running job."""
+    """An attack worker: a process of one machine, or a node of a cluster. ``jobs`` run there unless ``fault``."""
 
     id: str
     host: str
@@ -81,7 +81,8 @@ class WorkerInfo(Schema):
     alive: bool
     started: datetime
     seen: datetime
-    job: str | None = None
+    jobs: list[str] = Field(default_factory=list)
+    fault: str | None = None
 
 
 class RendererInfo(Schema):

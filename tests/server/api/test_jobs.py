@@ -21,7 +21,11 @@ def test_a_job_keeps_the_ids_of_what_it_names_and_shows_what_the_queue_knows_of_
     white = encode_png(np.full((8, 8, 3), 255, np.uint8))
     picture = stocked.post("/v1/backgrounds", files={"file": ("beach.png", white)}).json()["id"]
     named: dict[str, Any] = {"judges": ["net"], "ensemble": ["member"], "masks": {"paint.png": "beach"}}
-    queued: dict[str, Any] = {"priority": "sweep", "needs": "cuda", "labels": {"team": "a"}}
+    queued: dict[str, Any] = {
+        "priority": "sweep",
+        "needs": {"cpu": 1.0, "gpu": 0.5, "memory": 4.0},
+        "labels": {"team": "a"},
+    }
     named |= {"materials": ["paint"], "background": ["beach", "#00ff00"]}
     answer = stocked.submit(label="CUP", **named, **queued)
     job = answer.json()

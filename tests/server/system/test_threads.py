@@ -7,7 +7,7 @@ import sys
 
 SAYS = """
 import json, os, sys
-import trompe_server.executor.worker
+import trompe_server.executor.dispatcher, trompe_server.executor.process
 too_late = "torch" in sys.modules
 from trompe_server.system.threads import prepare_threads
 prepare_threads(1)

@@ -1,4 +1,4 @@
-"""Supervisor of the children of ``trompe serve``, renderers and workers: starts, restarts and stops them."""
+"""Supervisor of the renderer workers of ``trompe serve``: starts, restarts and stops them."""
 
 import logging
 import os
@@ -8,14 +8,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from types import TracebackType
 from typing import Final, Self
 
 from trompe_server.errors import ServiceError
-from trompe_server.executor.worker import READY
 from trompe_server.renderers.discovery import MAX_PROBES, Address, RendererAddresses
 from trompe_server.settings import Settings
 from trompe_shared.api import RendererInfo
@@ -42,18 +41,11 @@ PROBE_PATIENCE: Final = 1.0
 class Child:
     """One supervised process. ``command`` returns its arguments at each start.
 
-    ``ready`` matches the line it prints once it is up; its other lines are logged. ``environment`` is added to ours.
+    ``ready`` matches the line it prints once it is up; its other lines are logged.
     """
 
-    def __init__(
-        self,
-        name: str,
-        command: Callable[[], list[str]],
-        ready: re.Pattern[str],
-        environment: Mapping[str, str] | None = None,
-    ) -> None:
+    def __init__(self, name: str, command: Callable[[], list[str]], ready: re.Pattern[str]) -> None:
         self.name, self._command, self._ready = name, command, ready
-        self._environment = os.environ | (environment or {})
         self.match: re.Match[str] | None = None
         self.failures = 0
         self._process: subprocess.Popen[str] | None = None
@@ -115,9 +107,7 @@ class Child:
         """
         command = [sys.executable, "-m", "trompe_server.system.child", *self._command()]
         pipe = subprocess.PIPE
-        with subprocess.Popen(
-            command, stdin=pipe, stdout=pipe, text=True, process_group=0, env=self._environment
-        ) as process:
+        with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, process_group=0) as process:
             self._process = process
             os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + NICE)
             if self._stopping.is_set():
@@ -139,7 +129,7 @@ class Child:
 
 
 class Supervisor:
-    """The children of ``trompe serve``; a context manager. A restarted renderer keeps its port.
+    """The renderers of ``trompe serve``; a context manager. A restarted one keeps its port.
 
     RendererAddresses ``elsewhere`` are used and probed, but not supervised.
     """
@@ -151,9 +141,6 @@ class Supervisor:
         self.renderers = [
             Child("renderer worker", partial(self._render, number), listening) for number in range(settings.renderers)
         ]
-        ready = re.compile(f"^{re.escape(READY)}$")
-        environment = worker_environment(settings)
-        self.workers = [Child("attack worker", self._work, ready, environment) for _ in range(settings.workers)]
 
     def __enter__(self) -> Self:
         return self
@@ -169,20 +156,15 @@ class Supervisor:
         for renderer in self.renderers:
             renderer.start()
         self._ports = [int(renderer.wait_ready(deadline)[2]) for renderer in self.renderers]
-        for worker in self.workers:
-            worker.start()
-        for worker in self.workers:
-            worker.wait_ready(deadline)
 
     def stop(self) -> None:
-        """End all children, attack workers first."""
-        for children in (self.workers, self.renderers):
-            with ThreadPoolExecutor(max(1, len(children))) as pool:
-                list(pool.map(Child.stop, children))
+        """End all children."""
+        with ThreadPoolExecutor(max(1, len(self.renderers))) as pool:
+            list(pool.map(Child.stop, self.renderers))
 
     def missing(self) -> list[str]:
-        """Faults of the service right now, in words; empty if it is ready."""
-        words = [f"the {child.name} is not running" for child in (*self.workers, *self.renderers) if not child.up]
+        """Faults of the renderers right now, in words; empty if they are ready."""
+        words = [f"the {child.name} is not running" for child in self.renderers if not child.up]
         if not words and not all(_accepts("127.0.0.1", port) for port in self._ports):
             words.append("a renderer worker does not answer")
         elsewhere = not self._ports and self._elsewhere != RendererAddresses()
@@ -202,28 +184,14 @@ class Supervisor:
         except RendererError:
             return []
 
+    @property
+    def addresses(self) -> RendererAddresses:
+        """The renderers here and elsewhere."""
+        here = tuple(("127.0.0.1", port) for port in self._ports)
+        return RendererAddresses((*here, *self._elsewhere.listed), self._elsewhere.dns)
+
     def _render(self, number: int) -> list[str]:
         return ["render", "--host", "127.0.0.1", "--port", str(self._ports[number]), *self._settings.engine_flags]
-
-    def _work(self) -> list[str]:
-        listed = [*(("127.0.0.1", port) for port in self._ports), *self._elsewhere.listed]
-        renderers = [word for host, port in listed for word in ("--renderer", f"{host}:{port}")]
-        names = [word for name, port in self._elsewhere.dns for word in ("--renderers-dns", f"{name}:{port}")]
-        return ["worker", *renderers, *names]
-
-
-def worker_environment(settings: Settings) -> dict[str, str]:
-    """Environment of the attack workers of this machine: settings, threads of each, and the folder of metrics."""
-    threads = max(1, len(os.sched_getaffinity(0)) // max(1, settings.workers))
-    return {
-        "TROMPE_DATA": str(settings.data.absolute()),
-        "TROMPE_DATABASE": settings.database_url,
-        "TROMPE_STORE": settings.store_url,
-        "TROMPE_DEVICE": settings.device,
-        "TROMPE_METRICS_PORT": "0",
-        "PROMETHEUS_MULTIPROC_DIR": str(settings.metrics_folder),
-        "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(threads)),
-    }
 
 
 def _info(address: Address) -> RendererInfo:

@@ -1,0 +1,83 @@
+"""Attempts of jobs in this process, one after the other."""
+
+import logging
+from pathlib import Path
+from typing import Final
+
+from trompe_server.executor.opener import JobOpener, load
+from trompe_server.executor.runner import JobRunner
+from trompe_server.queue.claims import Claim, Claims
+from trompe_server.queue.leases import DISPATCHER, lease_holder
+from trompe_server.queue.store import JobStore
+from trompe_server.renderers.discovery import RendererAddresses
+from trompe_server.settings import Settings
+from trompe_server.storage.database import connect
+from trompe_server.storage.folders import open_folder
+from trompe_server.system.log import about_job, log_to_stderr
+from trompe_server.system.memory import keep_freed_memory
+from trompe_server.system.threads import prepare_threads
+from trompe_shared.errors import TrompeError
+
+__all__ = ["MARK", "Attempts", "fault_here"]
+
+logger = logging.getLogger(__name__)
+
+MARK: Final = "cluster-mark"
+"""File in the store with the name of the dispatcher: a node that reads it has our store."""
+
+
+class Attempts:
+    """Runs attempts with ``settings`` and ``renderers``. Imports torch at once, so that the first job need not wait."""
+
+    def __init__(self, settings: Settings, renderers: RendererAddresses) -> None:
+        log_to_stderr()
+        keep_freed_memory()
+        prepare_threads()
+        opener = JobOpener(settings, open_folder(settings.store_url), renderers)
+        self._runner = JobRunner(Claims(JobStore(settings.database_url).engine), opener.open, opener.tidy)
+        _preload(settings.pipeline)
+
+    def run(self, claim: Claim) -> str | None:
+        """Run an attempt. Returns why it was lost, or ``None`` if the record has its end."""
+        try:
+            with about_job(claim.job.id):
+                self._runner.run(claim)
+        except Exception as error:
+            logger.exception("attempt %d of job %s was lost", claim.attempt, claim.job.id)
+            return f"{type(error).__name__}: {error}"
+        return None
+
+
+def fault_here(settings: Settings, mark: str) -> str | None:
+    """What this machine lacks of a shared service: the database or the store with the dispatcher's ``mark``."""
+    try:
+        settings.data.mkdir(parents=True, exist_ok=True)
+        if not _is_dispatcher(settings, mark):
+            return f"it sees another database at {_place(settings)}; all nodes must reach the same one (PostgreSQL)"
+        folder = open_folder(settings.store_url)
+        if not folder.exists(MARK) or folder.read(MARK) != mark.encode():
+            return f"it does not see the store {settings.store_url}; mount it there, or use an object store"
+    except (OSError, TrompeError) as error:
+        return f"it cannot use the database or the store ({error})"
+    return None
+
+
+def _is_dispatcher(settings: Settings, mark: str) -> bool:
+    engine = connect(settings.database_url)
+    file = engine.url.database if engine.dialect.name == "sqlite" else None
+    try:
+        return (file is None or Path(file).exists()) and lease_holder(engine, DISPATCHER) == mark
+    finally:
+        engine.dispose()
+
+
+def _place(settings: Settings) -> str:
+    return connect(settings.database_url).url.render_as_string(hide_password=True)
+
+
+def _preload(pipeline: str) -> None:
+    """Import torch before the first job. If that fails, each job reports it."""
+    try:
+        load(pipeline)
+    except Exception:
+        logger.exception("%s cannot be imported; every job will fail", pipeline)

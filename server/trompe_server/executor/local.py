@@ -1,0 +1,153 @@
+"""Attempts in processes of this machine, by the standard library."""
+
+import logging
+import multiprocessing
+import os
+import pickle
+import socket
+import time
+from collections.abc import Mapping
+from multiprocessing.connection import wait
+from typing import Final
+
+from trompe_server.executor.port import Ended, fits, left_in, too_much
+from trompe_server.executor.process import READY, Setup, run_attempts
+from trompe_server.queue.claims import Claim
+from trompe_server.queue.workers import Worker
+from trompe_shared.api import Needs
+
+__all__ = ["LocalExecutor"]
+
+logger = logging.getLogger(__name__)
+
+LONGEST_WAIT: Final = 30.0
+"""Seconds between two starts of a process that dies before it is ready."""
+
+
+class LocalExecutor:
+    """An ``Executor`` of ``setup.settings.workers`` processes, which end with this one. A dead one is replaced.
+
+    They share the cores, the memory and, with a CUDA device, one GPU.
+    """
+
+    def __init__(self, setup: Setup) -> None:
+        settings = setup.settings
+        gpu = float(settings.device.startswith("cuda"))
+        self._room = Needs(cpu=settings.workers, gpu=gpu, memory=_memory())
+        self._device = settings.device
+        self._slots = [_Slot(f"{socket.gethostname()}-{number}", setup) for number in range(settings.workers)]
+
+    def place(self, needs: Needs) -> str | None:
+        free = next((slot for slot in self._slots if slot.ready and slot.claim is None), None)
+        left = left_in(self._room, (slot.claim for slot in self._slots if slot.claim is not None))
+        return free.name if free is not None and fits(needs, left) else None
+
+    def submit(self, claim: Claim) -> None:
+        self._slot(claim.job.worker).run(claim)
+
+    def cancel(self, claim: Claim) -> None:
+        for slot in self._slots:
+            if slot.claim == claim:
+                slot.kill()
+                slot.start()
+
+    def ended(self, timeout: float) -> list[Ended]:
+        for slot in self._slots:
+            slot.restart_if_due()
+        heard = wait([slot.connection for slot in self._slots if not slot.resting], timeout)
+        return [end for slot in self._slots if slot.connection in heard and (end := slot.listen()) is not None]
+
+    def workers(self) -> list[Worker]:
+        host = socket.gethostname()
+        return [Worker(slot.name, host, self._device, slot.fault) for slot in self._slots]
+
+    def unmet(self, waiting: Mapping[Needs, int]) -> dict[Needs, str]:
+        return {needs: too_much(needs, [self._room]) for needs in waiting if not fits(needs, self._room)}
+
+    def close(self) -> None:
+        for slot in self._slots:
+            slot.kill()
+
+    def _slot(self, name: str | None) -> "_Slot":
+        return next(slot for slot in self._slots if slot.name == name)
+
+
+class _Slot:
+    """A process and its attempt."""
+
+    def __init__(self, name: str, setup: Setup) -> None:
+        self.name, self._setup = name, setup
+        self.fault: str | None = None
+        self._failures = 0
+        self.start()
+
+    def start(self) -> None:
+        """Start the process. ``ready`` once it takes attempts."""
+        self.claim: Claim | None = None
+        self.ready, self._restart = False, 0.0
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        arguments = (theirs, dict(self._setup.environment), pickle.dumps(self._setup))
+        self._process = context.Process(target=run_attempts, args=arguments, name=self.name, daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def run(self, claim: Claim) -> None:
+        """Start an attempt."""
+        self.claim = claim
+        try:
+            self.connection.send(claim)
+        except OSError:  # it died just now, as ``listen`` will hear
+            logger.warning("worker %s died before attempt %d of job %s", self.name, claim.attempt, claim.job.id)
+
+    def kill(self) -> None:
+        """End the process at once."""
+        self._process.kill()
+        self._process.join()
+        self.connection.close()
+
+    @property
+    def resting(self) -> bool:
+        """Whether there is no process: it died before it was ready, and starts again later."""
+        return self._restart > 0
+
+    def restart_if_due(self) -> None:
+        """End the rest of a failing process."""
+        if self.resting and time.monotonic() > self._restart:
+            self.start()
+
+    def listen(self) -> Ended | None:
+        """Read what the process said; replace a dead one. Returns an attempt that ended."""
+        try:
+            said = self.connection.recv()
+        except (EOFError, OSError):
+            return self._bury()
+        if said == READY and not self.ready:
+            self.ready, self.fault, self._failures = True, None, 0
+            return None
+        claim, self.claim = self.claim, None
+        assert claim is not None
+        return Ended(claim, said)
+
+    def _bury(self) -> Ended | None:
+        """Replace the dead process, after a while if it was never ready."""
+        self.kill()
+        reason = f"{self.name} died ({_ending(self._process.exitcode)})"
+        logger.warning("%s", reason)
+        claim, was_ready = self.claim, self.ready
+        if was_ready:
+            self.start()
+        else:
+            self._failures += 1
+            self.fault = f"{reason} before it was ready, {self._failures} times; its messages are in the service's log"
+            self._restart = time.monotonic() + min(2.0 ** (self._failures - 1), LONGEST_WAIT)
+        return None if claim is None else Ended(claim, reason)
+
+
+def _ending(status: int | None) -> str:
+    return f"signal {-status}" if status is not None and status < 0 else f"status {status}"
+
+
+def _memory() -> float:
+    """GiB of this machine."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30

@@ -1,0 +1,82 @@
+"""Dispatches jobs for a service: in ``trompe serve``, or alone as ``trompe worker``."""
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Final
+
+import prometheus_client
+from prometheus_client import CollectorRegistry
+from prometheus_client.multiprocess import MultiProcessCollector
+from sqlalchemy.exc import SQLAlchemyError
+
+from trompe_server.errors import ServiceError
+from trompe_server.executor.choice import open_executor
+from trompe_server.executor.dispatcher import Dispatcher, dispatcher_name
+from trompe_server.queue.claims import Claims
+from trompe_server.queue.retention import Retention
+from trompe_server.queue.store import JobStore
+from trompe_server.renderers.discovery import RendererAddresses
+from trompe_server.settings import Settings
+from trompe_server.storage.database import DatabaseDownError
+from trompe_server.storage.folders import open_folder
+
+__all__ = ["READY", "dispatching", "prepare_data", "run_worker"]
+
+READY: Final = "trompe worker ready"
+"""Line printed by ``trompe worker`` once it dispatches jobs or waits for the lease."""
+
+
+def prepare_data(settings: Settings) -> None:
+    """Create the data folder, and create or upgrade the database. Raises ``ServiceError``."""
+    store = JobStore(settings.database_url)
+    try:
+        settings.data.mkdir(parents=True, exist_ok=True)
+        store.migrate()
+    except (OSError, SQLAlchemyError, DatabaseDownError) as error:
+        raise ServiceError(
+            f"The data folder {settings.data} or the database cannot be written ({error}). Choose another folder with "
+            "--data or TROMPE_DATA, another database with --database or TROMPE_DATABASE."
+        ) from error
+    finally:
+        store.close()
+
+
+@contextmanager
+def dispatching(settings: Settings, renderers: RendererAddresses) -> Iterator[Dispatcher]:
+    """Dispatch jobs and delete old ones during the block. ``renderers`` share the images of each job."""
+    store = JobStore(settings.database_url)
+    retention = Retention(store, open_folder(settings.store_url), days=settings.retention_days)
+    threading.Thread(target=retention.run_forever, daemon=True).start()
+    with dispatcher_name(settings.data) as name:
+        dispatcher = Dispatcher(
+            Claims(store.engine),
+            partial(open_executor, settings, renderers, mark=name),
+            name=name,
+            silence=settings.silence,
+            stall_timeout=settings.stall_timeout,
+        )
+        with dispatcher.running():
+            yield dispatcher
+
+
+def run_worker(settings: Settings, renderers: RendererAddresses, *, announce: Callable[[str], None]) -> None:
+    """Dispatch jobs until SIGTERM or SIGINT. Calls ``announce`` with ``READY`` once it does, or waits for the lease."""
+    prepare_data(settings)
+    if settings.metrics_port:
+        _serve_metrics(settings)
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    with dispatching(settings, renderers):
+        announce(READY)
+        stop.wait()
+
+
+def _serve_metrics(settings: Settings) -> None:
+    registry = CollectorRegistry()
+    settings.metrics_folder.mkdir(parents=True, exist_ok=True)
+    MultiProcessCollector(registry, path=str(settings.metrics_folder))  # type: ignore[no-untyped-call]
+    prometheus_client.start_http_server(settings.metrics_port, registry=registry)

@@ -1,0 +1,157 @@
+"""Executors for the contract tests: the fake, processes of this machine, and a Ray cluster of several nodes."""
+
+import gc
+import os
+import time
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+from tests.served import FAKE, Queue, free_port, wait_until
+from trompe_server.executor.choice import open_executor
+from trompe_server.executor.dispatcher import Dispatcher
+from trompe_server.executor.port import Ended, Executor, fits, left_in, too_much
+from trompe_server.executor.process import Setup, run_here
+from trompe_server.queue.claims import Claim, Claims
+from trompe_server.queue.workers import Worker
+from trompe_server.renderers.discovery import RendererAddresses
+from trompe_server.settings import Settings
+from trompe_shared.api import Job, Needs
+
+NAME: Final = "tests"
+TOKEN: Final = "t" * 32
+STORE_BYTES: Final = 80 * 2**20
+
+
+class FakeExecutor:
+    """An ``Executor`` of threads with these ``rooms``. What would kill its process dies at once."""
+
+    def __init__(self, setup: Setup, rooms: Sequence[Needs]) -> None:
+        self._setup = setup
+        self._rooms = {f"fake-{number}": room for number, room in enumerate(rooms)}
+        self._threads = ThreadPoolExecutor(2 * len(rooms))
+        self._running: dict[Future[str | None], Claim] = {}
+
+    def place(self, needs: Needs) -> str | None:
+        return next((name for name in self._rooms if fits(needs, self._left(name))), None)
+
+    def submit(self, claim: Claim) -> None:
+        deadly = claim.job.spec.goal.label == ["deadly"]
+        run = (lambda: "it died (signal 9)") if deadly else partial(run_here, self._setup, claim)
+        self._running[self._threads.submit(run)] = claim
+
+    def cancel(self, claim: Claim) -> None:
+        self._running = {future: each for future, each in self._running.items() if each != claim}
+
+    def ended(self, timeout: float) -> list[Ended]:
+        if not self._running:
+            time.sleep(timeout)
+        done = wait(self._running, timeout, FIRST_COMPLETED).done
+        return [Ended(self._running.pop(future), future.result()) for future in done]
+
+    def workers(self) -> list[Worker]:
+        return [Worker(name, "here", str(room)) for name, room in self._rooms.items()]
+
+    def unmet(self, waiting: Mapping[Needs, int]) -> dict[Needs, str]:
+        rooms = list(self._rooms.values())
+        return {needs: too_much(needs, rooms) for needs in waiting if not any(fits(needs, room) for room in rooms)}
+
+    def close(self) -> None:
+        self._running = {}
+        self._threads.shutdown(wait=False)
+
+    def _left(self, name: str) -> Needs:
+        return left_in(self._rooms[name], (claim for claim in self._running.values() if claim.job.worker == name))
+
+
+class RayNodes:
+    """A Ray cluster of simulated nodes with a client server at ``address``; a context manager.
+
+    Its nodes have one core each; the last one has a simulated GPU too.
+    """
+
+    def __init__(self, nodes: int = 3) -> None:
+        pytest.importorskip("ray", reason="Ray is not installed: pip install 'trompe[cluster]'")
+        from ray.cluster_utils import Cluster
+
+        self.port = free_port()
+        head = {"num_cpus": 0, "include_dashboard": False, "ray_client_server_port": self.port}
+        self.cluster = Cluster(initialize_head=True, head_node_args=head | {"object_store_memory": STORE_BYTES})
+        self.nodes = [self.add(num_gpus=int(number == nodes - 1)) for number in range(nodes)]
+
+    @property
+    def address(self) -> str:
+        """As in TROMPE_EXECUTOR."""
+        return f"ray://127.0.0.1:{self.port}"
+
+    def add(self, **resources: int) -> Any:
+        """A further node."""
+        return self.cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES, **resources)
+
+    def kill(self, node: Any) -> None:
+        """Kill a node with all its processes."""
+        self.cluster.remove_node(node, allow_graceful=False)
+
+    def close(self) -> None:
+        self.cluster.shutdown()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            gc.collect()  # its open files, lest a later test is blamed
+
+
+@contextmanager
+def ray_environment() -> Iterator[None]:
+    """The environment of a cluster with a token, for this process, the nodes and the attempts on them."""
+    added = FAKE | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN, "RAY_USAGE_STATS_ENABLED": "0"}
+    before = {name: os.environ.get(name) for name in added}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+
+
+class Executed(Queue):
+    """A queue of fake jobs that a dispatcher hands to an executor of three cores and one GPU: a ``kind``, or Ray at
+    its address."""
+
+    def __init__(self, folder: Path, kind: str, renderer: int, **settings: Any) -> None:
+        device = "cuda" if kind == "local" else "cpu"
+        executor = "local" if kind == "fake" else kind
+        fixed: dict[str, Any] = {"data": folder, "workers": 3, "device": device, "executor": executor}
+        super().__init__(Settings(**fixed, pipeline=FAKE["TROMPE_PIPELINE"], **settings))
+        self.store.migrate()
+        self._fake, self._renderers = kind == "fake", RendererAddresses((("127.0.0.1", renderer),))
+
+    def open(self) -> Executor:
+        """Start the executor."""
+        if not self._fake:
+            return open_executor(self.settings, self._renderers, mark=NAME)
+        return FakeExecutor(Setup(self.settings, self._renderers), [Needs(), Needs(), Needs(gpu=1)])
+
+    @contextmanager
+    def dispatching(self) -> Iterator[Dispatcher]:
+        """Dispatch during the block."""
+        dispatcher = Dispatcher(
+            Claims(self.store.engine),
+            self.open,
+            name=NAME,
+            silence=self.settings.silence,
+            stall_timeout=self.settings.stall_timeout,
+        )
+        with dispatcher.running():
+            yield dispatcher
+
+    def ended(self, *jobs: str) -> list[Job]:
+        """The jobs, once they have ended."""
+        wait_until(lambda: all(self.state(job).state.final for job in jobs))
+        return [self.state(job) for job in jobs]
