@@ -1,4 +1,4 @@
-# The images of Trompe: renderer (no torch), server (REST API, migration), worker (attacks).
+# The images of Trompe: renderer (no torch), server (REST API, migration), worker (attacks), cluster (attacks on Ray).
 #
 #   TORCH_INDEX  index of torch. Default: its builds for CPUs; empty: PyPI's, which include CUDA.
 #   WHEELS       image with additional wheels in its root folder. Default: none.
@@ -64,7 +64,7 @@ COPY deploy/image/api_health.py /opt/health.py
 COPY deploy/image/make_secrets.py /opt/
 COPY --from=project /project /
 RUN install --directory --owner=trompe --group=trompe --mode=0700 /data /models /objects \
- && install --directory --owner=trompe --group=trompe --mode=0750 /secrets/token /secrets/database /secrets/objects
+ && install --directory --owner=trompe --group=trompe --mode=0750 /secrets/token /secrets/database /secrets/objects /secrets/cluster
 ENV TROMPE_DATA=/data TORCH_HOME=/models ORT_DISABLE_TELEMETRY=1
 USER trompe
 EXPOSE 8000
@@ -76,3 +76,9 @@ FROM server AS worker
 COPY deploy/image/worker_health.py /opt/health.py
 HEALTHCHECK --interval=15s --timeout=14s --start-period=60s CMD ["python", "/opt/health.py"]
 CMD ["worker"]
+
+FROM worker AS cluster
+USER root
+RUN --mount=type=cache,target=/root/.cache/pip --mount=type=bind,from=requirements,source=/requirements,target=/requirements \
+    pip --python /opt/trompe/bin/python install -c /requirements/constraints.txt "ray[default]>=2.60"
+USER trompe

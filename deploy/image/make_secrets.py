@@ -31,6 +31,7 @@ def main() -> None:
     key = secret(Path("/secrets/objects/objects-password"))
     credentials = f"[default]\naws_access_key_id = trompe\naws_secret_access_key = {key}\n"
     keep(Path("/secrets/objects/credentials"), credentials, PRIVATE)
+    secret(Path("/secrets/cluster/token"))
 
 
 if __name__ == "__main__":

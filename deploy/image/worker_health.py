@@ -1,15 +1,9 @@
-"""Health check of an attack worker: a recent heartbeat in the database."""
+"""Health check of ``trompe worker``: a dispatcher holds the lease, this one or the one that it waits for."""
 
-import socket
 import sys
 
-import sqlalchemy as sa
-
-from trompe_server.queue.tables import workers
+from trompe_server.queue.leases import DISPATCHER, is_leased
 from trompe_server.settings import Settings
-from trompe_server.storage.database import clock, connect
+from trompe_server.storage.database import connect
 
-settings = Settings()
-ages = sa.select(clock() - workers.c.seen).where(workers.c.host == socket.gethostname())
-with connect(settings.database_url).connect() as connection:
-    sys.exit(not any(age < settings.silence for age in connection.scalars(ages)))
+sys.exit(not is_leased(connect(Settings().database_url), DISPATCHER))

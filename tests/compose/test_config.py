@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parents[2]
-LONG_RUNNING = ("api", "worker", "worker-gpu", "renderer", "postgres", "objects")
+WORKERS = ("worker", "worker-gpu", "dispatcher", "ray-head", "ray-node")
+LONG_RUNNING = ("api", *WORKERS, "renderer", "postgres", "objects")
 ONE_SHOT = ("secrets", "migrate", "token", "bucket")
-PROFILES = ("gpu", "s3", "token")
+PROFILES = ("cluster", "gpu", "s3", "token")
 
 
 def read(*, profiles: tuple[str, ...] = (), **variables: str) -> dict[str, Any]:
@@ -98,7 +99,7 @@ def test_nothing_of_the_host_is_mounted(services: dict[str, Any]) -> None:
     assert {mount["type"] for mount in mounts} == {"volume"}
 
 
-MAKERS = {("secrets", "database-secret"), ("secrets", "objects-secret"), ("migrate", "token-secret")}
+MAKERS = {("migrate", "token-secret")} | {("secrets", f"{name}-secret") for name in ("database", "objects", "cluster")}
 
 
 def test_secrets_are_in_volumes_of_those_alone_who_need_them_and_in_no_variable(services: dict[str, Any]) -> None:
@@ -108,16 +109,17 @@ def test_secrets_are_in_volumes_of_those_alone_who_need_them_and_in_no_variable(
             if mount["source"].endswith("-secret"):
                 readers.setdefault(mount["source"], set()).add(name)
                 assert mount.get("read_only") or (name, mount["source"]) in MAKERS, (name, mount)
-    workers = {"api", "worker", "worker-gpu"}
+    workers = {"api", *WORKERS}
     assert readers == {
         "token-secret": {"migrate", "token"},
         "database-secret": {"secrets", "migrate", "postgres", *workers},
         "objects-secret": {"secrets", "bucket", "objects", *workers},
+        "cluster-secret": {"secrets", "dispatcher", "ray-head", "ray-node"},
     }
     variables = [pair for service in services.values() for pair in (service.get("environment") or {}).items()]
     for variable, value in variables:
         assert not any(word in variable for word in ("PASSWORD", "SECRET", "TOKEN", "KEY")) or variable.endswith(
-            "_FILE"
+            ("_FILE", "_PATH")
         )
         assert not (value and "@" in value and ":" in value.partition("//")[2].partition("@")[0]), variable
 
@@ -136,7 +138,7 @@ def test_each_image_of_ours_is_built_by_one_service_and_pulled_by_none(services:
 
 
 def test_nobody_starts_before_the_tables_and_the_database_are_there(services: dict[str, Any]) -> None:
-    for name in ("api", "worker", "worker-gpu"):
+    for name in ("api", "worker", "worker-gpu", "dispatcher", "ray-head"):
         conditions = {other: each["condition"] for other, each in services[name]["depends_on"].items()}
         assert conditions["migrate"] == "service_completed_successfully"
         assert conditions["postgres"] == "service_healthy"
@@ -155,9 +157,19 @@ def test_a_gpu_is_asked_for_by_its_profile_alone(services: dict[str, Any]) -> No
     assert services["worker"]["build"]["args"]["TORCH_INDEX"].endswith("/cpu")
 
 
+def test_the_cluster_is_reached_by_its_dispatcher_with_a_token_and_publishes_nothing(services: dict[str, Any]) -> None:
+    for name in ("dispatcher", "ray-head", "ray-node"):
+        environment = services[name]["environment"]
+        assert (environment["RAY_AUTH_MODE"], environment["RAY_AUTH_TOKEN_PATH"]) == ("token", "/secrets/cluster/token")
+        assert environment["RAY_USAGE_STATS_ENABLED"] == "0"
+    assert services["dispatcher"]["environment"]["TROMPE_EXECUTOR"] == "ray://ray-head:10001"
+    assert services["ray-node"]["deploy"]["replicas"] == 2
+    assert {services[name]["image"] for name in ("dispatcher", "ray-head", "ray-node")} == {"trompe-cluster:0.2.0"}
+
+
 def test_numbers_address_and_store_are_chosen_by_variables(services: dict[str, Any]) -> None:
     chosen = read(TROMPE_WORKERS="3", TROMPE_RENDERERS="5", TROMPE_PORT="9000", TROMPE_STORE="s3://mine")["services"]
-    assert chosen["worker"]["deploy"]["replicas"] == 3
+    assert chosen["worker"]["environment"]["TROMPE_WORKERS"] == "3"
     assert chosen["renderer"]["deploy"]["replicas"] == 5
     assert chosen["api"]["ports"][0]["published"] == "9000"
     assert {chosen[name]["environment"]["TROMPE_STORE"] for name in ("api", "worker", "migrate")} == {"s3://mine"}
@@ -165,7 +177,7 @@ def test_numbers_address_and_store_are_chosen_by_variables(services: dict[str, A
 
 def test_the_images_end_as_an_unprivileged_user_and_tell_their_health() -> None:
     found = re.findall(r"^FROM (\S+) AS (\w+)\n(.*?)(?=^FROM|\Z)", (ROOT / "Dockerfile").read_text(), re.DOTALL | re.M)
-    assert {base for base, *_ in found} == {"${WHEELS}", "python:3.11-slim", "python", "server"}
+    assert {base for base, *_ in found} == {"${WHEELS}", "python:3.11-slim", "python", "server", "worker"}
     stages = {name: stage for _, name, stage in found}
     for name in ("renderer", "server"):
         assert [line for line in stages[name].splitlines() if line.startswith("USER")] == ["USER trompe"]

@@ -201,14 +201,13 @@ def received(stack: Stack, container: str) -> int:
     return int(stack.run_in(container, "cat", "/proc/net/dev").split("eth0:")[1].split()[0])
 
 
-def test_renderers_and_workers_are_scaled_and_share_the_work(stack: Stack, client: Client) -> None:
+def test_renderers_are_scaled_and_share_the_work_and_a_second_worker_waits(stack: Stack, client: Client) -> None:
     with stack.timed("scaling to 2 workers and 3 renderers"):
         stack.up(worker=2, renderer=3)
-        wait_until(lambda: sum(worker.alive for worker in client.workers()) == 2)
     jobs = [client.attack("mug", **QUICK | {"seed": seed}) for seed in range(6)]
     for job in jobs:
         finish(job)
-    assert len({job.refresh().worker for job in jobs}) == 2
+    assert len({job.refresh().worker for job in jobs}) == 1
     heard = [received(stack, each) for each in stack.containers("renderer")]
     assert len(heard) == 3
     assert min(heard) > 50_000, heard

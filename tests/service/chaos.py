@@ -19,6 +19,7 @@ from typing import Any, Final, Self
 
 from tests.fake_job import PHASES, trace
 from tests.served import CHILD, FAKE, command_line, command_of, reserved_port, wait_until
+from tests.service.executors import RayNodes
 from trompe_client import Client, Retries
 from trompe_client._job import JobHandle
 from trompe_server.queue.store import JobStore
@@ -93,7 +94,8 @@ class Site:
     """Three attack workers, three renderer workers and the API on the database at ``url``, all under ``folder``.
 
     With ``scattered=False``, `trompe serve` has them all. Otherwise API, renderers and two dispatchers, of which one
-    waits, share only the database and the store. ``phase_seconds``: length of the phases of fake jobs.
+    waits, share only the database and the store. ``phase_seconds``: length of the phases of fake jobs. With ``nodes``
+    the jobs run on that Ray cluster.
     """
 
     def __init__(
@@ -105,10 +107,13 @@ class Site:
         silence: float,
         phase_seconds: float,
         stall_timeout: float = 1800.0,
+        nodes: RayNodes | None = None,
     ) -> None:
         self.folder = folder
         self.settings = Settings(data=folder / "api", database=url, store=str(folder / "store"), silence=silence)
+        self.nodes = nodes
         self._environment = {
+            "TROMPE_EXECUTOR": nodes.address if nodes is not None else "local",
             "TROMPE_DATABASE": self.settings.database_url,
             "TROMPE_STORE": self.settings.store_url,
             "TROMPE_SILENCE": str(silence),
@@ -156,6 +161,7 @@ class Site:
         """Ids of our living processes, by kind."""
         table = process_table()
         roots = {kept.process.pid for kept in self._kept if kept.process is not None}
+        roots |= {os.getpid()} if self.nodes is not None else set()
         found: dict[str, list[int]] = {kind: [] for kind in KINDS.values()}
         for pid in sorted(table):
             kind = kind_of(pid)
@@ -172,6 +178,15 @@ class Site:
     def folder_of(self, job: Job) -> Path:
         """Folder of a job."""
         return Path(self.settings.store_url) / "jobs" / job.id
+
+    def kill_node(self, place: float) -> bool:
+        """Kill one of the nodes that run jobs, and start another in its place. Returns whether there was one."""
+        if self.nodes is None:
+            return False
+        node = self.nodes.nodes.pop(int(place * len(self.nodes.nodes)))
+        self.nodes.kill(node)
+        self.nodes.nodes.append(self.nodes.add())
+        return True
 
     def log(self) -> str:
         """The end of all logs."""
@@ -223,8 +238,12 @@ class Faults:
 
     def kill(self) -> None:
         """Kill a random process."""
-        kind = self._random.choice(SHARES)
+        kind = self._random.choice([*SHARES, "node"] if self._site.nodes is not None else SHARES)
         place = self._random.random()
+        if kind == "node" and self._site.kill_node(place):
+            self.tell(f"killed a node; running: {self._running()}")
+            self.counts["node killed"] += 1
+            return
         pids = self._site.processes()[kind]
         if not pids:
             self.tell(f"no {kind} to kill")
@@ -425,8 +444,11 @@ def kind_of(pid: int) -> str | None:
     """Kind of one of our processes; ``None`` for others."""
     folder = Path("/proc", str(pid))
     with suppress(PermissionError):
+        words = command_line(folder)
+        if words and re.match(r"ray::[0-9a-f]{16}/", words[0]):
+            return KINDS["worker"]
         command = command_of(folder)
-        if command == "worker" and CHILD[-1] in command_line(folder):
+        if command == "worker" and CHILD[-1] in words:
             command = "dispatcher"
         return KINDS.get(command or "")
     return None

@@ -106,9 +106,9 @@ class RayNodes:
 
 
 @contextmanager
-def ray_environment() -> Iterator[None]:
+def ray_environment(**more: str) -> Iterator[None]:
     """The environment of a cluster with a token, for this process, the nodes and the attempts on them."""
-    added = FAKE | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN, "RAY_USAGE_STATS_ENABLED": "0"}
+    added = FAKE | more | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN, "RAY_USAGE_STATS_ENABLED": "0"}
     before = {name: os.environ.get(name) for name in added}
     os.environ.update(added)
     try:

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from tests.service.chaos import Digests, Faults, Run, Site, Submission, check_history, is_real
+from tests.service.executors import RayNodes, ray_environment
 from trompe_shared.api import JobState
 
 pytestmark = pytest.mark.chaos
@@ -118,6 +119,38 @@ def survive_freezing(open_site: OpenSite, expected: Digests, *, beyond: float, p
 @pytest.mark.timeout(PATIENCE)
 def test_jobs_end_once_and_alike_whoever_is_killed(open_site: OpenSite, undisturbed: Callable[[int], Digests]) -> None:
     survive_kills(open_site, undisturbed(FEW), every=3.0, seed=1)
+
+
+def survive_kills_on_ray(url: str, folder: Path, expected: Digests, *, every: float, seed: int) -> None:
+    """Kill a process or a node of a Ray cluster every few seconds until all jobs have ended."""
+    phase_seconds = 0.3
+    with ray_environment(TROMPE_FAKE_SECONDS=str(phase_seconds), OMP_NUM_THREADS="1"):
+        nodes = RayNodes()
+        try:
+            options: dict[str, Any] = {"scattered": True, "silence": SILENCE, "phase_seconds": phase_seconds}
+            with Site(folder, url, nodes=nodes, **options) as site:
+                faults = Faults(site, seed=seed)
+                survive(site, faults, expected, meanwhile=faults.every(every, faults.kill), pause=0.5)
+                assert faults.counts.total() >= 5, faults.story()
+        finally:
+            nodes.close()
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.timeout(PATIENCE)
+def test_jobs_on_a_ray_cluster_end_once_and_alike_whoever_is_killed(
+    postgres: Any, tmp_path: Path, undisturbed: Callable[[int], Digests]
+) -> None:
+    survive_kills_on_ray(postgres.database(), tmp_path, undisturbed(FEW), every=3.0, seed=5)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.timeout(2 * PATIENCE)
+def test_200_jobs_on_a_ray_cluster_end_once_and_alike_while_something_is_killed_every_5_seconds(
+    postgres: Any, tmp_path: Path, undisturbed: Callable[[int], Digests]
+) -> None:
+    survive_kills_on_ray(postgres.database(), tmp_path, undisturbed(200), every=5.0, seed=6)
 
 
 @pytest.mark.timeout(PATIENCE)

@@ -129,6 +129,8 @@ class RayExecutor:
 
     def unmet(self, waiting: Mapping[Needs, int]) -> dict[Needs, str]:
         self._tell_autoscaler(waiting)
+        if any(node.check is not None for node in self._nodes.values()):
+            return {}  # not known yet
         sound = [node.room for node in self._nodes.values() if node.fault is None]
         faults = "".join(f" {node.name}: {node.fault}." for node in self._nodes.values() if node.fault is not None)
         large = [needs for needs in waiting if not any(fits(needs, room) for room in sound)]
@@ -162,6 +164,12 @@ class RayExecutor:
         there = NodeAffinitySchedulingStrategy(node, soft=False)
         return self._check.options(scheduling_strategy=there).remote(self._setup, self._mark)
 
+    def _doubt(self, name: str | None) -> None:
+        """Check a node where an attempt died before its next attempt: Ray may learn later that the node is gone."""
+        for node in self._nodes.values():
+            if node.name == name and node.check is None:
+                node.fault, node.check = "an attempt died there; it is checked again", self._start_check(node.id)
+
     def _end_check(self, node: _Node) -> None:
         try:
             node.fault = self._ray.get(node.check)
@@ -186,6 +194,7 @@ class RayExecutor:
             reason: str | None = self._ray.get(task)
         except self._ray.exceptions.RayError as error:
             reason = f"{attempt.claim.job.worker} died ({_first_line(error)})"
+            self._doubt(attempt.claim.job.worker)
         return None if attempt.cancelled else Ended(attempt.claim, reason)
 
     def _tell_autoscaler(self, waiting: Mapping[Needs, int]) -> None:

@@ -21,6 +21,10 @@ MAX_LOST: Final = 3
 """Attempts that may be lost in the same phase of a job before the job is failed."""
 
 
+MOST_TOLD: Final = 500
+"""Jobs told in one transaction why they wait."""
+
+
 class LostJobError(Exception):
     """The attempt is over: the job is queued again, has a newer attempt, or has ended."""
 
@@ -65,7 +69,8 @@ class Claims:
         with self.engine.connect() as connection:
             while (text := connection.scalar(following.where(jobs.c.needs > text))) is not None:
                 needs = Needs.model_validate_json(text)
-                found.append((*connection.execute(_first(needs)).one(), needs))
+                if (first := connection.execute(_first(needs)).first()) is not None:  # not cancelled meanwhile
+                    found.append((*first, needs))
         return [needs for *_, needs in sorted(found, key=lambda each: each[:2])]
 
     def claim(self, needs: Needs, worker: str) -> Claim | None:
@@ -79,11 +84,12 @@ class Claims:
             return None if row is None else _take(connection, row, worker)
 
     def explain(self, reasons: Mapping[Needs, str]) -> None:
-        """Tell the queued jobs with these needs why they wait."""
+        """Tell the queued jobs with these needs why they wait, ``MOST_TOLD`` at a time."""
         for needs, reason in reasons.items():
             told = sa.and_(_queued(needs), jobs.c.note.is_distinct_from(reason))
+            some = sa.select(jobs.c.id).where(told).limit(MOST_TOLD).with_for_update()
             with write(self.engine) as connection:
-                for job in connection.execute(sa.select(jobs.c.id).where(told).with_for_update()).scalars().all():
+                for job in connection.execute(some).scalars().all():
                     update_job(connection, job, message=reason, note=reason)
 
     def advance(

@@ -1,0 +1,187 @@
+"""A Ray cluster of three nodes that fails, and one that cannot be used."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.fake_job import trace
+from tests.served import reserved_port, wait_until
+from tests.service.executors import Executed, RayNodes, ray_environment
+from trompe_server.errors import ServiceError
+from trompe_server.executor.attempts import MARK
+from trompe_server.storage.folders import open_folder
+from trompe_shared.api import JobState
+
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+"""Ray leaves files open."""
+
+CLEAR = 10.0
+"""Seconds until a fault is told."""
+
+Open = Callable[..., Executed]
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[RayNodes]:
+    with ray_environment():
+        nodes = RayNodes()
+        yield nodes
+        nodes.close()
+
+
+@pytest.fixture
+def queue(tmp_path: Path, renderer: int) -> Iterator[Open]:
+    opened: list[Executed] = []
+
+    def open_queue(address: str, **settings: float) -> Executed:
+        opened.append(Executed(tmp_path, address, renderer, **settings))
+        return opened[-1]
+
+    yield open_queue
+    for each in opened:
+        each.store.close()
+
+
+def process_of(job: str) -> int:
+    """The process that runs an attempt of the job, by the name that Ray gives it."""
+    named = f"ray::{job}/".encode()
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal() and (entry / "cmdline").read_bytes().startswith(named):
+            return int(entry.name)
+    raise AssertionError(f"no process runs {job}")
+
+
+def test_the_job_of_a_frozen_process_goes_on_elsewhere_and_the_process_does_no_harm(
+    cluster: RayNodes, queue: Open
+) -> None:
+    executed = queue(cluster.address, stall_timeout=3.0, silence=10.0)
+    job = executed.submit("gate")
+    with executed.dispatching():
+        wait_until(lambda: executed.in_gate(job))
+        frozen, first = process_of(job), executed.state(job).worker
+        os.kill(frozen, signal.SIGSTOP)
+        wait_until(lambda: executed.state(job).attempts == 2 and executed.in_gate(job))
+        assert executed.state(job).worker != first, "a frozen process holds its room"
+        executed.open_gate(job)
+        (ended,) = executed.ended(job)
+        result = (executed.folder(job) / "2" / "result.json").read_bytes()
+        os.kill(frozen, signal.SIGCONT)
+        after = [executed.submit("fine", seed=number) for number in range(6)]
+        executed.ended(*after)
+    assert (ended.state, ended.attempts) == (JobState.succeeded, 2)
+    assert "no progress for 3 s" in "".join(event.message or "" for event in executed.store.events(job))
+    assert (executed.folder(job) / "2" / "result.json").read_bytes() == result
+    assert trace(executed.folder(job)).count("end judge") == 1
+
+
+def test_the_job_of_a_killed_process_and_of_a_killed_node_goes_on_at_its_phase(cluster: RayNodes, queue: Open) -> None:
+    executed = queue(cluster.address)
+    job = executed.submit("gate")
+    with executed.dispatching():
+        wait_until(lambda: executed.in_gate(job))
+        os.kill(process_of(job), signal.SIGKILL)
+        wait_until(lambda: executed.state(job).attempts == 2 and executed.in_gate(job))
+        place = str(executed.state(job).worker)
+        (node,) = [node for node in cluster.nodes if place.endswith(node.node_id[:6])]
+        cluster.kill(node)
+        cluster.nodes.remove(node)
+        wait_until(lambda: executed.state(job).attempts == 3 and executed.in_gate(job))
+        assert executed.state(job).worker != place
+        executed.open_gate(job)
+        (ended,) = executed.ended(job)
+        cluster.nodes.append(cluster.add())
+        wait_until(lambda: sum(worker.alive and not worker.fault for worker in executed.store.workers()) >= 3)
+    assert (ended.state, ended.attempts) == (JobState.succeeded, 3)
+    assert trace(executed.folder(job)).count("begin prepare") == 1
+
+
+def test_a_node_without_the_store_gets_no_job_and_says_so(cluster: RayNodes, queue: Open) -> None:
+    executed = queue(cluster.address, silence=4.0)
+    with executed.dispatching():
+        wait_until(lambda: executed.ended(executed.submit("fine")))
+        open_folder(executed.settings.store_url).write(MARK, b"another")  # as if the new node had another folder there
+        node = cluster.add(num_gpus=4)
+        job = executed.submit("fine", needs={"gpu": 3})
+        wait_until(lambda: "does not see the store" in str(executed.state(job).note), seconds=CLEAR + 20)
+        (faulty,) = [worker for worker in executed.store.workers() if "gpu 4" in worker.device]
+        assert "does not see the store" in str(faulty.fault)
+        assert executed.state(job).state is JobState.queued
+        cluster.kill(node)
+
+
+def refusal(executed: Executed, *, within: float = CLEAR) -> str:
+    """The sentence that refuses the executor."""
+    started = time.monotonic()
+    with pytest.raises(ServiceError) as refused:
+        executed.open()
+    assert time.monotonic() - started < within
+    return str(refused.value)
+
+
+def test_a_cluster_that_is_not_there_is_told_with_the_remedy_while_the_job_waits(queue: Open) -> None:
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'trompe[cluster]'")
+    with reserved_port() as port:
+        executed = queue(f"ray://127.0.0.1:{port}")
+        assert "No Ray cluster answers at" in refusal(executed)
+        job = executed.submit("fine")
+        with executed.dispatching() as dispatcher:
+            assert "ray start --head" in str(dispatcher.fault)
+            assert executed.state(job).state is JobState.queued
+
+
+def test_a_port_that_is_no_cluster_is_told(queue: Open) -> None:
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'trompe[cluster]'")
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        threading.Thread(target=silent.accept, daemon=True).start()
+        assert "refuses us" in refusal(queue(f"ray://127.0.0.1:{port}"), within=3 * CLEAR)
+
+
+OPEN = """
+import sys
+from pathlib import Path
+from tests.service.executors import Executed
+import trompe_server.executor.ray_cluster
+{change}
+try:
+    Executed(Path(sys.argv[1]), sys.argv[2], 1).open()
+except Exception as error:
+    print(type(error).__name__, error)
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "token", "said"),
+    [
+        pytest.param("", "w" * 32, "ServiceError .* refuses us .*RAY_AUTH_TOKEN", id="wrong token"),
+        pytest.param(
+            "import ray; ray.__version__ = '2.0.0'", None, "ServiceError .*must be the same", id="other version"
+        ),
+    ],
+)
+def test_a_wrong_token_and_another_version_are_told(
+    cluster: RayNodes, tmp_path: Path, change: str, token: str | None, said: str
+) -> None:
+    environment = os.environ | ({"RAY_AUTH_TOKEN": token} if token else {})
+    command = [sys.executable, "-c", OPEN.format(change=change), str(tmp_path), cluster.address]
+    started = time.monotonic()
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert re.search(said, done.stdout, re.DOTALL), done.stdout + done.stderr
+    assert time.monotonic() - started < 3 * CLEAR
+
+
+def test_a_service_on_one_machine_imports_no_ray() -> None:
+    code = (
+        "import sys, trompe_server.service.serve, trompe_server.service.dispatch, trompe_server.executor.attempts;"
+        "sys.exit('ray' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
