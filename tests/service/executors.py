@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
+from unittest import mock
 
 import pytest
 
@@ -92,7 +93,8 @@ class RayNodes:
 
     def add(self, **resources: int) -> Any:
         """A further node."""
-        return self.cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES, **resources)
+        with mock.patch("signal.signal"):  # Ray sets a handler, which only the main thread may
+            return self.cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES, **resources)
 
     def kill(self, node: Any) -> None:
         """Kill a node with all its processes."""

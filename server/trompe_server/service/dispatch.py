@@ -63,7 +63,12 @@ def dispatching(settings: Settings, renderers: RendererAddresses) -> Iterator[Di
 
 
 def run_worker(settings: Settings, renderers: RendererAddresses, *, announce: Callable[[str], None]) -> None:
-    """Dispatch jobs until SIGTERM or SIGINT. Calls ``announce`` with ``READY`` once it does, or waits for the lease."""
+    """Dispatch jobs until SIGTERM or SIGINT. Calls ``announce`` with ``READY`` once it does, or waits for the lease.
+
+    Raises ``ServiceError`` if there is nothing to run them.
+    """
+    if settings.executor == "local" and not settings.workers:
+        raise ServiceError("`trompe worker` needs a process to run jobs: --workers 1 or more (TROMPE_WORKERS).")
     prepare_data(settings)
     if settings.metrics_port:
         _serve_metrics(settings)

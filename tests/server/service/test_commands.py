@@ -34,6 +34,12 @@ def test_a_worker_must_be_told_where_the_renderers_are(tmp_path: Path) -> None:
     assert "--renderers-dns" in words
 
 
+def test_a_worker_without_processes_is_refused(tmp_path: Path) -> None:
+    status, words = run(commands.worker, "--data", str(tmp_path), "--renderer", "127.0.0.1:1", "--workers", "0")
+    assert status == 1
+    assert "--workers 1" in words
+
+
 @pytest.mark.parametrize("url", ["mysql://host/name", "nonsense", "sqlite://"])
 def test_a_database_that_cannot_be_used_is_refused_with_a_remedy(tmp_path: Path, url: str) -> None:
     status, words = run(commands.migrate, "--data", str(tmp_path), "--database", url)

@@ -1,0 +1,118 @@
+"""The dispatcher on the fake executor: leases, losses, and executors that fail."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.served import wait_until
+from tests.service.executors import Executed
+from trompe_server.errors import ServiceError
+from trompe_server.executor.dispatcher import Dispatcher, dispatcher_name
+from trompe_server.executor.local import LocalExecutor
+from trompe_server.executor.port import Executor
+from trompe_server.executor.process import Setup
+from trompe_server.queue.claims import Claims
+from trompe_server.queue.tables import events
+from trompe_server.renderers.discovery import RendererAddresses
+from trompe_server.settings import Settings
+from trompe_server.storage.database import write
+from trompe_shared.api import JobState
+
+
+class Clock:
+    """A clock set by hand."""
+
+    now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def executed(tmp_path: Path, renderer: int) -> Iterator[Executed]:
+    queue = Executed(tmp_path, "fake", renderer)
+    yield queue
+    queue.store.close()
+
+
+def dispatcher(executed: Executed, name: str, open: Callable[[], Executor] | None = None) -> tuple[Dispatcher, Clock]:
+    clock = Clock()
+    claims = Claims(executed.store.engine)
+    return Dispatcher(claims, open or executed.open, name=name, silence=30, stall_timeout=60, clock=clock), clock
+
+
+def test_one_dispatches_and_the_other_waits(executed: Executed) -> None:
+    job = executed.submit("gate")
+    (first, _), (second, _) = dispatcher(executed, "first"), dispatcher(executed, "second")
+    assert first.step()
+    assert not second.step()
+    assert executed.state(job).attempts == 1
+    executed.store.request_cancel(job)
+    wait_until(lambda: first.step() and executed.state(job).state.final)
+
+
+def test_a_job_that_stands_still_is_lost_but_not_right_after_the_dispatcher_was_held_up(executed: Executed) -> None:
+    def frozen() -> Executor:
+        executor = executed.open()
+        executor.submit = lambda claim: None  # type: ignore[method-assign]
+        return executor
+
+    job = executed.submit("fine")
+    ours, clock = dispatcher(executed, "ours", frozen)
+    ours.step()
+    with write(executed.store.engine) as connection:
+        connection.execute(events.update().values(time=events.c.time - 100))
+    clock.now += 50  # the machine was asleep
+    ours.step()
+    for _ in range(9):
+        clock.now += 6
+        ours.step()
+        assert executed.state(job).attempts == 1
+    clock.now += 10
+    ours.step()
+    assert "no progress for 60 s" in "".join(event.message or "" for event in executed.store.events(job))
+    assert executed.state(job).attempts == 2
+
+
+def test_an_executor_that_is_lost_is_opened_again_and_the_jobs_go_on(executed: Executed) -> None:
+    opened: list[Executor] = []
+
+    def open_executor() -> Executor:
+        if len(opened) == 1:
+            opened.append(opened[0])
+            raise ServiceError("No cluster answers.")
+        opened.append(executed.open())
+        return opened[-1]
+
+    def lost(timeout: float) -> list[object]:
+        raise ServiceError("The cluster was lost.")
+
+    job = executed.submit("gate")
+    claims = Claims(executed.store.engine)
+    ours = Dispatcher(claims, open_executor, name="ours", silence=1.0, stall_timeout=60)
+    with ours.running():
+        wait_until(lambda: executed.in_gate(job))
+        opened[0].ended = lost  # type: ignore[method-assign, assignment]
+        wait_until(lambda: ours.fault == "No cluster answers." or executed.state(job).attempts == 2)
+        wait_until(lambda: executed.state(job).attempts == 2 and executed.in_gate(job))
+        assert ours.fault is None
+        executed.open_gate(job)
+        (found,) = executed.ended(job)
+    assert (found.state, found.attempts) == (JobState.succeeded, 2)
+
+
+def test_a_process_that_dies_before_it_is_ready_is_a_fault_and_is_tried_again(tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path, workers=1, store="nowhere://at.all")
+    executor = LocalExecutor(Setup(settings, RendererAddresses()))
+    try:
+        wait_until(lambda: executor.ended(0.1) == [] and "2 times" in str(executor.workers()[0].fault))
+    finally:
+        executor.close()
+
+
+def test_a_data_folder_keeps_its_dispatcher_s_name_and_lends_it_to_one(tmp_path: Path) -> None:
+    with dispatcher_name(tmp_path) as first, dispatcher_name(tmp_path) as second:
+        assert first != second
+    with dispatcher_name(tmp_path) as again:
+        assert again == first
