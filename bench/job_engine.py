@@ -1,7 +1,8 @@
-"""What a job costs apart from its attack: python -m bench.job_engine [--jobs N] [--executor NAME] [--database URL]...
+"""What a job costs apart from its attack: python -m bench.job_engine [--jobs N] [--workers N] [--executor NAME]...
 
-Jobs of nine phases that do nothing (as many as an attack of 30 steps has) run on one worker of an executor: ``local``,
-``ray-local`` or ``ray://HOST:PORT``. Then the worker of a running phase is killed: seconds until it begins again.
+Jobs of nine phases that do nothing, as many as an attack of 30 steps has, run on an executor: ``local``, ``ray-local``
+or ``ray://HOST:PORT``. Then the worker of a running phase is killed: seconds until it begins again, on another worker
+if there are several; a new process first imports torch.
 """
 
 import argparse
@@ -84,7 +85,7 @@ def bench(settings: Settings, count: int) -> None:
             ends = sorted(finished.timestamp() for job in jobs if (finished := store.get(job).finished))
             grown = (size(store) - before) / count
             losses = [loss for _ in range(LOSSES // 2) for loss in losses_of_a_job(store, Path(settings.store_url))]
-    overhead = statistics.median(after - before for before, after in pairwise(ends))
+    overhead = settings.workers * statistics.median(after - before for before, after in pairwise(ends))
     print(
         f"{store.engine.dialect.name:12}{1000 * submitted / count:8.1f} ms to submit"
         f"{1000 * overhead:8.1f} ms to run (median of {count}){grown:8.0f} bytes a job\n"
@@ -125,12 +126,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--jobs", type=int, default=200)
     parser.add_argument("--executor", default="local", help="local, ray-local or ray://HOST:PORT")
+    parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--database", action="append", help="an empty database; repeatable")
     options = parser.parse_args()
     for url in options.database or [""]:
         with tempfile.TemporaryDirectory() as folder:
             pipeline = "bench.job_engine:open_job"
-            named = {"executor": options.executor, "database": url, "pipeline": pipeline}
+            named = {"executor": options.executor, "workers": options.workers, "database": url, "pipeline": pipeline}
             bench(Settings(data=Path(folder), **named), options.jobs)
 
 

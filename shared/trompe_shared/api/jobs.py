@@ -50,12 +50,15 @@ class _Part(Schema):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+Amount = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
+
+
 class Needs(_Part):
     """What an attempt of a job occupies while it runs."""
 
-    cpu: float = Field(default=1.0, ge=0, description="cores; several small jobs may share one")
-    gpu: float = Field(default=0.0, ge=0, description="CUDA devices; 0.5: two such jobs share one")
-    memory: float = Field(default=0.0, ge=0, description="GiB")
+    cpu: Amount = Field(default=1.0, description="cores; several small jobs may share one")
+    gpu: Amount = Field(default=0.0, description="CUDA devices; 0.5: two such jobs share one")
+    memory: Amount = Field(default=0.0, description="GiB")
 
     def __str__(self) -> str:
         return ", ".join(f"{name} {value:g}" for name, value in self if value) or "nothing"
