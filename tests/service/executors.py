@@ -1,7 +1,9 @@
 """Executors for the contract tests: the fake, processes of this machine, and a Ray cluster of several nodes."""
 
+import fcntl
 import gc
 import os
+import tempfile
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -109,12 +111,17 @@ class RayNodes:
 
 @contextmanager
 def ray_environment(**more: str) -> Iterator[None]:
-    """The environment of a cluster with a token, for this process, the nodes and the attempts on them."""
+    """The environment of a cluster with a token, for this process, the nodes and the attempts on them.
+
+    Waits while another process has one: two clusters on a machine take each other's ports.
+    """
     added = FAKE | more | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN, "RAY_USAGE_STATS_ENABLED": "0"}
     before = {name: os.environ.get(name) for name in added}
     os.environ.update(added)
     try:
-        yield
+        with Path(tempfile.gettempdir(), "trompe-tests-ray.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
     finally:
         for name, value in before.items():
             os.environ.pop(name, None)

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -55,8 +56,9 @@ def process_of(job: str) -> int:
     """The process that runs an attempt of the job, by the name that Ray gives it."""
     named = f"ray::{job}/".encode()
     for entry in Path("/proc").iterdir():
-        if entry.name.isdecimal() and (entry / "cmdline").read_bytes().startswith(named):
-            return int(entry.name)
+        with suppress(OSError):  # it has ended
+            if entry.name.isdecimal() and (entry / "cmdline").read_bytes().startswith(named):
+                return int(entry.name)
     raise AssertionError(f"no process runs {job}")
 
 
