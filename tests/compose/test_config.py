@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[2]
 WORKERS = ("worker", "worker-gpu", "dispatcher", "ray-head", "ray-node")
@@ -173,6 +174,16 @@ def test_numbers_address_and_store_are_chosen_by_variables(services: dict[str, A
     assert chosen["renderer"]["deploy"]["replicas"] == 5
     assert chosen["api"]["ports"][0]["published"] == "9000"
     assert {chosen[name]["environment"]["TROMPE_STORE"] for name in ("api", "worker", "migrate")} == {"s3://mine"}
+
+
+def test_kubernetes_runs_the_same_image_and_ray_as_compose(services: dict[str, Any]) -> None:
+    manifest = (ROOT / "deploy" / "kuberay" / "trompe.yaml").read_text()
+    ray, *dispatcher = yaml.safe_load_all(manifest)
+    constraints = (ROOT / "deploy" / "image" / "constraints.txt").read_text().splitlines()
+    assert f"ray=={ray['spec']['rayVersion']}" in constraints
+    assert set(re.findall(r"image: (?:&image )?([\w:.-]+)", manifest)) == {services["ray-node"]["image"]}
+    assert [each["kind"] for each in dispatcher] == ["Deployment"]
+    assert ray["spec"]["authOptions"] == {"mode": "token"}
 
 
 def test_the_images_end_as_an_unprivileged_user_and_tell_their_health() -> None:
