@@ -5,12 +5,13 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test chaos compose check scoreboard audit format clean egl
+.PHONY: help demo test chaos cluster compose check scoreboard audit format clean egl
 
 help:
 	@echo "make demo    attack an object that comes with Trompe; results in trompe-demo/"
 	@echo "make test    run the tests (those with real objects too, if TROMPE_ASSETS names their folder)"
 	@echo "make chaos   kill, freeze and stop the service's processes while it works (6 minutes)"
+	@echo "make cluster run jobs on Ray clusters of simulated nodes (4 minutes)"
 	@echo "make compose build the images and test the stack of docker-compose.yml (needs Docker)"
 	@echo "make scoreboard ROW=name  measure speed and accuracy (under 20 minutes; needs TROMPE_ASSETS)"
 	@echo "make audit   look for known faults in what is installed, and write its list to out/sbom.json"
@@ -26,6 +27,9 @@ test: $(VENV)/.installed-dev egl
 
 chaos: $(VENV)/.installed-dev egl
 	$(BIN)/python -m pytest -m "chaos and not slow" tests/service/test_chaos.py
+
+cluster: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -m cluster tests/service
 
 compose: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m compose tests/compose -v -o log_cli=true -o log_cli_level=INFO

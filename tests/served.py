@@ -141,7 +141,7 @@ class Served(Queue):
         """Process ids of the children, by command; an attack worker is ``worker``."""
         found: dict[str, int] = {}
         for entry in Path("/proc").iterdir():
-            if entry.name.isdecimal() and self.process.pid == parent(int(entry.name)):
+            if entry.name.isdecimal() and self.process.pid in ancestors(int(entry.name)):
                 command = command_of(entry)
                 found |= {command: int(entry.name)} if command is not None else {}
         return found
@@ -159,7 +159,22 @@ def command_of(process: Path) -> str | None:
     words = command_line(process)
     if CHILD[-1] in words:
         return words[words.index(CHILD[-1]) + 1]
-    return "worker" if "--multiprocessing-fork" in words else None
+    forked = any("multiprocessing.forkserver" in word for word in words)
+    return "worker" if forked and command_line(Path("/proc", str(parent(int(process.name))))) == words else None
+
+
+def ancestors(pid: int) -> list[int]:
+    """Parent and grandparent of a process."""
+    above = [parent(pid)]
+    above += [parent(above[0])] if above[0] else []
+    return [each for each in above if each]
+
+
+def workers_of(service: int) -> list[int]:
+    """Ids of the attack workers of a process."""
+    entries = [entry for entry in Path("/proc").iterdir() if entry.name.isdecimal()]
+    found = [int(entry.name) for entry in entries if service in ancestors(int(entry.name))]
+    return [pid for pid in found if command_of(Path("/proc", str(pid))) == "worker"]
 
 
 def parent(pid: int) -> int | None:

@@ -30,9 +30,9 @@ class Settings(BaseSettings):
     """What runs the jobs: ``local``, processes of this machine; ``ray://HOST:PORT``, a Ray cluster; ``ray-local``, Ray
     on this machine alone."""
     stall_timeout: Annotated[float, Field(gt=0)] = 1800.0
-    """Seconds without progress after which a job loses its attempt and goes on in another one."""
+    """Seconds without progress after which an attempt counts as lost."""
     silence: Annotated[float, Field(ge=1.0)] = 30.0
-    """Seconds without a sign of life after which the dispatcher counts as dead and another one takes over."""
+    """Seconds without a heartbeat after which an attempt, or the dispatcher, counts as dead and is replaced."""
     retention_days: Annotated[float, Field(ge=0)] = 0.0
     """Days after which ended jobs, their artifacts and unused calibrations are deleted; 0 keeps them."""
     device: str = "cpu"

@@ -19,7 +19,7 @@ from typing import Any, Final, Self
 
 from tests.fake_job import PHASES, trace
 from tests.served import CHILD, FAKE, command_line, command_of, reserved_port, wait_until
-from tests.service.executors import RayNodes
+from tests.service.ray_nodes import ACCESS, RayNodes
 from trompe_client import Client, Retries
 from trompe_client._job import JobHandle
 from trompe_server.queue.store import JobStore
@@ -106,18 +106,16 @@ class Site:
         scattered: bool,
         silence: float,
         phase_seconds: float,
-        stall_timeout: float = 1800.0,
         nodes: RayNodes | None = None,
     ) -> None:
         self.folder = folder
         self.settings = Settings(data=folder / "api", database=url, store=str(folder / "store"), silence=silence)
         self.nodes = nodes
-        self._environment = {
+        self._environment = ACCESS | {
             "TROMPE_EXECUTOR": nodes.address if nodes is not None else "local",
             "TROMPE_DATABASE": self.settings.database_url,
             "TROMPE_STORE": self.settings.store_url,
             "TROMPE_SILENCE": str(silence),
-            "TROMPE_STALL_TIMEOUT": str(stall_timeout),
             "TROMPE_RATE_LIMIT": "0",
             "TROMPE_RENDERER_PATIENCE": "120",
             "TROMPE_PIPELINE": "tests.service.chaos_pipeline:open_job",
@@ -161,7 +159,7 @@ class Site:
         """Ids of our living processes, by kind."""
         table = process_table()
         roots = {kept.process.pid for kept in self._kept if kept.process is not None}
-        roots |= {os.getpid()} if self.nodes is not None else set()
+        roots |= {self.nodes.process.pid} if self.nodes is not None else set()
         found: dict[str, list[int]] = {kind: [] for kind in KINDS.values()}
         for pid in sorted(table):
             kind = kind_of(pid)
@@ -183,9 +181,8 @@ class Site:
         """Kill one of the nodes that run jobs, and start another in its place. Returns whether there was one."""
         if self.nodes is None:
             return False
-        node = self.nodes.nodes.pop(int(place * len(self.nodes.nodes)))
-        self.nodes.kill(node)
-        self.nodes.nodes.append(self.nodes.add())
+        self.nodes.kill(self.nodes.nodes[int(place * len(self.nodes.nodes))])
+        self.nodes.add()
         return True
 
     def log(self) -> str:

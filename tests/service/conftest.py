@@ -8,6 +8,7 @@ import pytest
 
 from tests.service.postgres import Postgres, find_programs
 from tests.service.processes import Service, listening
+from tests.service.ray_nodes import ACCESS, RayNodes
 from trompe_server.queue.store import JobStore
 from trompe_server.settings import Settings
 
@@ -52,6 +53,23 @@ def store(database_url: str) -> Iterator[JobStore]:
     store.migrate()
     yield store
     store.close()
+
+
+@pytest.fixture(scope="session")
+def ray_access() -> Iterator[None]:
+    """The environment in which this process reaches Ray clusters: Ray reads it once, when it is imported."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in ACCESS.items():
+            patch.setenv(name, value)
+        pytest.importorskip("ray", reason="Ray is not installed: pip install 'trompe[cluster]'")
+        yield
+
+
+@pytest.fixture(scope="module")
+def cluster(ray_access: None) -> Iterator[RayNodes]:
+    """A Ray cluster of three nodes."""
+    with RayNodes() as nodes:
+        yield nodes
 
 
 @pytest.fixture

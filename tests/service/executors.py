@@ -1,22 +1,14 @@
-"""Executors for the contract tests: the fake, processes of this machine, and a Ray cluster of several nodes."""
+"""Queues of fake jobs for the contract tests of executors, and a fake executor."""
 
-import fcntl
-import gc
-import os
-import tempfile
 import time
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
-from unittest import mock
 
-import pytest
-
-from tests.served import FAKE, Queue, free_port, wait_until
+from tests.served import FAKE, Queue, wait_until
 from trompe_server.executor.choice import open_executor
 from trompe_server.executor.dispatcher import Dispatcher
 from trompe_server.executor.port import Ended, Executor, fits, left_in, too_much
@@ -28,8 +20,6 @@ from trompe_server.settings import Settings
 from trompe_shared.api import Job, Needs
 
 NAME: Final = "tests"
-TOKEN: Final = "t" * 32
-STORE_BYTES: Final = 80 * 2**20
 
 
 class FakeExecutor:
@@ -73,62 +63,6 @@ class FakeExecutor:
         return left_in(self._rooms[name], (claim for claim in self._running.values() if claim.job.worker == name))
 
 
-class RayNodes:
-    """A Ray cluster of simulated nodes with a client server at ``address``; a context manager.
-
-    Its nodes have one core each; the last one has a simulated GPU too.
-    """
-
-    def __init__(self, nodes: int = 3) -> None:
-        pytest.importorskip("ray", reason="Ray is not installed: pip install 'trompe[cluster]'")
-        from ray.cluster_utils import Cluster
-
-        self.port = free_port()
-        head = {"num_cpus": 0, "include_dashboard": False, "ray_client_server_port": self.port}
-        self.cluster = Cluster(initialize_head=True, head_node_args=head | {"object_store_memory": STORE_BYTES})
-        self.nodes = [self.add(num_gpus=int(number == nodes - 1)) for number in range(nodes)]
-
-    @property
-    def address(self) -> str:
-        """As in TROMPE_EXECUTOR."""
-        return f"ray://127.0.0.1:{self.port}"
-
-    def add(self, **resources: int) -> Any:
-        """A further node."""
-        with mock.patch("signal.signal"):  # Ray sets a handler, which only the main thread may
-            return self.cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES, **resources)
-
-    def kill(self, node: Any) -> None:
-        """Kill a node with all its processes."""
-        self.cluster.remove_node(node, allow_graceful=False)
-
-    def close(self) -> None:
-        self.cluster.shutdown()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            gc.collect()  # its open files, lest a later test is blamed
-
-
-@contextmanager
-def ray_environment(**more: str) -> Iterator[None]:
-    """The environment of a cluster with a token, for this process, the nodes and the attempts on them.
-
-    Waits while another process has one: two clusters on a machine take each other's ports.
-    """
-    added = FAKE | more | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN, "RAY_USAGE_STATS_ENABLED": "0"}
-    before = {name: os.environ.get(name) for name in added}
-    os.environ.update(added)
-    try:
-        with Path(tempfile.gettempdir(), "trompe-tests-ray.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
-
-
 class Executed(Queue):
     """A queue of fake jobs that a dispatcher hands to an executor of three cores and one GPU: a ``kind``, or Ray at
     its address."""
@@ -137,7 +71,7 @@ class Executed(Queue):
         device = "cuda" if kind == "local" else "cpu"
         executor = "local" if kind == "fake" else kind
         fixed: dict[str, Any] = {"data": folder, "workers": 3, "device": device, "executor": executor}
-        super().__init__(Settings(**fixed, pipeline=FAKE["TROMPE_PIPELINE"], **settings))
+        super().__init__(Settings(**fixed | settings, pipeline=FAKE["TROMPE_PIPELINE"]))
         self.store.migrate()
         self._fake, self._renderers = kind == "fake", RendererAddresses((("127.0.0.1", renderer),))
 

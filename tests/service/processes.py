@@ -8,10 +8,9 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Final
 
-from tests.served import CHILD, FAKE, Queue, command_of, parent, wait_until
+from tests.served import CHILD, FAKE, Queue, wait_until
 from trompe_server.service.dispatch import prepare_data
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import JobArtifacts, job_artifacts, open_folder
@@ -78,12 +77,6 @@ class WorkerProcess:
         """Send a signal and return the exit status."""
         self.send(number)
         return self.process.wait(120)
-
-    def children(self) -> list[int]:
-        """Ids of its attack workers."""
-        pids = [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdecimal()]
-        ours = [pid for pid in pids if parent(pid) == self.process.pid]
-        return [pid for pid in ours if command_of(Path("/proc", str(pid))) == "worker"]
 
     def words(self) -> str:
         """Standard error of the process so far."""

@@ -1,11 +1,15 @@
 """The dispatcher on the fake executor: leases, losses, and executors that fail."""
 
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.served import wait_until
+from tests.served import FAKE, parent, wait_until, workers_of
 from tests.service.executors import Executed
 from trompe_server.errors import ServiceError
 from trompe_server.executor.dispatcher import Dispatcher, dispatcher_name
@@ -102,8 +106,40 @@ def test_an_executor_that_is_lost_is_opened_again_and_the_jobs_go_on(executed: E
     assert (found.state, found.attempts) == (JobState.succeeded, 2)
 
 
+def test_the_job_of_a_frozen_process_goes_on_in_another(tmp_path: Path, renderer: int) -> None:
+    executed = Executed(tmp_path, "local", renderer, silence=4.0)
+    job = executed.submit("gate")
+    with executed.dispatching():
+        wait_until(lambda: executed.in_gate(job))
+        frozen = workers_of(os.getpid())
+        for pid in frozen:
+            os.kill(pid, signal.SIGSTOP)
+        wait_until(lambda: executed.state(job).attempts == 2 and executed.in_gate(job))
+        assert "no heartbeat for 4 s" in "".join(event.message or "" for event in executed.store.events(job))
+        executed.open_gate(job)
+        (ended,) = executed.ended(job)
+    executed.store.close()
+    assert ended.state is JobState.succeeded
+
+
+def test_a_dead_fork_server_is_replaced(tmp_path: Path, renderer: int) -> None:
+    executed = Executed(tmp_path, "local", renderer, workers=1)
+    job = executed.submit("gate")
+    with executed.dispatching():
+        wait_until(lambda: executed.in_gate(job))
+        (worker,) = workers_of(os.getpid())
+        for pid in (parent(worker), worker):
+            assert pid is not None
+            os.kill(pid, signal.SIGKILL)
+        wait_until(lambda: executed.state(job).attempts == 2 and executed.in_gate(job))
+        executed.open_gate(job)
+        (ended,) = executed.ended(job)
+    executed.store.close()
+    assert ended.state is JobState.succeeded
+
+
 def test_a_process_that_dies_before_it_is_ready_is_a_fault_and_is_tried_again(tmp_path: Path) -> None:
-    settings = Settings(data=tmp_path, workers=1, store="nowhere://at.all")
+    settings = Settings(data=tmp_path, workers=1, store="nowhere://at.all", pipeline=FAKE["TROMPE_PIPELINE"])
     executor = LocalExecutor(Setup(settings, RendererAddresses()))
     try:
         wait_until(lambda: executor.ended(0.1) == [] and "2 times" in str(executor.workers()[0].fault))
@@ -116,3 +152,11 @@ def test_a_data_folder_keeps_its_dispatcher_s_name_and_lends_it_to_one(tmp_path:
         assert first != second
     with dispatcher_name(tmp_path) as again:
         assert again == first
+
+
+def test_a_service_on_one_machine_imports_no_ray() -> None:
+    code = (
+        "import sys, trompe_server.service.serve, trompe_server.service.dispatch, trompe_server.executor.attempts;"
+        "sys.exit('ray' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

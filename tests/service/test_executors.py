@@ -7,22 +7,11 @@ import pytest
 
 from tests.fake_job import PHASES, trace
 from tests.served import wait_until
-from tests.service.executors import Executed, RayNodes, ray_environment
+from tests.service.executors import Executed
 from trompe_shared.api import JobState
 
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-"""Ray leaves files open."""
 
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[RayNodes]:
-    with ray_environment():
-        nodes = RayNodes()
-        yield nodes
-        nodes.close()
-
-
-@pytest.fixture(params=["fake", "local", "ray"])
+@pytest.fixture(params=["fake", "local", pytest.param("ray", marks=pytest.mark.cluster)])
 def executed(request: pytest.FixtureRequest, tmp_path: Path, renderer: int) -> Iterator[Executed]:
     kind = request.getfixturevalue("cluster").address if request.param == "ray" else request.param
     queue = Executed(tmp_path, kind, renderer)

@@ -199,6 +199,22 @@ def test_a_running_job_without_events_stands_still(store: JobStore) -> None:
     assert lively == taken.job.id
 
 
+def test_an_attempt_whose_heartbeats_stop_is_silent_and_the_next_one_begins_anew(store: JobStore) -> None:
+    create(store)
+    taken = claim(store)
+    assert claims_of(store).silent(0) == {}, "it has not begun"
+    claims_of(store).beat(taken)
+    assert claims_of(store).silent(50) == {}
+    with write(store.engine) as connection:
+        connection.execute(jobs.update().values(seen=jobs.c.seen - 100))
+    assert claims_of(store).silent(50) == {taken.job.id: 1}
+    claims_of(store).lose(taken, "frozen")
+    assert claims_of(store).silent(50) == {}
+    claim(store)
+    claims_of(store).beat(taken)
+    assert claims_of(store).silent(-50) == {}, "the heartbeat of an earlier attempt counts for nothing"
+
+
 def test_events_tell_the_whole_story_and_their_ids_grow_by_one(store: JobStore) -> None:
     job = create(store)
     taken = claim(store)
@@ -434,6 +450,7 @@ def test_the_tables_of_an_earlier_version_are_upgraded_with_their_jobs(store: Jo
     with write(store.engine) as connection:
         for statement in (
             "ALTER TABLE jobs DROP COLUMN names",
+            "ALTER TABLE jobs DROP COLUMN seen",
             "UPDATE jobs SET needs = CASE needs WHEN '{}' THEN 'any' ELSE 'cuda' END",
             "ALTER TABLE leases DROP COLUMN holder",
             "DELETE FROM leases WHERE name = 'dispatcher'",

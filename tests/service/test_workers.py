@@ -13,7 +13,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from tests.fake_job import PHASES, trace
-from tests.served import Served, reserved_port, wait_until
+from tests.served import Served, reserved_port, wait_until, workers_of
 from tests.service.processes import Service
 from trompe_server.errors import ServiceError
 from trompe_server.settings import Settings
@@ -110,14 +110,16 @@ def test_a_frozen_process_loses_its_job_and_never_replaces_what_a_newer_attempt_
     with service.worker() as alone:
         wait_until(lambda: service.in_gate(job))
         alone.send(signal.SIGSTOP)
-        for pid in alone.children():
+        for pid in workers_of(alone.process.pid):
             os.kill(pid, signal.SIGSTOP)
         with service.worker():
             wait_until(lambda: service.state(job).attempts == 2)
             service.open_gate(job)
             service.ended(job)
             result = service.artifacts(job).read("result.json")
-            for pid in alone.children():  # it sees the gate open, and writes attack-001.txt of the first attempt
+            for pid in workers_of(
+                alone.process.pid
+            ):  # it sees the gate open, and writes attack-001.txt of the first attempt
                 os.kill(pid, signal.SIGCONT)
             wait_until(lambda: "was lost" in alone.words())
             wait_until(lambda: LocalArtifacts(service.folder(job) / "1").names() == [])

@@ -1,6 +1,9 @@
 """Attempts of jobs in this process, one after the other."""
 
 import logging
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -11,14 +14,14 @@ from trompe_server.queue.leases import DISPATCHER, lease_holder
 from trompe_server.queue.store import JobStore
 from trompe_server.renderers.discovery import RendererAddresses
 from trompe_server.settings import Settings
-from trompe_server.storage.database import connect
+from trompe_server.storage.database import DatabaseDownError, connect
 from trompe_server.storage.folders import open_folder
 from trompe_server.system.log import about_job, log_to_stderr
 from trompe_server.system.memory import keep_freed_memory
 from trompe_server.system.threads import prepare_threads
 from trompe_shared.errors import TrompeError
 
-__all__ = ["MARK", "Attempts", "fault_here"]
+__all__ = ["MARK", "Attempts", "fault_here", "prepare"]
 
 logger = logging.getLogger(__name__)
 
@@ -27,25 +30,53 @@ MARK: Final = "cluster-mark"
 
 
 class Attempts:
-    """Runs attempts with ``settings`` and ``renderers``. Imports torch at once, so that the first job need not wait."""
+    """Runs attempts with ``settings`` and ``renderers``."""
 
     def __init__(self, settings: Settings, renderers: RendererAddresses) -> None:
         log_to_stderr()
-        keep_freed_memory()
-        prepare_threads()
+        prepare(settings.pipeline)
         opener = JobOpener(settings, open_folder(settings.store_url), renderers)
-        self._runner = JobRunner(Claims(JobStore(settings.database_url).engine), opener.open, opener.tidy)
-        _preload(settings.pipeline)
+        self._claims = Claims(JobStore(settings.database_url).engine)
+        self._runner = JobRunner(self._claims, opener.open, opener.tidy)
+        self._interval = settings.silence / 4
 
     def run(self, claim: Claim) -> str | None:
         """Run an attempt. Returns why it was lost, or ``None`` if the record has its end."""
         try:
-            with about_job(claim.job.id):
+            with about_job(claim.job.id), self._heartbeats(claim):
                 self._runner.run(claim)
         except Exception as error:
             logger.exception("attempt %d of job %s was lost", claim.attempt, claim.job.id)
             return f"{type(error).__name__}: {error}"
         return None
+
+    @contextmanager
+    def _heartbeats(self, claim: Claim) -> Iterator[None]:
+        """Tell the record periodically that this process is not frozen."""
+        over = threading.Event()
+
+        def beat() -> None:
+            while True:
+                with suppress(DatabaseDownError):
+                    self._claims.beat(claim)
+                if over.wait(self._interval):
+                    return
+
+        threading.Thread(target=beat, daemon=True).start()
+        try:
+            yield
+        finally:
+            over.set()
+
+
+def prepare(pipeline: str) -> None:
+    """Prepare this process for attempts, and import torch before the first one. If that fails, each job reports it."""
+    keep_freed_memory()
+    prepare_threads()
+    try:
+        load(pipeline)
+    except Exception:
+        logger.exception("%s cannot be imported; every job will fail", pipeline)
 
 
 def fault_here(settings: Settings, mark: str) -> str | None:
@@ -73,11 +104,3 @@ def _is_dispatcher(settings: Settings, mark: str) -> bool:
 
 def _place(settings: Settings) -> str:
     return connect(settings.database_url).url.render_as_string(hide_password=True)
-
-
-def _preload(pipeline: str) -> None:
-    """Import torch before the first job. If that fails, each job reports it."""
-    try:
-        load(pipeline)
-    except Exception:
-        logger.exception("%s cannot be imported; every job will fail", pipeline)

@@ -26,6 +26,8 @@ WAIT: Final = 0.1
 """Longest wait for the end of an attempt, seconds; then for new jobs."""
 INTERVAL: Final = 5.0
 """Longest time between two rounds, seconds."""
+RETRY: Final = 1.0
+"""Seconds until the next step after an error."""
 LEAVE_PATIENCE: Final = 5.0
 """Seconds a stopping dispatcher has to give its jobs back."""
 
@@ -33,8 +35,8 @@ LEAVE_PATIENCE: Final = 5.0
 class Dispatcher:
     """Dispatches the jobs of ``claims`` while it holds the lease, as ``name``, which another gets after ``silence``.
 
-    ``open_executor`` is called once it has the lease, and again after the executor was lost. A job without an event for
-    ``stall_timeout`` seconds loses its attempt. ``clock`` is monotonic. Durations are in seconds.
+    ``open_executor`` is called once it has the lease, and again after the executor was lost. An attempt is lost without
+    a heartbeat for ``silence`` or an event for ``stall_timeout``. ``clock`` is monotonic. Durations are in seconds.
     """
 
     def __init__(
@@ -74,24 +76,25 @@ class Dispatcher:
 
     def _run(self, stop: threading.Event) -> None:
         while not stop.is_set():
-            try:
-                ours = self.step()
-                self._tried.set()
-                if not ours:
-                    stop.wait(self._interval)
-            except DatabaseDownError as error:
-                self._heard_since = self._clock()
-                logger.warning("%s Retrying.", error)
-                stop.wait(1.0)
-            except ServiceError as error:
-                self._abandon(str(error))
-                self._tried.set()
-                stop.wait(self._interval)
-            except Exception:
-                logger.exception("the dispatcher failed; retrying")
-                stop.wait(1.0)
+            pause = self._try()
             self._tried.set()
+            stop.wait(pause)
         self._leave()
+
+    def _try(self) -> float:
+        """Dispatch once, whatever fails. Returns the seconds to wait."""
+        try:
+            return 0.0 if self.step() else self._interval
+        except DatabaseDownError as error:
+            self._heard_since = self._clock()
+            logger.warning("%s Retrying.", error)
+            return RETRY
+        except ServiceError as error:
+            self._abandon(str(error))
+            return self._interval
+        except Exception:
+            logger.exception("the dispatcher failed; retrying")
+            return RETRY
 
     def step(self) -> bool:
         """Dispatch once. Returns whether this dispatcher has the lease.
@@ -124,7 +127,7 @@ class Dispatcher:
             self._executor = self._open()
         for job in self._claims.lose_unknown(self._held, "its worker or dispatcher died"):
             logger.warning("job %s was requeued: nobody runs it", job)
-        self._cancel_stalled(self._executor)
+        self._cancel_dead(self._executor)
         workers = self._executor.workers()
         record_workers(self._claims.engine, workers)
         faults = [worker.fault for worker in workers if worker.fault is not None]
@@ -149,17 +152,21 @@ class Dispatcher:
         if ended.reason is not None:
             self._lost.append((ended.claim, ended.reason))
 
-    def _cancel_stalled(self, executor: Executor) -> None:
-        """Kill the attempts that make no progress. Nobody is called dead right after we were held up ourselves."""
-        if self._clock() - self._heard_since < self._stall_timeout:
-            return
-        for job, attempt in self._claims.still(self._stall_timeout).items():
-            claim = self._held.get(job)
-            if claim is not None and claim.attempt == attempt:
-                reason = f"no progress for {self._stall_timeout:.0f} s on {claim.job.worker}"
-                logger.error("job %s made %s", job, reason)
-                executor.cancel(claim)
-                self._end(Ended(claim, reason))
+    def _cancel_dead(self, executor: Executor) -> None:
+        """Kill attempts that are frozen or make no progress. None is called dead after we were held up ourselves."""
+        for lack, seconds, overdue in (
+            ("heartbeat", self._silence, self._claims.silent),
+            ("progress", self._stall_timeout, self._claims.still),
+        ):
+            if self._clock() - self._heard_since < seconds:
+                continue
+            for job, attempt in overdue(seconds).items():
+                claim = self._held.get(job)
+                if claim is not None and claim.attempt == attempt:
+                    reason = f"no {lack} for {seconds:.0f} s on {claim.job.worker}"
+                    logger.error("job %s: %s", job, reason)
+                    executor.cancel(claim)
+                    self._end(Ended(claim, reason))
 
     def _abandon(self, fault: str | None) -> None:
         """Kill what runs: the executor is lost, or another dispatcher has the lease and the jobs."""

@@ -1,7 +1,7 @@
 """Prometheus counters of a worker.
 
-Workers of ``trompe serve`` write them to files in the folder ``PROMETHEUS_MULTIPROC_DIR``, which the API sums up. A
-worker elsewhere serves them itself at the port ``metrics_port``.
+Workers of this machine write them to files in the folder ``PROMETHEUS_MULTIPROC_DIR``, which the API or
+``trompe worker`` sums up. Those of Ray nodes stay there.
 """
 
 from collections.abc import Mapping

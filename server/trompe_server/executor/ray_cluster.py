@@ -4,6 +4,7 @@ import logging
 import os
 import socket
 import time
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -31,6 +32,8 @@ ENVIRONMENT: Final = {
 """Ray reads it at its import. After the grace period, in seconds, the tasks of a dead dispatcher end."""
 ANSWER: Final = 5.0
 """Seconds the cluster has to accept a connection."""
+TRIES: Final = 2
+"""Tries to connect, each of 5 s."""
 LOOK: Final = 1.0
 """Seconds between two looks at the nodes."""
 RECHECK: Final = 30.0
@@ -80,7 +83,8 @@ class RayExecutor:
         self._attempts: dict[Any, _Attempt] = {}
         self._demanded: list[dict[str, float]] = []
         self._looked = 0.0
-        self._look()
+        with self._translated():
+            self._look()
 
     def place(self, needs: Needs) -> str | None:
         rooms = [(node, self._left(node)) for node in self._nodes.values() if node.fault is None]
@@ -222,24 +226,31 @@ def _connected(address: str, workers: int) -> Any:
         os.environ.setdefault(name, value)
     try:
         import ray
-        from ray.util.client_connect import connect
     except ImportError as error:
         raise ServiceError("Ray is not installed: pip install 'trompe[cluster]', or use --executor local.") from error
     if ray.is_initialized():
         ray.shutdown()
-    if address == "ray-local":
-        ray.init(
-            address="local",  # otherwise it may join a cluster that somebody left behind
-            num_cpus=workers,
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE,
-            logging_level=logging.ERROR,
-        )
+    if address != "ray-local":
+        _connect(address)
         return ray
+    ray.init(
+        address="local",  # otherwise it may join a cluster that somebody left behind
+        num_cpus=workers,
+        include_dashboard=False,
+        object_store_memory=OBJECT_STORE,
+        logging_level=logging.ERROR,
+    )
+    return ray
+
+
+def _connect(address: str) -> None:
+    from ray.util.client_connect import connect
+
     place = address.removeprefix("ray://")
     _check_there(address, place)
     try:
-        connect(place, connection_retries=1, ray_init_kwargs={"logging_level": logging.ERROR})
+        with warnings.catch_warnings(action="ignore"):
+            connect(place, connection_retries=TRIES, ray_init_kwargs={"logging_level": logging.ERROR})
     except RuntimeError as error:
         raise ServiceError(
             f"The Ray cluster {address} has other versions: Ray and Python must be the same on all nodes and here "
@@ -250,7 +261,6 @@ def _connected(address: str, workers: int) -> Any:
             f"The Ray cluster {address} refuses us ({_first_line(error)}). Set RAY_AUTH_TOKEN, or the file "
             "~/.ray/auth_token, to the cluster's token, and check that this is the port of its client server (10001)."
         ) from error
-    return ray
 
 
 def _check_there(address: str, place: str) -> None:

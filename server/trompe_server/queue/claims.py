@@ -20,9 +20,9 @@ __all__ = ["MAX_LOST", "Claim", "Claims", "Ending", "LostJobError"]
 MAX_LOST: Final = 3
 """Attempts that may be lost in the same phase of a job before the job is failed."""
 
-
 MOST_TOLD: Final = 500
 """Jobs told in one transaction why they wait."""
+_RUNNING: Final = jobs.c.state == JobState.running.value
 
 
 class LostJobError(Exception):
@@ -136,7 +136,7 @@ class Claims:
     def lose_unknown(self, known: Mapping[str, Claim], reason: str) -> list[str]:
         """Take the running jobs whose attempts are not ``known`` (by job). Returns their ids."""
         ours = {job: claim.attempt for job, claim in known.items()}
-        running = sa.select(jobs.c.id, jobs.c.attempts).where(jobs.c.state == JobState.running.value)
+        running = sa.select(jobs.c.id, jobs.c.attempts).where(_RUNNING)
         with self.engine.connect() as connection:
             unknown = [row.id for row in connection.execute(running) if ours.get(row.id) != row.attempts]
         for job in unknown:
@@ -146,11 +146,23 @@ class Claims:
                     _lose(connection, row, reason)
         return unknown
 
+    def beat(self, claim: Claim) -> None:
+        """Note that the attempt lives, unless it is over."""
+        held = sa.and_(jobs.c.id == claim.job.id, jobs.c.attempts == claim.attempt, _RUNNING)
+        with write(self.engine) as connection:
+            connection.execute(jobs.update().where(held).values(seen=clock()))
+
+    def silent(self, seconds: float) -> dict[str, int]:
+        """Running jobs whose attempts have had heartbeats, but none for ``seconds``: their attempts, by job."""
+        query = sa.select(jobs.c.id, jobs.c.attempts).where(_RUNNING, jobs.c.seen < clock() - seconds)
+        with self.engine.connect() as connection:
+            return {row.id: row.attempts for row in connection.execute(query)}
+
     def still(self, seconds: float) -> dict[str, int]:
         """Running jobs without an event for ``seconds``: their attempts, by job."""
         last = sa.and_(events.c.job == jobs.c.id, events.c.id == jobs.c.events)
         query = sa.select(jobs.c.id, jobs.c.attempts).join(events, last)
-        query = query.where(jobs.c.state == JobState.running.value, events.c.time < clock() - seconds)
+        query = query.where(_RUNNING, events.c.time < clock() - seconds)
         with self.engine.connect() as connection:
             return {row.id: row.attempts for row in connection.execute(query)}
 
@@ -166,9 +178,9 @@ class Claims:
 
 def _take(connection: sa.Connection, row: Row, worker: str) -> Claim:
     message = "started" if row.attempts == 0 else f"continued by {worker}"
-    values = {"state": JobState.running.value, "worker": worker, "attempts": row.attempts + 1, "note": None}
+    values = {"state": JobState.running.value, "worker": worker, "attempts": row.attempts + 1}
     started = sa.func.coalesce(jobs.c.started, clock())
-    return _claim(update_job(connection, row.id, message=message, started=started, **values))
+    return _claim(update_job(connection, row.id, message=message, started=started, note=None, seen=None, **values))
 
 
 def _lose(connection: sa.Connection, row: Row, reason: str) -> None:

@@ -48,11 +48,12 @@ jobs = sa.Table(
     sa.Column("note", sa.String),
     sa.Column("artifacts", sa.JSON, nullable=False),
     sa.Column("names", sa.JSON, nullable=False, server_default="{}"),
+    sa.Column("seen", sa.Double),
     sqlite_autoincrement=True,
 )
 """``attempts`` counts claims, and an attempt must name itself to write; ``lost`` counts attempts lost since the last
-finished phase; ``done`` counts finished phases; ``events`` counts the rows in ``job_events``. ``needs`` is JSON without
-defaults.
+finished phase; ``done`` counts finished phases; ``events`` counts the rows in ``job_events``; ``needs`` is JSON without
+defaults; ``seen`` is the time of the attempt's last heartbeat.
 """
 sa.Index("jobs_by_state", jobs.c.state, jobs.c.number)
 sa.Index("jobs_by_object", jobs.c.object, jobs.c.number)

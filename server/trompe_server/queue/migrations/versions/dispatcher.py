@@ -1,4 +1,4 @@
-"""One dispatcher hands out the jobs: leases have holders, workers faults, and jobs needs in amounts."""
+"""One dispatcher hands out the jobs: leases have holders, workers faults, jobs heartbeats and needs in amounts."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -13,6 +13,7 @@ def upgrade() -> None:
     op.execute("DELETE FROM workers")
     op.drop_column("workers", "job")
     op.add_column("workers", sa.Column("fault", sa.String))
+    op.add_column("jobs", sa.Column("seen", sa.Double))
     jobs = sa.table("jobs", sa.column("needs"))
     op.execute(jobs.update().where(jobs.c.needs == "cuda").values(needs='{"gpu":1.0}'))
     op.execute(jobs.update().where(jobs.c.needs.in_(["any", "cpu"])).values(needs="{}"))
