@@ -26,6 +26,7 @@ from trompe_client import Client
 ROOT: Final = Path(__file__).parents[2]
 STAND_INS: Final = Path(__file__).parent / "stand_ins"
 OFFICIAL: Final = re.compile(r"image: ((?:postgres|minio/minio):\S+)")
+PROFILES: Final = ("--profile", "cluster", "--profile", "s3")
 VERSION: Final = "test"
 """Tag of the images under test."""
 
@@ -167,7 +168,7 @@ def built(engine: str) -> Stack:
     fixed = {"TROMPE_VERSION": VERSION, "TROMPE_PORT": str(free_port()), "TROMPE_SILENCE": "15"}
     stack = Stack(files, fixed | _variables_of_the_build())
     with timed("building the images"):
-        stack.compose("--profile", "s3", "build", "--quiet", timeout=1800)
+        stack.compose(*PROFILES, "build", "--quiet", timeout=1800)
     return stack
 
 
@@ -181,7 +182,7 @@ def stack(built: Stack, request: pytest.FixtureRequest) -> Iterator[Stack]:
     finally:
         if request.session.testsfailed or sys.exc_info()[0]:
             logger.error("%s", built.compose("logs", "--no-color", "--timestamps", "--tail", "200"))
-        built.compose("--profile", "s3", "down", "--volumes", "--timeout", "5")
+        built.compose(*PROFILES, "down", "--volumes", "--timeout", "5")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
