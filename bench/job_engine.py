@@ -2,7 +2,7 @@
 
 Jobs of nine phases that do nothing, as many as an attack of 30 steps has, run on an executor: ``local``, ``ray-local``
 or ``ray://HOST:PORT``. Then the worker of a running phase is killed: seconds until it begins again, on another worker
-if there are several; a new process first imports torch.
+if there are several.
 """
 
 import argparse
@@ -19,6 +19,7 @@ from typing import Any
 
 from tests.service.processes import listening
 
+import trompe_server.job.texture_attack  # noqa: F401  what an attack imports
 from bench.job_list import size
 from trompe_server.executor.choice import open_executor
 from trompe_server.executor.dispatcher import Dispatcher
@@ -60,9 +61,7 @@ class Idle:
 
 
 def open_job(spec: JobSpec, *, artifacts: JobArtifacts, **_: Any) -> Idle:
-    """Open a job with the signature of ``trompe_server.job.texture_attack.open_job``, and with its imports."""
-    import trompe_server.job.texture_attack  # noqa: F401
-
+    """Open a job with the signature of ``trompe_server.job.texture_attack.open_job``."""
     return Idle(spec.goal.label == ["wait"], artifacts)
 
 

@@ -60,7 +60,8 @@ def test_a_job_is_cancelled_over_http(serve: Served) -> None:
 
 
 def test_a_renderer_that_is_killed_comes_back_at_the_same_address(serve: Served) -> None:
-    before, renderers = serve.children(), wait_until(serve.engines)
+    before = wait_until(lambda: "worker" in (children := serve.children()) and children)
+    renderers = wait_until(serve.engines)
     pids = [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdecimal()]
     assert [pid for pid in pids if parent(pid) == before["render"]] == []  # serve alone supervises it
     os.kill(before["render"], signal.SIGKILL)

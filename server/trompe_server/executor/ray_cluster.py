@@ -32,8 +32,6 @@ ENVIRONMENT: Final = {
 """Ray reads it at its import. After the grace period, in seconds, the tasks of a dead dispatcher end."""
 ANSWER: Final = 5.0
 """Seconds the cluster has to accept a connection."""
-TRIES: Final = 2
-"""Tries to connect, each of 5 s."""
 LOOK: Final = 1.0
 """Seconds between two looks at the nodes."""
 RECHECK: Final = 30.0
@@ -250,7 +248,7 @@ def _connect(address: str) -> None:
     _check_there(address, place)
     try:
         with warnings.catch_warnings(action="ignore"):
-            connect(place, connection_retries=TRIES, ray_init_kwargs={"logging_level": logging.ERROR})
+            connect(place, connection_retries=1, ray_init_kwargs={"logging_level": logging.ERROR})
     except RuntimeError as error:
         raise ServiceError(
             f"The Ray cluster {address} has other versions: Ray and Python must be the same on all nodes and here "
