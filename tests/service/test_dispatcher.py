@@ -107,13 +107,12 @@ def test_an_executor_that_is_lost_is_opened_again_and_the_jobs_go_on(executed: E
 
 
 def test_the_job_of_a_frozen_process_goes_on_in_another(tmp_path: Path, renderer: int) -> None:
-    executed = Executed(tmp_path, "local", renderer, silence=4.0)
+    executed = Executed(tmp_path, "local", renderer, silence=4.0, workers=1)
     job = executed.submit("gate")
     with executed.dispatching():
         wait_until(lambda: executed.in_gate(job))
-        frozen = workers_of(os.getpid())
-        for pid in frozen:
-            os.kill(pid, signal.SIGSTOP)
+        (frozen,) = workers_of(os.getpid())
+        os.kill(frozen, signal.SIGSTOP)
         wait_until(lambda: executed.state(job).attempts == 2 and executed.in_gate(job))
         assert "no heartbeat for 4 s" in "".join(event.message or "" for event in executed.store.events(job))
         executed.open_gate(job)
