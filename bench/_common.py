@@ -18,7 +18,8 @@ from PIL import Image
 from trompe_experiments.asset_objects import AssetObject, asset_objects
 from trompe_server.attack import grid_views
 from trompe_server.renderers import local_renderer
-from trompe_shared.geometry import COLOURS, View
+from trompe_shared.colours import COLOURS
+from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import ShippedObject, shipped_objects
 

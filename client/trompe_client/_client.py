@@ -10,11 +10,27 @@ from trompe_client._core import JobFilter, Request
 from trompe_client._job import AsyncJobHandle, JobHandle
 from trompe_client._many import Attack, Outcome, run_all
 from trompe_client._operations import pages, planned, send, stored, uploaded
-from trompe_client._plan import AttackPlan, background_upload, classifier_upload, named_object_upload, plan_attack
+from trompe_client._plan import (
+    AttackPlan,
+    background_upload,
+    classifier_upload,
+    named_object_upload,
+    plan_attack,
+    plan_judgement,
+)
 from trompe_client._port import Port, blocking, finish, iterate
 from trompe_client._retry import Retries
 from trompe_client._settings import Connection
-from trompe_shared.api import BackgroundInfo, ClassifierInfo, JobSpec, JobState, ObjectInfo, RendererInfo, WorkerInfo
+from trompe_shared.api import (
+    BackgroundInfo,
+    ClassifierInfo,
+    JobSpec,
+    JobState,
+    JudgementSpec,
+    ObjectInfo,
+    RendererInfo,
+    WorkerInfo,
+)
 
 if TYPE_CHECKING:
     from trompe_client._http import AsyncPort, BlockingPort
@@ -61,11 +77,18 @@ class AsyncClient(_Connected["AsyncPort"]):
         plan = partial(plan_attack, object, label=label, **options)
         return await self.submit(await planned(self.port, plan), key=key)
 
+    async def judge(
+        self, before: str | Path, after: str | Path, *, label: Label, key: str | None = None, **options: Any
+    ) -> AsyncJobHandle:
+        """As ``Client.judge``."""
+        plan = partial(plan_judgement, before, after, label=label, **options)
+        return await self.submit(await planned(self.port, plan), key=key)
+
     async def start(self, plan: AttackPlan, *, key: str | None = None) -> AsyncJobHandle:
         """As ``Client.start``."""
         return await self.submit(await uploaded(self.port, plan), key=key)
 
-    async def submit(self, spec: JobSpec, *, key: str | None = None) -> AsyncJobHandle:
+    async def submit(self, spec: JobSpec | JudgementSpec, *, key: str | None = None) -> AsyncJobHandle:
         """As ``Client.submit``."""
         return AsyncJobHandle(self, await self.send(_core.submit(spec, key=key or _core.new_key())))
 
@@ -177,12 +200,30 @@ class Client(_Connected["BlockingPort"]):
         plan = partial(plan_attack, object, label=label, **options)
         return self.submit(finish(planned(self.port, plan)), key=key)
 
+    def judge(
+        self, before: str | Path, after: str | Path, *, label: Label, key: str | None = None, **options: Any
+    ) -> JobHandle:
+        """Submit a judgement of ``after``, a repaint of ``before`` by anyone, and return a handle at once.
+
+        Args:
+            before: path of a zip, a model file or a folder with one; or the name or id of a stored object.
+            after: the same, or ``job:ID`` for the result of an attack.
+            label: the object's true class: a name or an index; or several that all count as the object.
+            key: idempotency key; the same key makes one judgement.
+            options: the other fields of ``JudgementRequest``; ``networks`` takes names or paths.
+
+        ``wait().manifest()`` has the figures, ``download`` gets manifest and page. Raises ``ObjectError``,
+        ``ClassifierError`` or ``SpecError`` for invalid files and options.
+        """
+        plan = partial(plan_judgement, before, after, label=label, **options)
+        return self.submit(finish(planned(self.port, plan)), key=key)
+
     def start(self, plan: AttackPlan, *, key: str | None = None) -> JobHandle:
         """Upload a plan's files and submit its job."""
         return self.submit(finish(uploaded(self.port, plan)), key=key)
 
-    def submit(self, spec: JobSpec, *, key: str | None = None) -> JobHandle:
-        """Submit a ``JobRequest`` or ``JobSpec`` of stored objects and classifiers.
+    def submit(self, spec: JobSpec | JudgementSpec, *, key: str | None = None) -> JobHandle:
+        """Submit an attack or a judgement of stored objects and classifiers, with or without options of the queue.
 
         Raises ``Conflict`` if another job was submitted with this ``key``.
         """

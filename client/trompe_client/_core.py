@@ -20,6 +20,8 @@ from trompe_shared.api import (
     JobList,
     JobSpec,
     JobState,
+    JudgementSpec,
+    Manifest,
     ObjectInfo,
     Problem,
     RendererInfo,
@@ -91,10 +93,11 @@ def new_key() -> str:
     return secrets.token_hex(16)
 
 
-def submit(spec: JobSpec, *, key: str) -> Request[Job]:
-    """Submit a job; the same ``key`` makes one job. The queue's options of a plain ``JobSpec`` have their defaults."""
+def submit(spec: JobSpec | JudgementSpec, *, key: str) -> Request[Job]:
+    """Submit a job; the same ``key`` makes one job. The queue's options of a plain spec have their defaults."""
     headers = {"Idempotency-Key": key}
-    return Request("POST", "/v1/jobs", _reader(Job), headers=headers, json=spec.model_dump_json())
+    path = "/v1/judgements" if isinstance(spec, JudgementSpec) else "/v1/jobs"
+    return Request("POST", path, _reader(Job), headers=headers, json=spec.model_dump_json())
 
 
 def jobs(wanted: JobFilter, *, limit: int, cursor: str | None = None) -> Request[JobList]:
@@ -128,6 +131,11 @@ def events(job_id: str, *, after: int | None) -> Request[bytes]:
 
 def result(job_id: str) -> Request[Result]:
     return Request("GET", f"{_job_path(job_id)}/result", _reader(Result), job_id=job_id)
+
+
+def manifest(job_id: str) -> Request[Manifest]:
+    path = f"/v1/judgements/{quote(job_id, safe='')}/manifest"
+    return Request("GET", path, _reader(Manifest), job_id=job_id)
 
 
 def artifact(job_id: str, name: str) -> Request[bytes]:

@@ -11,7 +11,7 @@ from trompe_client._page import ResultPage
 from trompe_client._port import Port, blocking, finish, iterate
 from trompe_client._progress import Progress, shown
 from trompe_client._transfer import fetch, fetch_all
-from trompe_shared.api import Event, Job, Result
+from trompe_shared.api import Event, Job, Manifest, Result
 
 if TYPE_CHECKING:
     from trompe_client._client import AsyncClient, Client
@@ -42,8 +42,12 @@ class AsyncJobHandle(_Handle):
         return self.status
 
     async def result(self) -> Result:
-        """The result of an ended job. Raises ``Conflict`` before that."""
+        """The result of an ended attack. Raises ``Conflict`` before that."""
         return await send(self._port, _core.result(self.id))
+
+    async def manifest(self) -> Manifest:
+        """The manifest of an ended judgement. Raises ``Conflict`` before that, ``NotFound`` for an attack."""
+        return await send(self._port, _core.manifest(self.id))
 
     async def download(self, folder: str | Path) -> list[Path]:
         """Download all artifacts into ``folder``, created if missing. Returns their paths.
@@ -95,6 +99,7 @@ class JobHandle(_Handle):
     client: "Client"
     refresh = blocking(AsyncJobHandle.refresh)
     result = blocking(AsyncJobHandle.result)
+    manifest = blocking(AsyncJobHandle.manifest)
     download = blocking(AsyncJobHandle.download)
     show = blocking(AsyncJobHandle.show)
     archive = blocking(AsyncJobHandle.archive)

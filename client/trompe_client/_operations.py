@@ -1,16 +1,29 @@
 """Requests with retries, and operations of several requests. Coroutines over a ``Port``."""
 
-from collections.abc import AsyncGenerator, Callable
-from typing import Any, TypeVar
+from collections.abc import AsyncGenerator, Callable, Mapping
+from typing import Any, Protocol, TypeVar
 
 from trompe_client import _core
 from trompe_client._core import JobFilter, Request
 from trompe_client._errors import ClientError
-from trompe_client._plan import AttackPlan, Upload
+from trompe_client._plan import Upload
 from trompe_client._port import Answer, Port
-from trompe_shared.api import Job, JobRequest
+from trompe_shared.api import Job, JobRequest, JudgementRequest
 
 T = TypeVar("T")
+R = TypeVar("R", bound=JobRequest | JudgementRequest, covariant=True)
+
+
+class Plan(Protocol[R]):
+    """A request whose files are not yet on the server."""
+
+    def uploads(self) -> list[Upload]:
+        """Files to send before it."""
+        ...
+
+    def request(self, ids: Mapping[Upload, str]) -> R:
+        """The request with ids in place of files."""
+        ...
 
 
 async def send(port: Port, request: Request[T]) -> T:
@@ -40,12 +53,12 @@ async def check(answer: Answer, request: Request[Any]) -> None:
         raise _core.error_from(answer.status, answer.headers, await answer.body(), job_id=request.job_id)
 
 
-async def planned(port: Port, plan: Callable[[], AttackPlan]) -> JobRequest:
+async def planned(port: Port, plan: Callable[[], Plan[R]]) -> R:
     """Make a plan, which reads files, and upload them."""
     return await uploaded(port, await port.off(plan))
 
 
-async def uploaded(port: Port, plan: AttackPlan, ids: dict[Upload, str] | None = None) -> JobRequest:
+async def uploaded(port: Port, plan: Plan[R], ids: dict[Upload, str] | None = None) -> R:
     """Upload a plan's files without an id in ``ids``, and add theirs. Returns the job."""
     ids = {} if ids is None else ids
     for upload in plan.uploads():

@@ -11,7 +11,15 @@ from typing import Any, BinaryIO
 
 from pydantic import ValidationError
 
-from trompe_shared.api import OPTIONS, BackgroundInfo, ClassifierInfo, JobRequest, ObjectInfo, in_parts
+from trompe_shared.api import (
+    OPTIONS,
+    BackgroundInfo,
+    ClassifierInfo,
+    JobRequest,
+    JudgementRequest,
+    ObjectInfo,
+    in_parts,
+)
 from trompe_shared.errors import ClassifierError, SpecError
 from trompe_shared.faults import Fault, faults_of
 from trompe_shared.local_files import (
@@ -60,25 +68,44 @@ class AttackPlan:
 
     def uploads(self) -> list[Upload]:
         """Files to send before the job, each once."""
-        found = (each for value in self.options.values() for each in _items(value) if isinstance(each, Upload))
-        return list(dict.fromkeys(found))
+        return _uploads(self.options)
 
     def request(self, ids: Mapping[Upload, str]) -> JobRequest:
         """The job with ids in place of files; a file without an id keeps its name. Raises ``SpecError``."""
-
-        def named(value: Any) -> Any:
-            if isinstance(value, Upload):
-                return ids.get(value, value.filename)
-            if isinstance(value, Mapping):
-                return {key: named(each) for key, each in value.items()}
-            return [named(each) for each in value] if isinstance(value, list) else value
-
-        fields = {keyword: named(value) for keyword, value in self.options.items()}
+        fields = _with_ids(self.options, ids)
         object = fields.pop("object")
         try:
             return JobRequest.model_validate({"object": object, **in_parts(fields)})
         except ValidationError as error:
             raise SpecError(f"Invalid options: {'; '.join(map(_by_keyword, faults_of(error)))}.") from error
+
+
+@dataclass(frozen=True)
+class JudgementPlan:
+    """A judgement by keyword, with an ``Upload`` in place of each file."""
+
+    options: Mapping[str, Any]
+
+    def uploads(self) -> list[Upload]:
+        """Files to send before the judgement, each once."""
+        return _uploads(self.options)
+
+    def request(self, ids: Mapping[Upload, str]) -> JudgementRequest:
+        """The judgement with ids in place of files; a file without an id keeps its name. Raises ``SpecError``."""
+        return JudgementRequest.of(**_with_ids(self.options, ids))
+
+
+def _uploads(options: Mapping[str, Any]) -> list[Upload]:
+    found = (each for value in options.values() for each in _items(value) if isinstance(each, Upload))
+    return list(dict.fromkeys(found))
+
+
+def _with_ids(value: Any, ids: Mapping[Upload, str]) -> Any:
+    if isinstance(value, Upload):
+        return ids.get(value, value.filename)
+    if isinstance(value, Mapping):
+        return {key: _with_ids(each, ids) for key, each in value.items()}
+    return [_with_ids(each, ids) for each in value] if isinstance(value, list | tuple) else value
 
 
 def _by_keyword(fault: Fault) -> str:
@@ -119,6 +146,19 @@ def plan_attack(object: Source, *, read: Read = source_of, **options: Any) -> At
             several = option.repeated and isinstance(value, str | Path)
             planned[keyword] = _read_all([value] if several else value, partial(read, option.file))
     plan = AttackPlan(planned)
+    plan.request({})
+    return plan
+
+
+def plan_judgement(before: Source, after: Source, **options: Any) -> JudgementPlan:
+    """Read the files of a judgement and check its options (``JudgementRequest``).
+
+    Raises ``ObjectError``, ``ClassifierError`` or ``SpecError``.
+    """
+    planned = options | {"before": object_source(before), "after": object_source(after)}
+    if "networks" in options:
+        planned["networks"] = [classifier_source(each) for each in options["networks"]]
+    plan = JudgementPlan(planned)
     plan.request({})
     return plan
 

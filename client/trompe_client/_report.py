@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Group, RenderableType
@@ -9,11 +10,15 @@ from rich.table import Table
 from rich.text import Text
 
 from trompe_shared.api import (
+    AS_RENDERED,
     Accuracy,
     BackgroundInfo,
     ClassifierInfo,
     GoalOptions,
     Job,
+    JobSpec,
+    JudgementSpec,
+    Manifest,
     ObjectInfo,
     RendererInfo,
     Result,
@@ -58,17 +63,37 @@ def result_report(
     return Group(Text(_headline(result), style="bold"), table, Text("[..] intervals at 95 %"), facts, *notes, *warnings)
 
 
+def judgement_report(manifest: Manifest, files: Sequence[Path]) -> RenderableType:
+    """Figures of the images as rendered, and the findings. files: what was written."""
+    table = _table("network", "renderer", "before", "after", "A_drop", right=3)
+    for cell in manifest.cells:
+        if cell.pipeline == AS_RENDERED:
+            figures = ["", "", "missing"] if cell.accuracy is None else _cells(cell.accuracy)
+            table.add_row(cell.network, cell.renderer, *figures)
+    findings = [Text(f"- {in_flags(finding.text)}") for finding in manifest.findings]
+    return Group(table, Text("[..] intervals at 95 %"), *findings, Text(f"written: {', '.join(map(str, files))}"))
+
+
 def jobs_table(jobs: Sequence[Job]) -> Table:
     """One line per job, with a column of labels if there are any."""
     labels = ["labels"] if any(job.labels for job in jobs) else []
     table = _table("job", "state", "object", "label", "classifier", "epsilon", "done", "created", *labels)
     for job in jobs:
-        spec = job.spec
-        object, classifier = (_short(_named(each, job)) for each in (spec.object, spec.victim.classifier))
-        what = [object, _either(spec.goal.label), classifier, f"{spec.paint.epsilon:g}"]
+        what = _judged(job, job.spec) if isinstance(job.spec, JudgementSpec) else _attacked(job, job.spec)
         how = [f"{job.progress.fraction:.0%}", f"{job.created:%Y-%m-%d %H:%M}"]
         table.add_row(job.id, job.state.value, *what, *how, *([_words(job.labels)] if labels else []))
     return table
+
+
+def _attacked(job: Job, spec: JobSpec) -> list[str]:
+    object, classifier = (_short(_named(each, job)) for each in (spec.object, spec.victim.classifier))
+    return [object, _either(spec.goal.label), classifier, f"{spec.paint.epsilon:g}"]
+
+
+def _judged(job: Job, spec: JudgementSpec) -> list[str]:
+    objects = " to ".join(_short(_named(each, job)) for each in (spec.before, spec.after))
+    networks = ", ".join(_short(_named(each, job)) for each in spec.networks) or spec.suite or "tiny"
+    return [f"judge {objects}", _either(spec.label), networks, _figure(spec.epsilon, "{:g}")]
 
 
 def job_table(job: Job) -> Table:
@@ -87,7 +112,7 @@ def _job_facts(job: Job) -> Iterator[tuple[str, str]]:
     yield "state", f"{job.state.value}, {job.progress.phase}, {job.progress.fraction:.0%}"
     yield "error", in_flags(job.error or "")
     yield "note", in_flags(job.note or "")
-    for name, value in ({"object": job.spec.object} | job.spec.changed()).items():
+    for name, value in _asked(job.spec).items():
         yield name, _named(", ".join(map(str, value)) if isinstance(value, list) else value, job)
     yield "ids", " ".join(f"{name}={identity}" for identity, name in job.names.items())
     yield "labels", _words(job.labels)
@@ -97,6 +122,13 @@ def _job_facts(job: Job) -> Iterator[tuple[str, str]]:
         time = getattr(job, name)
         yield name, f"{time:%Y-%m-%d %H:%M:%S %Z}" if time else ""
     yield "files", ", ".join(job.artifacts)
+
+
+def _asked(spec: JobSpec | JudgementSpec) -> dict[str, Any]:
+    """Options that differ from their defaults."""
+    if isinstance(spec, JudgementSpec):
+        return spec.model_dump(exclude_defaults=True)
+    return {"object": spec.object} | spec.changed()
 
 
 def records_table(kind: type, records: Sequence[Any]) -> Table:

@@ -103,7 +103,7 @@ def _on_server(found: Service, name: str) -> list["ResultRow"]:
             rows.append(ResultRow.of_result(place, found.result(job.id), state=job.state.value, job=job.id))
         else:
             said = job.error or f"{job.progress.phase}, {job.progress.fraction:.0%}"
-            rows.append(ResultRow.of_spec(place, job.spec, state=job.state.value, job=job.id, error=said))
+            rows.append(ResultRow.of_spec(place, job.attack, state=job.state.value, job=job.id, error=said))
     return rows[::-1]
 
 

@@ -7,7 +7,6 @@ of a right-handed renderer's picture.
 """
 
 import math
-import re
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -19,7 +18,6 @@ __all__ = [
     "Camera",
     "Light",
     "View",
-    "colour_of",
     "direction_to_angles",
     "euler_to_matrix",
     "framing_distance",
@@ -33,7 +31,6 @@ __all__ = [
 FIELD_OF_VIEW: Final = 60.0
 """Vertical field of view of every camera, degrees."""
 
-COLOURS: Final = {"white": (255, 255, 255), "black": (0, 0, 0)}
 
 Matrix = NDArray[np.float64]
 
@@ -163,13 +160,3 @@ def direction_to_angles(direction: Matrix) -> tuple[float, float]:
 def framing_distance(radius: float) -> float:
     """Distance, metres, at which a sphere of ``radius``, metres, fills most of the picture from every side."""
     return 1.05 * radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
-
-
-def colour_of(text: str) -> tuple[int, int, int] | None:
-    """The sRGB colour, 0 to 255, named white, black or #rrggbb; ``None`` for any other text."""
-    if text in COLOURS:
-        return COLOURS[text]
-    if not re.fullmatch("#[0-9a-fA-F]{6}", text):
-        return None
-    red, green, blue = bytes.fromhex(text[1:])
-    return red, green, blue

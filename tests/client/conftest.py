@@ -28,17 +28,27 @@ from trompe_client._http import AsyncPort, BlockingPort
 from trompe_client._plan import Upload, object_source
 from trompe_client.cli import main
 from trompe_shared.api import (
+    AS_RENDERED,
+    MANIFEST,
+    MANIFEST_PAGE,
     Accuracy,
     BackgroundInfo,
+    Cell,
     ClassifierInfo,
     Event,
     FooledAs,
+    HashedFile,
     Job,
     JobList,
     JobRequest,
     JobSpec,
     JobState,
+    JudgedNetwork,
+    JudgedRenderer,
     Judgement,
+    JudgementRequest,
+    JudgementSpec,
+    Manifest,
     ObjectInfo,
     PipelineJudgement,
     Progress,
@@ -150,6 +160,35 @@ def adversarial_zip() -> bytes:
     return buffer.getvalue()
 
 
+JUDGED = [MANIFEST, MANIFEST_PAGE]
+"""Files of a judgement."""
+
+
+def manifest_of(job: Job) -> Manifest:
+    """A judgement with the figures of one cell."""
+    assert isinstance(job.spec, JudgementSpec)
+    before, after = (HashedFile(source=each, sha256="0", bytes=1) for each in (job.spec.before, job.spec.after))
+    cell = Cell(renderer="pyrender", network="tiny", pipeline=AS_RENDERED, accuracy=OWN)
+    return Manifest(
+        suite=None,
+        label=job.spec.label,
+        epsilon=job.spec.epsilon,
+        before=before,
+        after=after,
+        networks=[JudgedNetwork(name="tiny", reference="tiny")],
+        renderers=[JudgedRenderer(name="pyrender")],
+        image_size=(128, 128),
+        seed=0,
+        views=[],
+        findings=[],
+        textures=[],
+        cells=[cell],
+        predictions=[],
+        seconds=1.0,
+        versions={},
+    )
+
+
 class FakeServer:
     """State and script of the double.
 
@@ -184,7 +223,7 @@ class FakeServer:
         self.page_size = 2
         self.ids = count(1)
 
-    def add_job(self, request: JobRequest) -> Job:
+    def add_job(self, request: JobRequest | JudgementRequest) -> Job:
         queued: dict[str, Any] = request.model_dump(include={"priority", "labels", "needs"})
         queued["names"] = {one.id: one.name for one in self.objects if not one.shipped}
         queued["names"] |= {one.id: one.name for one in self.classifiers if not one.shipped}
@@ -211,7 +250,9 @@ class FakeServer:
         """The job is now where ``event`` says."""
         update: dict[str, object] = {"state": event.state, "progress": event.progress}
         if event.state in {JobState.succeeded, JobState.not_applicable}:
-            update["artifacts"] = [each.replace("NAME", self.name_of(job_id)) for each in self.artifacts]
+            attack = isinstance(self.jobs[job_id].spec, JobSpec)
+            files = [each.replace("NAME", self.name_of(job_id)) for each in self.artifacts] if attack else JUDGED
+            update["artifacts"] = files
         if event.state is JobState.failed:
             update["error"] = "the renderer said no"
         if event.state is JobState.not_applicable:
@@ -231,18 +272,20 @@ class FakeServer:
                 self.reach(job_id, self.history[job_id][-1])
 
     def artifact(self, job_id: str, name: str) -> bytes:
+        if name == MANIFEST:
+            return manifest_of(self.jobs[job_id]).model_dump_json().encode()
         if name.endswith("-adversarial.zip"):
             return adversarial_zip()
         return b"<html>" if name.endswith(".html") else self.result(job_id).model_dump_json().encode()
 
     def name_of(self, job_id: str) -> str:
         """Name of a job's object."""
-        reference = self.jobs[job_id].spec.object
+        reference = self.jobs[job_id].attack.object
         return [one.name for one in self.objects if reference in {one.id, one.name}][-1]
 
     def result(self, job_id: str) -> Result:
         job = self.jobs[job_id]
-        found = result_of(job.spec, applicable=job.state is not JobState.not_applicable)
+        found = result_of(job.attack, applicable=job.state is not JobState.not_applicable)
         return found.model_copy(update={"warnings": self.warnings})
 
 
@@ -300,7 +343,8 @@ class Handler(BaseHTTPRequestHandler):
         if url.path == "/v1/jobs":
             self.fake.when_listed()
             return self.answer(self.page(parse_qs(url.query)))
-        match = re.fullmatch(r"/v1/jobs/([^/]+)(?:/(events|result|archive|artifacts)(?:/(.+))?)?", url.path)
+        routes = "events|result|manifest|archive|artifacts"
+        match = re.fullmatch(rf"/v1/(?:jobs|judgements)/([^/]+)(?:/({routes})(?:/(.+))?)?", url.path)
         if match is None or match[1] not in self.fake.jobs:
             return self.problem(404, "No such job")
         job_id, what, name = match.groups()
@@ -311,8 +355,10 @@ class Handler(BaseHTTPRequestHandler):
         if what == "archive":
             return self.reply(adversarial_zip(), kind="application/zip")
         job = self.fake.jobs[job_id]
-        if what == "result" and not job.artifacts:
+        if what in {"result", "manifest"} and not job.artifacts:
             return self.problem(409, "No result", detail=f"The job is {job.state.value}")
+        if what == "manifest":
+            return self.answer(manifest_of(job)) if isinstance(job.spec, JudgementSpec) else self.problem(404, "None")
         return self.answer(self.fake.result(job_id) if what else job)
 
     def file(self, data: bytes) -> None:
@@ -337,7 +383,9 @@ class Handler(BaseHTTPRequestHandler):
     def page(self, query: dict[str, list[str]]) -> JobList:
         def wanted(job: Job) -> bool:
             labels = dict(label.split(":", 1) for label in query.get("label", []))
-            known = {"state": job.state.value, "object": job.spec.object, "classifier": job.spec.victim.classifier}
+            known = {"state": job.state.value}
+            if isinstance(job.spec, JobSpec):
+                known |= {"object": job.spec.object, "classifier": job.spec.victim.classifier}
             return all(query.get(name) in (None, [value]) for name, value in known.items()) and (
                 labels.items() <= job.labels.items()
             )
@@ -362,6 +410,8 @@ class Handler(BaseHTTPRequestHandler):
             return None
         if self.path == "/v1/jobs":
             return self.submit(body)
+        if self.path == "/v1/judgements":
+            return self.make(JudgementRequest.model_validate_json(body))
         *_, job_id, what = self.path.split("/")
         if what == "cancel":
             self.fake.cancel(job_id)
@@ -382,7 +432,7 @@ class Handler(BaseHTTPRequestHandler):
             return self.problem(404, "No such object", detail=f"{request.object!r} is not stored")
         return self.make(request)
 
-    def make(self, request: JobRequest) -> None:
+    def make(self, request: JobRequest | JudgementRequest) -> None:
         """A new job, or the one of the same key."""
         key = self.headers["Idempotency-Key"]
         new = key not in self.fake.keys

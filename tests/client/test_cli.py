@@ -156,7 +156,7 @@ def test_every_option_is_a_flag_a_keyword_and_a_word_of_the_printed_command(
     words = [word for name, value in given.items() for word in words_of(name, value)]
     done = trompe("attack", "mug", *words, "--server", server.url, "--detach")
     assert done.exit_code == 0, done.output
-    spec = server.jobs["job-1"].spec
+    spec = server.jobs["job-1"].attack
     assert spec == JobSpec.of("mug", **given)
     assert (
         client.attack("mug", **given | ({"masks": {"a.png": mask}} if keyword == "masks" else {})).status.spec == spec
@@ -172,7 +172,7 @@ def test_a_given_range_takes_the_place_of_that_of_the_conditions_even_if_it_is_t
 ) -> None:
     words = ["--conditions", "wide", "--range", "roll", "0", "0", "--range", "ambient", "0.1", "0.2"]
     assert trompe("attack", "mug", "--label", "mug", *words, "--server", server.url, "--detach").exit_code == 0
-    spec = server.jobs["job-1"].spec
+    spec = server.jobs["job-1"].attack
     given = {"roll": (0.0, 0.0), "ambient": (0.1, 0.2)}
     assert spec.views.ranges == CONDITIONS["wide"].model_copy(update=given)
     assert spec.changed()["ranges"] == given
@@ -293,7 +293,7 @@ def test_a_failed_job_exits_with_6_and_its_reason(attack_mug: Attack, server: Fa
         pytest.param(["--queries", "0"], "--queries: Input should be greater", id="not the keyword"),
         pytest.param(["--surrogate", "magic"], "'magic' is not one of 'auto', 'diffuse'", id="no such model"),
         pytest.param(
-            ["--elevation", "50", "0"], "Invalid options: --elevation must be a range within", id="range upside down"
+            ["--elevation", "50", "0"], "Invalid options: --elevation: must be a range within", id="range upside down"
         ),
         pytest.param(["--bogus"], "No such option '--bogus'", id="no such option"),
         pytest.param(["--mask", "mask.png"], "should be a texture and a picture of its size", id="mask of no texture"),

@@ -23,7 +23,8 @@ from trompe_client import (
     Outcome,
 )
 from trompe_client._embedded import embedded_server
-from trompe_shared.api import JobRequest, JobSpec, JobState
+from trompe_shared.api import MANIFEST, MANIFEST_PAGE, JobRequest, JobSpec, JobState, Manifest
+from trompe_shared.errors import SpecError
 
 FEW: dict[str, Any] = {"grid": True, "azimuths": 2, "elevations": 1, "held_out": 1, "steps": 1}
 """Options of a job of seconds."""
@@ -113,6 +114,23 @@ def test_a_job_from_its_submission_to_its_files(client: Any, tmp_path: Path) -> 
     events = list(client.job(job.id).events())
     assert [event.id for event in events] == list(range(1, len(events) + 1))
     assert (events[0].state, events[-1].state) == (JobState.queued, JobState.succeeded)
+
+
+def test_a_judgement_from_its_submission_to_its_manifest(client: Any, tmp_path: Path) -> None:
+    job = client.judge("mug", "mug", label="mug", epsilon=0.05, views=4, labels={"who": "me"})
+    with pytest.raises(Conflict, match=r"queued|running|No result"):
+        job.manifest()
+    job.wait(timeout=120)
+    manifest = job.manifest()
+    found = manifest.cell("pyrender", "tiny")
+    assert found is not None
+    assert (manifest.epsilon, manifest.before.source, job.status.labels) == (0.05, "mug", {"who": "me"})
+    paths = job.download(tmp_path)
+    assert {MANIFEST, MANIFEST_PAGE} <= {path.name for path in paths}
+    assert Manifest.model_validate_json((tmp_path / MANIFEST).read_bytes()) == manifest
+    assert job.id in {each.id for each in client.jobs(labels={"who": "me"})}
+    with pytest.raises(SpecError, match="fixes views and seed"):
+        client.judge("mug", "mug", label="mug", suite="standard-1", views=4)
 
 
 def test_a_key_makes_one_job(client: Any, name: str) -> None:

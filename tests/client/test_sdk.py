@@ -59,7 +59,7 @@ def test_files_are_uploaded_and_the_job_names_them_by_id(
     files: dict[str, Any] = {"classifier": victim, "judges": [victim], "ensemble": [member], "masks": {"a.png": mask}}
     ranges = {"roll": (-20, 20)}
     job = client.attack(mug_folder, label=0, **files, background=picture, ranges=ranges, materials=["m"])
-    spec = job.status.spec
+    spec = job.status.attack
     assert spec.object == server.objects[-1].id
     ids = {one.name: one.id for one in server.classifiers}
     assert spec.victim.classifier == spec.judges.networks[0] == ids["net"]

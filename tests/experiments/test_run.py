@@ -97,7 +97,7 @@ class FakeService(Service):
         found = next(each for each in self.by_key.values() if each.id == job)
         if job in self.waiting:
             return found
-        bad = found.spec.object in self.failing
+        bad = found.attack.object in self.failing
         state, error = (JobState.failed, "the renderer said no") if bad else (JobState.succeeded, None)
         return found.model_copy(
             update={

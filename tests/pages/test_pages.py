@@ -239,6 +239,28 @@ def test_a_job_that_is_not_there_is_told_on_a_page(service: Service, page: Page,
     faults.clear()
 
 
+def test_a_result_is_judged_with_the_form_and_its_page_is_shown(
+    service: Service, page: Page, done: str, faults: list[str]
+) -> None:
+    page.goto(f"{service.url}/jobs/{done}")
+    page.get_by_role("link", name="Judge the painted object").click()
+    expect(page.locator("[name=after]")).to_have_value(f"job:{done}")
+    expect(page.locator("[name=before]")).to_have_value("mug")
+    page.fill("[name=views]", "5000")
+    page.get_by_role("button", name="Judge").click()
+    expect(page.locator('[data-error="suite views seed epsilon"]')).to_contain_text("1000")
+    faults.clear()  # browsers report answers of 422 on the console
+
+    page.fill("[name=views]", "6")
+    page.get_by_role("button", name="Judge").click()
+    page.wait_for_url(re.compile(r"/jobs/[0-9a-f]+$"))
+    shown = page.frame_locator("iframe.judgement")
+    expect(shown.get_by_role("heading", level=1)).to_contain_text("still recognised as mug")
+    expect(shown.get_by_role("cell", name="tiny").first).to_be_visible()
+    page.goto(f"{service.url}/jobs")
+    expect(page.get_by_role("link", name="judged beside mug").first).to_be_visible()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_no_serious_fault_of_accessibility(service: Service, browser: Browser, done: str, scheme: Any) -> None:
     context = browser.new_context(color_scheme=scheme)
@@ -248,6 +270,7 @@ def test_no_serious_fault_of_accessibility(service: Service, browser: Browser, d
         "/",
         "/jobs",
         "/jobs/new",
+        "/judgements/new",
         f"/jobs/{done}",
         f"/jobs/compare?job={done}&job={done}",
         "/experiments/tries",
@@ -266,7 +289,7 @@ def test_nothing_is_wider_than_a_phone(service: Service, browser: Browser, done:
     context = browser.new_context(viewport={"width": 360, "height": 740})
     context.set_default_timeout(LIMIT)
     page = context.new_page()
-    for path in ("/", "/jobs", "/jobs/new", f"/jobs/{done}", "/experiments/tries", "/docs"):
+    for path in ("/", "/jobs", "/jobs/new", "/judgements/new", f"/jobs/{done}", "/experiments/tries", "/docs"):
         page.goto(service.url + path)
         assert page.evaluate("document.documentElement.scrollWidth") <= 360, path
     context.close()

@@ -272,7 +272,9 @@ class Faults:
             jobs = self._site.store.page(state=JobState.running, limit=20).jobs
         except Exception as error:
             return f"unknown ({type(error).__name__})"
-        return ", ".join(f"{job.spec.search.seed} ({job.progress.phase}) by {job.worker}" for job in jobs) or "nothing"
+        return (
+            ", ".join(f"{job.attack.search.seed} ({job.progress.phase}) by {job.worker}" for job in jobs) or "nothing"
+        )
 
     @contextmanager
     def every(self, pause: float, fault: Callable[[], None]) -> Iterator[None]:
@@ -318,7 +320,7 @@ class Run:
             "seconds": round(self.seconds, 1),
             "ended": dict(Counter(job.state.value for job in self.jobs.values())),
             "jobs taken up again": len(moved),
-            "attacks among them": sum(is_real(job.spec.search.seed) for job in moved),
+            "attacks among them": sum(is_real(job.attack.search.seed) for job in moved),
             "attempts beyond the first": sum(job.attempts - 1 for job in moved),
             "most attempts": most,
             "phases begun again": self.repeated,
@@ -368,8 +370,8 @@ class Submission:
             assert sorted(handle.id for handle in handles) == sorted(self._ids), (
                 "there are more or fewer than submitted"
             )
-            jobs = {handle.status.spec.search.seed: handle.status for handle in handles}
-            digests = {handle.status.spec.search.seed: self._digests(handle) for handle in handles}
+            jobs = {handle.status.attack.search.seed: handle.status for handle in handles}
+            digests = {handle.status.attack.search.seed: self._digests(handle) for handle in handles}
         events = {number: self._site.store.events(job.id) for number, job in jobs.items()}  # a client stops early
         repeated = sum(self._repeated(job) for job in jobs.values())
         return Run(jobs, events, digests, self.seconds, repeated, sum(self._left(job) for job in jobs.values()))

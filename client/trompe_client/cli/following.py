@@ -9,8 +9,8 @@ import click
 from trompe_client._delivery import in_the_form_of
 from trompe_client._job import JobHandle
 from trompe_client._progress import Progress, shown
-from trompe_client.cli.output import as_json, console, print_json
-from trompe_shared.api import Event, JobState, in_flags
+from trompe_client.cli.output import as_json, console, print_json, say
+from trompe_shared.api import Event, JobState, JudgementSpec, in_flags
 from trompe_shared.errors import TrompeError
 
 
@@ -52,6 +52,12 @@ def deliver(
     began: when the command began, on the monotonic clock; ``start_up``: its seconds until the job was submitted.
     """
     files = job.download(out) if out else []
+    if isinstance(job.status.spec, JudgementSpec):
+        from trompe_client._report import judgement_report
+
+        manifest = job.manifest()
+        say({"job": job.status, "manifest": manifest}, lambda: judgement_report(manifest, files))
+        return
     if source is not None:
         files = [in_the_form_of(source, file) for file in files]
     result = job.result()

@@ -19,6 +19,7 @@ OWN: Final = {
     "classifiers": "trompe_client.cli.library",
     "completion": "trompe_client.cli.completion",
     "jobs": "trompe_client.cli.jobs",
+    "judge": "trompe_client.cli.judge",
     "objects": "trompe_client.cli.library",
     "renderers": "trompe_client.cli.library",
     "report": "trompe_client.cli.jobs",
@@ -41,12 +42,14 @@ EXTENSIONS: Final = {
     "worker": _Extension("server", "Run an additional attack worker."),
     "demo": _Extension("server", "Attack a shipped object and show the result."),
     "doctor": _Extension("server", "Check this machine and suggest repairs."),
-    "judge": _Extension("server", "Judge an adversarial object from two model files."),
     "experiment": _Extension("experiments", "Run grids of jobs and report their results."),
     "migrate": _Extension("server", "Create or upgrade the service's database."),
     "render": _Extension("renderer", "Run a renderer worker (SAILenv's protocol)."),
     "token": _Extension("server", "Create, list and revoke access tokens."),
 }
+
+PARTLY: Final = {"judge": "server"}
+"""Own commands that need an extra unless they are given a server."""
 
 
 class _Trompe(click.Group):
@@ -91,7 +94,7 @@ class _Trompe(click.Group):
         except BrokenPipeError:
             raise
         except ModuleNotFoundError as error:  # raised when the command runs
-            if ctx.invoked_subcommand not in EXTENSIONS:
+            if ctx.invoked_subcommand not in {*EXTENSIONS, *PARTLY}:
                 raise
             raise _missing_extra(ctx.invoked_subcommand, error) from error
         except (TrompeError, OSError) as error:
@@ -113,9 +116,9 @@ def _load_extension(name: str) -> click.Command:
 
 
 def _missing_extra(name: str, error: ModuleNotFoundError) -> click.ClickException:
-    if name not in EXTENSIONS:
+    if name not in {*EXTENSIONS, *PARTLY}:
         return click.ClickException(f"`trompe {name}` cannot be loaded: {error}.")
-    extra = EXTENSIONS[name].extra
+    extra = PARTLY[name] if name in PARTLY else EXTENSIONS[name].extra
     return click.ClickException(f"`trompe {name}` needs the {extra} extra: pip install 'trompe[{extra}]' ({error})")
 
 

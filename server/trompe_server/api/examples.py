@@ -48,6 +48,17 @@ JOB_REQUESTS: Final[dict[str, Any]] = {
     },
 }
 
+JUDGEMENT_REQUESTS: Final[dict[str, Any]] = {
+    "shortest": {
+        "summary": "A shipped object against itself",
+        "value": {"before": "mug", "after": "mug", "label": "mug"},
+    },
+    "suite": {
+        "summary": "A suite, with a stated budget",
+        "value": {"before": "mug", "after": "mug", "label": "mug", "epsilon": 0.05, "suite": "standard-1"},
+    },
+}
+
 _JOB: Final[dict[str, Any]] = {
     "id": "8f14e45fceea167a",
     "state": "running",
@@ -111,6 +122,7 @@ _EXPERIMENT: Final = {
 }
 
 JOB: Final = _json(_JOB)
+JUDGEMENT: Final = _json(_JOB | {"spec": {"before": "mug", "after": "mug", "label": ["mug"], "epsilon": 0.05}})
 JOB_LIST: Final = _json({"jobs": [_JOB], "next_cursor": "41"})
 OBJECT: Final = _json(_OBJECT)
 OBJECT_LIST: Final = _json([_OBJECT])
@@ -196,6 +208,28 @@ RESULT: Final = _json(
         "versions": {"trompe": "0.2.0"},
         "views": [_VIEW],
         "held_out_views": [_VIEW],
+    }
+)
+
+_FILE: Final = {"source": "mug", "sha256": "2c624232cdd221771294dfbb310aca00", "bytes": 400_000}
+MANIFEST: Final = _json(
+    {
+        "suite": "standard-1",
+        "label": ["mug"],
+        "epsilon": 0.05,
+        "before": _FILE,
+        "after": _FILE | {"source": "after.zip"},
+        "networks": [{"name": "tiny", "reference": "tiny", "image_size": [128, 128], "labels": [2]}],
+        "renderers": [{"name": "pyrender"}],
+        "image_size": [128, 128],
+        "seed": 0,
+        "views": [],
+        "findings": [{"kind": "size", "text": "The texture is 512 x 512 texels before and 256 x 256 after."}],
+        "textures": [],
+        "cells": [{"renderer": "pyrender", "network": "tiny", "pipeline": "as rendered", "accuracy": _ACCURACY}],
+        "predictions": [],
+        "seconds": 12.5,
+        "versions": {"trompe": "0.2.0"},
     }
 )
 

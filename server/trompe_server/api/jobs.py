@@ -12,21 +12,22 @@ from trompe_server.api import examples
 from trompe_server.api.downloads import send_file, zip_stream
 from trompe_server.api.following import follow
 from trompe_server.api.problems import PROBLEMS
-from trompe_server.api.services import DigestsDep, ServicesDep, StoreDep
+from trompe_server.api.services import DigestsDep, Services, ServicesDep, StoreDep
 from trompe_server.api.submission import checked_spec
 from trompe_server.errors import ConflictError, NotFoundError
 from trompe_server.queue import retention
 from trompe_server.queue.store import JobStore
-from trompe_shared.api import Job, JobList, JobRequest, JobState, Result
+from trompe_shared.api import Job, JobList, JobRequest, JobState, JudgementRequest, JudgementSpec, Result
 from trompe_shared.errors import SpecError
 
-__all__ = ["RESULT", "Cursor", "Limit", "labels_of", "router"]
+__all__ = ["NEW_OR_KNOWN", "RESULT", "Cursor", "IdempotencyKey", "Limit", "create", "labels_of", "router", "send"]
+__all__ += ["with_result"]
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=PROBLEMS)
 
 RESULT: Final = "result.json"
 
-_NEW_OR_KNOWN: Final[dict[int | str, dict[str, Any]]] = {
+NEW_OR_KNOWN: Final[dict[int | str, dict[str, Any]]] = {
     200: {"model": Job, "description": "The job of an earlier request with the same key", **examples.JOB},
     **examples.made(examples.JOB),
 }
@@ -46,7 +47,7 @@ LabelFilters = Annotated[
 ]
 
 
-@router.post("", status_code=201, responses=_NEW_OR_KNOWN)
+@router.post("", status_code=201, responses=NEW_OR_KNOWN)
 def submit(
     services: ServicesDep,
     request: Annotated[JobRequest, Body(openapi_examples=examples.JOB_REQUESTS)],
@@ -55,7 +56,7 @@ def submit(
 ) -> Job:
     """Queue an attack. Objects and networks must exist. The job keeps their ids: later uploads do not change it."""
     spec, names = checked_spec(request, services.library)
-    return _create(services.store, spec, names, response, idempotency_key)
+    return create(services.store, spec, names, response, idempotency_key)
 
 
 @router.post("/check", status_code=204)
@@ -99,15 +100,16 @@ def cancel_job(store: StoreDep, job: str) -> Job:
     return store.request_cancel(job)
 
 
-@router.post("/{job}/retry", status_code=201, responses=_NEW_OR_KNOWN)
+@router.post("/{job}/retry", status_code=201, responses=NEW_OR_KNOWN)
 def retry_job(services: ServicesDep, job: str, response: Response, idempotency_key: IdempotencyKey = None) -> Job:
-    """Queue the same attack as a new job. The old one must have ended, and stays."""
+    """Queue the same work as a new job. The old one must have ended, and stays."""
     old = services.store.get(job)
     if not old.state.final:
         raise ConflictError(f"Job {job} is {old.state} and has not ended; cancel it before a retry.")
     queued = {"priority": old.priority, "labels": old.labels, "needs": old.needs}
-    request = JobRequest.model_validate(old.spec.model_dump() | queued)
-    return _create(services.store, request, old.names, response, idempotency_key)
+    kind = JudgementRequest if isinstance(old.spec, JudgementSpec) else JobRequest
+    request = kind.model_validate(old.spec.model_dump() | queued)
+    return create(services.store, request, old.names, response, idempotency_key)
 
 
 @router.get(
@@ -133,15 +135,8 @@ def follow_job(
 
 @router.get("/{job}/result", response_model=Result, responses=examples.found(examples.RESULT) | examples.PART_ANSWERS)
 def read_result(services: ServicesDep, digests: DigestsDep, request: Request, job: str) -> Response:
-    """Result of a successful job."""
-    found = services.store.get(job)
-    if not found.state.final:
-        raise ConflictError(f"Job {job} is {found.state} and has no result yet. Wait for its end.")
-    if RESULT not in found.artifacts:
-        raise ConflictError(
-            f"Job {job} ended as {found.state} without a result: {found.error or found.note or 'no reason given'}"
-        )
-    return _send(services, digests, request, found, RESULT)
+    """Result of a successful attack."""
+    return send(services, digests, request, with_result(services, job, RESULT), RESULT)
 
 
 @router.head("/{job}/artifacts/{name}", include_in_schema=False)
@@ -154,7 +149,7 @@ def read_artifact(services: ServicesDep, digests: DigestsDep, request: Request, 
     if name not in found.artifacts:
         known = ", ".join(found.artifacts) or "none yet"
         raise NotFoundError(f"Job {job} has no artifact {name!r}. It has: {known}.")
-    return _send(services, digests, request, found, name)
+    return send(services, digests, request, found, name)
 
 
 @router.get("/{job}/archive", response_class=StreamingResponse, responses={200: examples.ARCHIVE})
@@ -168,11 +163,30 @@ def read_archive(services: ServicesDep, job: str) -> StreamingResponse:
     return StreamingResponse(parts, media_type="application/zip", headers={"Content-Disposition": disposition})
 
 
-def _create(store: JobStore, request: JobRequest, names: Mapping[str, str], response: Response, key: str | None) -> Job:
+def create(
+    store: JobStore,
+    request: JobRequest | JudgementRequest,
+    names: Mapping[str, str],
+    response: Response,
+    key: str | None,
+) -> Job:
+    """Queue a job, and answer with its place."""
     job, new = store.create(request, names=names, idempotency_key=key)
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
+
+
+def with_result(services: Services, job: str, name: str) -> Job:
+    """An ended job with the file ``name``. Raises ``ConflictError`` without it."""
+    found = services.store.get(job)
+    if not found.state.final:
+        raise ConflictError(f"Job {job} is {found.state} and has no result yet. Wait for its end.")
+    if name not in found.artifacts:
+        raise ConflictError(
+            f"Job {job} ended as {found.state} without {name}: {found.error or found.note or 'no reason given'}"
+        )
+    return found
 
 
 def labels_of(texts: list[str]) -> dict[str, str]:
@@ -187,7 +201,8 @@ def labels_of(texts: list[str]) -> dict[str, str]:
     return labels
 
 
-def _send(services: ServicesDep, digests: DigestsDep, request: Request, job: Job, name: str) -> Response:
+def send(services: ServicesDep, digests: DigestsDep, request: Request, job: Job, name: str) -> Response:
+    """Answer with a file of a job."""
     artifacts = services.artifacts(job.id)
     try:
         digest = digests.of(artifacts, job.id, name, lasting=job.state.final)

@@ -1,8 +1,10 @@
 """Checks of a submitted job: its objects and networks must exist and fit together."""
 
-import re
 from typing import TypeVar
 
+from trompe_server.api.services import Services
+from trompe_server.errors import ConflictError
+from trompe_server.judgement.suites import suite_of
 from trompe_server.library import Library
 from trompe_server.spec.checks import (
     check_gradients,
@@ -14,15 +16,22 @@ from trompe_server.spec.checks import (
     check_top_k,
 )
 from trompe_server.spec.labels import resolve_label, resolve_labels
-from trompe_shared.api import BackgroundInfo, ClassifierInfo, JobSpec, ObjectInfo
+from trompe_shared.api import (
+    ADVERSARIAL,
+    JOB_RESULT,
+    BackgroundInfo,
+    ClassifierInfo,
+    JobSpec,
+    JudgementRequest,
+    ObjectInfo,
+)
+from trompe_shared.colours import colour_of
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import decode_rgb
 
-__all__ = ["checked_spec"]
+__all__ = ["checked_judgement", "checked_spec"]
 
 Spec = TypeVar("Spec", bound=JobSpec)
-
-_COLOUR = re.compile(r"white|black|#[0-9a-fA-F]{6}")
 
 
 def checked_spec(spec: Spec, library: Library) -> tuple[Spec, dict[str, str]]:
@@ -43,7 +52,7 @@ def checked_spec(spec: Spec, library: Library) -> tuple[Spec, dict[str, str]]:
         resolve_labels(spec.goal.label, other.classes or classifier.classes, other.n_classes, other.name)
     victim = {"classifier": classifier.reference, "ensemble": [member.reference for member in members]}
     masks = {texture: _mask(texture, picture, obj, library) for texture, picture in spec.paint.masks.items()}
-    pictures = {name: library.background(name) for name in spec.views.background if not _COLOUR.fullmatch(name)}
+    pictures = {name: library.background(name) for name in spec.views.background if colour_of(name) is None}
     background = [pictures[name].id if name in pictures else name for name in spec.views.background]
     stored: list[ObjectInfo | ClassifierInfo] = [obj, classifier, *members, *judges]
     names = {one.id: one.name for one in stored if not one.shipped}
@@ -58,6 +67,36 @@ def checked_spec(spec: Spec, library: Library) -> tuple[Spec, dict[str, str]]:
         }
     )
     return checked, names
+
+
+def checked_judgement(spec: JudgementRequest, services: Services) -> tuple[JudgementRequest, dict[str, str]]:
+    """``spec`` with ids in place of names, and the names of uploads by id.
+
+    The result of a job is stored as an object: deleting the job changes no judgement. Raises ``NotFoundError``,
+    ``AmbiguousError``, ``ConflictError``, ``ClassifierError``, or ``SpecError`` for an unknown suite.
+    """
+    suite_of(spec, renderer="")
+    before, after = (_judged(reference, services) for reference in (spec.before, spec.after))
+    networks = [services.library.classifier(name) for name in spec.networks]
+    stored: list[ObjectInfo | ClassifierInfo] = [before, after, *networks]
+    update = {
+        "before": _reference(before),
+        "after": _reference(after),
+        "networks": [_reference(network) for network in networks],
+    }
+    return spec.model_copy(update=update), {one.id: one.name for one in stored if not one.shipped}
+
+
+def _judged(reference: str, services: Services) -> ObjectInfo:
+    """A stored object, or the painted object of a job, which is stored."""
+    if not reference.startswith(JOB_RESULT):
+        return services.library.object(reference)
+    job = services.store.get(reference.removeprefix(JOB_RESULT))
+    name = next((each for each in job.artifacts if each.endswith(f"{ADVERSARIAL}.zip")), None)
+    if name is None:
+        raise ConflictError(f"Job {job.id} is {job.state} and has no painted object to judge.")
+    with services.artifacts(job.id).open(name) as painted:
+        return services.library.add_object(painted, name)
 
 
 def _check_goal(spec: JobSpec, classifier: ClassifierInfo) -> None:

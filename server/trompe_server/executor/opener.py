@@ -2,19 +2,20 @@
 
 import importlib
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
-from typing import Any, Final
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
+from typing import Any, Final, TypeVar
 
 from trompe_server.executor.runner import OpenedJob
 from trompe_server.library import Library
 from trompe_server.queue.claims import Claim
-from trompe_server.renderers.choice import JobEngines, listed
+from trompe_server.renderers.choice import JobEngines, listed, named
 from trompe_server.renderers.discovery import Address, DiscoveredRenderers, RendererAddresses, engines_at
 from trompe_server.renderers.protocol import TargetRenderer
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import Folder, JobArtifacts, job_artifacts
-from trompe_shared.api import JobSpec
+from trompe_shared.api import JobSpec, JudgementSpec
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, RendererLostError
 
@@ -22,6 +23,11 @@ __all__ = ["JobOpener", "load"]
 
 ENGINES: Final = "engines.json"
 """File with the engines of a job's renderers: later attempts use the same ones."""
+
+JUDGEMENTS: Final = "trompe_server.service.judgement_job:open_judgement"
+"""Opens a judgement."""
+
+T = TypeVar("T")
 
 
 class JobOpener:
@@ -34,6 +40,8 @@ class JobOpener:
     def open(self, claim: Claim) -> OpenedJob:
         """Open the job of ``claim``. Raises ``TrompeError`` for errors the user can fix."""
         artifacts = job_artifacts(self._files, claim.job.id, attempt=claim.attempt)
+        if isinstance(claim.job.spec, JudgementSpec):
+            return self._judgement(claim.job.spec, artifacts)
         engines = self._engines(claim.job.spec, artifacts)
         with ExitStack() as opened:
             targets = []
@@ -53,25 +61,47 @@ class JobOpener:
             return OpenedJob(job, opened.pop_all().close)
         raise AssertionError("the block returns or raises")
 
+    def _judgement(self, spec: JudgementSpec, artifacts: JobArtifacts) -> OpenedJob:
+        first = self._patiently(self._there)[0]
+        job = load(JUDGEMENTS)(
+            spec,
+            artifacts=artifacts,
+            library=self._library,
+            renderer=first.name,
+            opened=self._opened,
+            device=self._settings.device,
+        )
+        return OpenedJob(job, lambda: None)
+
+    @contextmanager
+    def _opened(self, name: str) -> Iterator[TargetRenderer]:
+        """The renderers with the engine ``name`` for the block. Raises ``RendererError``."""
+        engine = self._patiently(lambda *, late: named(name, "renderers", self._there(late=late)))
+        with closing(DiscoveredRenderers(self._renderers, engine, _target)) as target:
+            yield target
+
     def _engines(self, spec: JobSpec, artifacts: JobArtifacts) -> JobEngines:
         """The engines of the job's renderers, recorded at its first opening, once they answer."""
         known = JobEngines.from_text(artifacts.read(ENGINES)) if artifacts.exists(ENGINES) else None
-        deadline = time.monotonic() + self._settings.renderer_patience
-        while True:
-            late = time.monotonic() > deadline
-            try:
-                engines = self._engines_now(spec, known, late=late)
-                break
-            except RendererError:
-                if late:
-                    raise
-            time.sleep(0.3)
+        engines = self._patiently(partial(self._engines_now, spec, known))
         if known is None:
             artifacts.write(ENGINES, engines.to_text().encode())
         return engines
 
-    def _engines_now(self, spec: JobSpec, known: JobEngines | None, *, late: bool) -> JobEngines:
-        """The same by those that answer now. The first renderer is the default: unless ``late``, wait for it."""
+    def _patiently(self, look: Callable[..., T]) -> T:
+        """What ``look`` finds, repeated while it raises ``RendererError``, at last with ``late``."""
+        deadline = time.monotonic() + self._settings.renderer_patience
+        while True:
+            late = time.monotonic() > deadline
+            try:
+                return look(late=late)
+            except RendererError:
+                if late:
+                    raise
+            time.sleep(0.3)
+
+    def _there(self, *, late: bool) -> list[EngineInfo]:
+        """The engines that answer now. The first renderer is the default: unless ``late``, wait for it."""
         found = engines_at(self._renderers.addresses())
         there = list(dict.fromkeys(engine for engine in found.values() if engine))
         if not there:
@@ -80,9 +110,14 @@ class JobOpener:
                 f"No renderer answers at {where}. Start one with: trompe render --host HOST --port PORT; "
                 "`trompe doctor` tells whether this machine can render."
             )
+        if next(iter(found.values())) is None and not late:
+            raise RendererError("The first renderer does not answer yet.")
+        return there
+
+    def _engines_now(self, spec: JobSpec, known: JobEngines | None, *, late: bool) -> JobEngines:
+        """The engines of a job by those that answer now. Those of its first opening may not be the first ones."""
+        there = self._there(late=late or known is not None)
         if known is None:
-            if next(iter(found.values())) is None and not late:
-                raise RendererError("The first renderer does not answer yet.")
             return JobEngines.of(spec, there)
         if missing := set(known.all) - set(there):
             raise RendererLostError(

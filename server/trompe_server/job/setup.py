@@ -35,9 +35,10 @@ from trompe_server.spec.checks import check_gradients, check_keep, check_members
 from trompe_server.spec.framing import Framing, framing_of
 from trompe_server.spec.labels import resolve_label, resolve_labels
 from trompe_shared.api import JobSpec, PipelineName
+from trompe_shared.colours import colour_of
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import SpecError
-from trompe_shared.geometry import View, colour_of
+from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, decode_rgb, load_object
 
 __all__ = ["SAFE_MARGINS", "JobRenderer", "JobSetup", "open_setup"]

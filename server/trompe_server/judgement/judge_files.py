@@ -7,27 +7,27 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, partial
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trompe_server.attack import ViewDistribution
+from trompe_server.job.protocol import Artifacts
 from trompe_server.job.setup import HELD_OUT_STREAM, drawn_views, noise_numbers
 from trompe_server.judgement.manifest import PIPELINES, Judged
-from trompe_server.judgement.request import JudgeRequest
-from trompe_server.judgement.sources import JudgedObject, open_judge, read_judged, running
+from trompe_server.judgement.sources import JudgedObject, Sources
+from trompe_server.judgement.suites import Suite, suite_of
 from trompe_server.judgement.work import Kept, OnWork, Timed, key_of
 from trompe_server.judging.judge import Judge
 from trompe_server.renderers import TargetRenderer
 from trompe_server.spec.framing import Framing, framing_of
-from trompe_shared.api import JudgedNetwork
+from trompe_shared.api import JudgedNetwork, JudgementSpec, ViewOptions
 from trompe_shared.engine import EngineInfo
-from trompe_shared.errors import ClassifierError, LabelError, RendererError, SpecError
+from trompe_shared.errors import ClassifierError, LabelError, RendererError, RendererLostError, SpecError
 from trompe_shared.geometry import View
 
-__all__ = ["judge_files", "noisy", "sampled", "views_of"]
+__all__ = ["judge_files", "noisy", "sampled"]
 
 SHARE: Final = 10
 """Images between two saves."""
@@ -38,28 +38,29 @@ IMAGE_SIZE: Final = (224, 224)
 Images = NDArray[np.uint8]
 
 
-def judge_files(request: JudgeRequest, folder: Path, *, kept: Path, on_work: OnWork) -> Judged:
-    """Judge what ``request`` names, for a manifest in ``folder``. A stopped judgement goes on with what is in ``kept``.
+def judge_files(spec: JudgementSpec, sources: Sources, *, kept: Artifacts, on_work: OnWork) -> Judged:
+    """Judge what ``spec`` names in ``sources``. A stopped judgement goes on with what is in ``kept``.
 
-    Raises ``ObjectError`` if one of the two files cannot be read, and ``SpecError`` for two networks of one name.
+    Raises ``ObjectError`` if one of the two files cannot be read, and ``SpecError`` for two networks of one name and
+    an unknown suite.
     """
-    before, after = (read_judged(source, folder) for source in (request.before, request.after))
-    judges, records = _networks(request, folder)
-    size = request.image_size or next((judge.network.image_size for judge in judges.values()), IMAGE_SIZE)
-    judged = Judged(before, after, judges, records, views_of(request, before), size)
-    _Run(request, judged, Kept(kept), on_work).run()
+    suite = suite_of(spec, renderer=sources.renderer)
+    before, after = sources.object(spec.before, "before"), sources.object(spec.after, "after")
+    judges, records = _networks(spec, suite, sources)
+    size = suite.image_size or next((judge.network.image_size for judge in judges.values()), IMAGE_SIZE)
+    framing = framing_of(
+        before.obj, ViewOptions(distance=spec.distance, elevation=spec.elevation), shipped=before.shipped
+    )
+    views = sampled(suite.views, suite.seed, framing, background=spec.background)
+    judged = Judged(spec, suite, before, after, judges, records, views, size)
+    _Run(judged, sources, Kept(kept), on_work).run()
     return judged
 
 
-def views_of(request: JudgeRequest, before: JudgedObject) -> list[View]:
-    """The random views of a judgement: those of a job's held-out ones if the seed is the same."""
-    return sampled(request, framing_of(before.obj, request.framing, shipped=before.shipped))
-
-
-def sampled(request: JudgeRequest, framing: Framing) -> list[View]:
-    """The random views of a seed in a framing."""
+def sampled(count: int, seed: int, framing: Framing, *, background: str) -> list[View]:
+    """Random views: those of a job's held-out ones if the seed is the same."""
     cameras = ViewDistribution(framing.distance, framing.elevation, centre=framing.centre)
-    return [*drawn_views(cameras, [request.background], request.views, seed=request.seed, stream=HELD_OUT_STREAM)]
+    return [*drawn_views(cameras, [background], count, seed=seed, stream=HELD_OUT_STREAM)]
 
 
 def noisy(views: Sequence[View], engine: EngineInfo, seed: int) -> Sequence[View]:
@@ -68,12 +69,12 @@ def noisy(views: Sequence[View], engine: EngineInfo, seed: int) -> Sequence[View
     return [replace(view, noise=noise) for view in views]
 
 
-def _networks(request: JudgeRequest, folder: Path) -> tuple[dict[str, Judge], list[JudgedNetwork]]:
+def _networks(spec: JudgementSpec, suite: Suite, sources: Sources) -> tuple[dict[str, Judge], list[JudgedNetwork]]:
     """The networks that can judge, by name, and the records of all."""
     judges, records = dict[str, Judge](), list[JudgedNetwork]()
-    for reference in request.networks:
+    for reference in suite.networks:
         try:
-            judge, record = open_judge(reference, request.label, folder)
+            judge, record = sources.network(reference, spec.label)
         except (ClassifierError, LabelError, SpecError) as error:
             record = JudgedNetwork(name=reference, reference=reference, missing=str(error))
         else:
@@ -86,32 +87,39 @@ def _networks(request: JudgeRequest, folder: Path) -> tuple[dict[str, Judge], li
 
 @dataclass(frozen=True)
 class _Run:
-    request: JudgeRequest
     judged: Judged
+    sources: Sources
     kept: Kept
     on_work: OnWork
 
     def run(self) -> None:
         """Look at everything, and note it in ``judged``."""
-        for name in self.request.renderers:
+        for name in self.judged.suite.renderers:
             try:
-                with running(name) as target:
-                    self._in_renderer(name, target)
+                self._again_if_lost(name)
             except RendererError as error:
                 self.judged.missing[name] = str(error)
                 self._timed.skip(_rendering(name), *(_showing(name, network) for network in self.judged.judges))
 
+    def _again_if_lost(self, name: str) -> None:
+        """Look in a renderer, once more if it was lost: its supervisor restarts it, and finished work is kept."""
+        try:
+            self._in_renderer(name)
+        except RendererLostError:
+            self._in_renderer(name)
+
     @cached_property
     def _timed(self) -> Timed:
-        pairs, renderers = 2 * len(self.judged.views), self.request.renderers
+        pairs, renderers = 2 * len(self.judged.views), self.judged.suite.renderers
         left = Counter({_rendering(name): pairs for name in renderers})
         left |= Counter({_showing(name, to): pairs * len(PIPELINES) for name in renderers for to in self.judged.judges})
         return Timed(left, self.on_work)
 
-    def _in_renderer(self, name: str, target: TargetRenderer) -> None:
-        engine, views = target.engine, noisy(self.judged.views, target.engine, self.request.seed)
+    def _in_renderer(self, name: str) -> None:
         objects = {"before": self.judged.before, "after": self.judged.after}
-        images = {kind: self._images(name, target, each, views) for kind, each in objects.items()}
+        with self.sources.running(name) as target:
+            engine, views = target.engine, noisy(self.judged.views, target.engine, self.judged.suite.seed)
+            images = {kind: self._images(name, target, each, views) for kind, each in objects.items()}
         self.judged.engines[name], self.judged.images[name] = engine, images
         for pipeline in PIPELINES:
             for kind, each in objects.items():

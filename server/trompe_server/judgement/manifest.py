@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_server.image_pipelines import SUITE, ImagePipeline
-from trompe_server.judgement.request import JudgeRequest
 from trompe_server.judgement.sources import JudgedObject
+from trompe_server.judgement.suites import Suite
 from trompe_server.judging.judge import Judge
 from trompe_server.judging.metrics import camera_and_light, drop_warning, margins
 from trompe_server.judging.objects import ObjectPair, texture_changes
@@ -24,6 +24,7 @@ from trompe_shared.api import (
     Finding,
     JudgedNetwork,
     JudgedRenderer,
+    JudgementSpec,
     Manifest,
     Predictions,
     TextureChange,
@@ -41,16 +42,21 @@ Logits = NDArray[np.float32]
 PIPELINES: Final[Mapping[str, ImagePipeline | None]] = {AS_RENDERED: None, **SUITE}
 """What happens to the images before the networks."""
 
+DROPS: Final = ("a_drop", "a_drop_interval", "a_drop_with_neighbours", "a_drop_with_neighbours_interval")
+"""Figures that two different objects do not have."""
+
 
 @dataclass(frozen=True)
 class Judged:
-    """What was looked at, and what was seen.
+    """What was asked for, what was looked at, and what was seen.
 
     judges: networks that could be loaded, by name. images: by renderer, of the objects ``before`` and ``after``
     (views, H, W, 3). logits: by (renderer, network, pipeline, ``before`` or ``after``), (views, classes). missing:
     why a renderer gave no images.
     """
 
+    spec: JudgementSpec
+    suite: Suite
     before: JudgedObject
     after: JudgedObject
     judges: Mapping[str, Judge]
@@ -73,27 +79,28 @@ class Judged:
         return (self.logits[*cell, "before"], self.logits[*cell, "after"]) if (*cell, "after") in self.logits else None
 
 
-def manifest_of(judged: Judged, request: JudgeRequest, *, seconds: float) -> Manifest:
+def manifest_of(judged: Judged, *, seconds: float) -> Manifest:
     """The manifest. ``seconds``: wall time of the judgement."""
-    changes = texture_changes(*judged.pair.textures, epsilon=request.epsilon)
+    spec, suite = judged.spec, judged.suite
+    changes = texture_changes(*judged.pair.textures, epsilon=spec.epsilon)
     cells = [
         _cell(judged, renderer, network.name, pipeline)
-        for renderer in request.renderers
+        for renderer in suite.renderers
         for network in judged.records
         for pipeline in PIPELINES
     ]
     return Manifest(
-        suite=request.suite,
-        label=list(request.label),
-        epsilon=request.epsilon,
+        suite=spec.suite,
+        label=spec.label,
+        epsilon=spec.epsilon,
         before=judged.before.file,
         after=judged.after.file,
         networks=list(judged.records),
-        renderers=[_renderer(judged, name, request.epsilon) for name in request.renderers],
+        renderers=[_renderer(judged, name) for name in suite.renderers],
         image_size=judged.size,
-        seed=request.seed,
+        seed=suite.seed,
         views=[view_record(view) for view in judged.views],
-        findings=[*judged.pair.findings(), *_findings(judged, request, changes, cells)],
+        findings=[*judged.pair.findings(), *_findings(judged, changes, cells)],
         textures=changes,
         cells=cells,
         predictions=[
@@ -128,18 +135,22 @@ def view_of(record: ViewRecord) -> View:
 def _cell(judged: Judged, renderer: str, network: str, pipeline: str) -> Cell:
     both = judged.both(renderer, network, pipeline)
     accuracy = None if both is None else judged.judges[network].accuracy(*both)
+    if accuracy is not None and not judged.pair.is_one:
+        accuracy = accuracy.model_copy(update=dict.fromkeys(DROPS))
     return Cell(renderer=renderer, network=network, pipeline=pipeline, accuracy=accuracy)
 
 
-def _renderer(judged: Judged, name: str, epsilon: float | None) -> JudgedRenderer:
+def _renderer(judged: Judged, name: str) -> JudgedRenderer:
     if name not in judged.engines:
         return JudgedRenderer(name=name, missing=judged.missing[name])
-    return JudgedRenderer(name=name, engine=judged.engines[name], visibility=_visibility(judged, name, epsilon))
+    return JudgedRenderer(name=name, engine=judged.engines[name], visibility=_visibility(judged, name))
 
 
-def _visibility(judged: Judged, renderer: str, epsilon: float | None) -> Visibility:
+def _visibility(judged: Judged, renderer: str) -> Visibility:
+    if not judged.pair.is_one:
+        return Visibility()
     images, ground = judged.images[renderer], behind(judged.views, {}, judged.size)
-    return visibility_of(*judged.pair.textures, images["before"], images["after"], ground, epsilon=epsilon)
+    return visibility_of(*judged.pair.textures, images["before"], images["after"], ground, epsilon=judged.spec.epsilon)
 
 
 def _predictions(judged: Judged, renderer: str, network: str) -> Predictions | None:
@@ -159,16 +170,15 @@ def _predictions(judged: Judged, renderer: str, network: str) -> Predictions | N
     )
 
 
-def _findings(
-    judged: Judged, request: JudgeRequest, changes: Sequence[TextureChange], cells: Sequence[Cell]
-) -> Iterator[Finding]:
+def _findings(judged: Judged, changes: Sequence[TextureChange], cells: Sequence[Cell]) -> Iterator[Finding]:
     """Findings about the budget, and about what is missing or rests on little."""
+    epsilon = judged.spec.epsilon
     for change in changes:
-        if change.texels_beyond_epsilon and request.epsilon is not None:
+        if change.texels_beyond_epsilon and epsilon is not None:
             yield Finding(
                 kind="epsilon",
-                text=f"The texture {change.texture!r} exceeds the stated epsilon of {request.epsilon:g} "
-                f"({levels_within(request.epsilon)} levels of 255): {change.texels_beyond_epsilon} of "
+                text=f"The texture {change.texture!r} exceeds the stated epsilon of {epsilon:g} "
+                f"({levels_within(epsilon)} levels of 255): {change.texels_beyond_epsilon} of "
                 f"{change.size[0] * change.size[1]} texels change by more, one by {change.max_levels} levels.",
             )
     for warning in faint_warnings(judged.before.obj):

@@ -29,9 +29,10 @@ def judgement_pictures(judged: Judged) -> Mapping[str, bytes]:
     for renderer, images in judged.images.items():
         if judged.judges:
             sheets[f"Views in {renderer}"] = _views(judged, renderer, next(iter(judged.judges)))
-        few = representative(len(judged.views), DIFFERENCE_VIEWS)
-        title = f"Change in {renderer}"
-        sheets[title] = difference_strip(images["before"][few], images["after"][few], title=title)
+        if judged.pair.is_one:
+            few = representative(len(judged.views), DIFFERENCE_VIEWS)
+            title = f"Change in {renderer}"
+            sheets[title] = difference_strip(images["before"][few], images["after"][few], title=title)
     before, after = judged.pair.textures
     if before:
         sheets["Textures"] = texture_sheet(before, after, title="Textures")

@@ -1,25 +1,32 @@
-"""Model files, networks and renderers of a judgement, each with its hash or identity."""
+"""What the names in a judgement stand for: model files, networks and renderers, each with its hash or identity.
 
-import contextlib
+On one machine they are files and names (``LocalSources``), in a service stored things (``StoredSources``).
+"""
+
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from trompe_server.classifiers import Classifier, classifier_file, load_classifier
 from trompe_server.formats import import_file
+from trompe_server.job.protocol import Artifacts
 from trompe_server.judging.judge import Judge
+from trompe_server.library import Library
 from trompe_server.library.intake import identity_of
 from trompe_server.renderers import SailenvTarget, TargetRenderer, local_renderer
 from trompe_server.renderers.local import COMMAND
 from trompe_server.spec.labels import resolve_label
 from trompe_shared.api import HashedFile, JudgedNetwork
+from trompe_shared.engine import DEFAULT_ENGINE
 from trompe_shared.errors import LabelError
 from trompe_shared.local_files import CLASSIFIER_SUFFIXES, LOOKED_UP, classes_beside, model_file
 from trompe_shared.object3d import Object3D, load_object, unpack
 from trompe_shared.shipped import shipped_objects
 
-__all__ = ["JudgedObject", "network_file", "open_judge", "read_judged", "running"]
+__all__ = ["JudgedObject", "LocalSources", "Sources", "StoredSources", "network_file"]
 
 
 @dataclass(frozen=True)
@@ -31,37 +38,102 @@ class JudgedObject:
     shipped: str | None = None
 
 
-def read_judged(source: str, folder: Path) -> JudgedObject:
-    """Read a model file, or a shipped object by name, for a manifest in ``folder``. Raises ``ObjectError``."""
-    if source in shipped_objects() and not Path(source).exists():
-        data = shipped_objects()[source].read()
-        return JudgedObject(
-            load_object(data), HashedFile(source=source, sha256=identity_of(data), bytes=len(data)), source
-        )
-    name, content = model_file(Path(source))
-    data = content if isinstance(content, bytes) else content.read_bytes()
-    sha256 = _hash_of_files(data) if isinstance(content, bytes) else identity_of(data)
-    file = HashedFile(source=_relative(source, folder), sha256=sha256, bytes=len(data))
-    return JudgedObject(load_object(import_file(data, name=name).archive), file)
+class Sources(Protocol):
+    """Resolves the names in a judgement."""
+
+    @property
+    def renderer(self) -> str:
+        """Name of the default renderer."""
+        ...
+
+    def object(self, source: str, role: str) -> JudgedObject:
+        """The object ``before`` or ``after``, as ``role`` says. Raises ``ObjectError``, or ``NotFoundError``."""
+        ...
+
+    def network(self, reference: str, label: Sequence[str | int]) -> tuple[Judge, JudgedNetwork]:
+        """Load a network, with the labels among ``label`` that it knows.
+
+        Raises ``ClassifierError``, and ``LabelError`` if it knows none of them.
+        """
+        ...
+
+    def running(self, name: str) -> AbstractContextManager[TargetRenderer]:
+        """The renderer ``name`` for the block. Raises ``RendererError``."""
+        ...
 
 
-def open_judge(reference: str, label: Sequence[str | int], folder: Path) -> tuple[Judge, JudgedNetwork]:
-    """Load a network, with the labels among ``label`` that it knows.
+@dataclass(frozen=True)
+class LocalSources:
+    """Paths and names on this machine, for a manifest in ``folder``."""
 
-    Raises ``ClassifierError``, and ``LabelError`` if it knows none of them.
+    folder: Path
+    renderer: str = DEFAULT_ENGINE
+
+    def object(self, source: str, role: str) -> JudgedObject:
+        """See ``Sources``; ``role`` is not needed."""
+        if source in shipped_objects() and not Path(source).exists():
+            return _shipped(source)
+        name, content = model_file(Path(source))
+        if isinstance(content, bytes):
+            return _imported(content, name, source=self._relative(source), sha256=_hash_of_files(content))
+        return _imported(content.read_bytes(), name, source=self._relative(source))
+
+    def network(self, reference: str, label: Sequence[str | int]) -> tuple[Judge, JudgedNetwork]:
+        """See ``Sources``."""
+        path = network_file(reference)
+        network = load_classifier(reference, classes=None if path is None else classes_beside(path))
+        return _judge(network, label, reference, reference if path is None else self._relative(reference), path is None)
+
+    @contextmanager
+    def running(self, name: str) -> Iterator[TargetRenderer]:
+        """The renderer at HOST:PORT, or a worker of our own with the engine ``name``. Raises ``RendererError``."""
+        host, _, port = name.rpartition(":")
+        if host and port.isdecimal():
+            with closing(SailenvTarget(host, int(port))) as target:
+                yield target
+            return
+        with local_renderer([*COMMAND, "--engine", name]) as target:
+            yield target
+
+    def _relative(self, source: str) -> str:
+        return Path(os.path.relpath(Path(source).resolve(), self.folder.resolve())).as_posix()
+
+
+@dataclass(frozen=True)
+class StoredSources:
+    """Things in the library of a service.
+
+    An uploaded model file is written to ``artifacts`` as ``before`` or ``after`` with its ending, so that a manifest
+    beside them can be verified. renderer: the default one. opened: connects to the service's renderers of a name.
     """
-    path = network_file(reference)
-    network = load_classifier(reference, classes=None if path is None else classes_beside(path))
-    judge = Judge.of(network, _known(label, network))
-    names = network.classes
-    return judge, JudgedNetwork(
-        name=reference if path is None else network.name,
-        reference=reference if path is None else _relative(reference, folder),
-        sha256=identity_of(classifier_file(reference).read_bytes()),
-        image_size=network.image_size,
-        labels=list(judge.labels),
-        label_names=None if names is None else [names[index] for index in judge.labels],
-    )
+
+    library: Library
+    artifacts: Artifacts
+    renderer: str
+    opened: Callable[[str], AbstractContextManager[TargetRenderer]]
+    device: str = "cpu"
+
+    def object(self, source: str, role: str) -> JudgedObject:
+        """See ``Sources``."""
+        original = self.library.original(source)
+        if original is None:
+            return _shipped(self.library.object(source).name)
+        data, filename = original
+        name = f"{role}{Path(filename).suffix.lower()}"
+        self.artifacts.write(name, data)
+        return _imported(data, filename, source=name)
+
+    def network(self, reference: str, label: Sequence[str | int]) -> tuple[Judge, JudgedNetwork]:
+        """See ``Sources``."""
+        info, file = self.library.classifier(reference), self.library.classifier_path(reference)
+        network = load_classifier(file, name=info.name, classes=info.classes, device=self.device)
+        by_name = network_file(file) is None
+        shown = reference if by_name else f"{info.name}{Path(file).suffix}"
+        return _judge(network, label, file, shown, by_name)
+
+    def running(self, name: str) -> AbstractContextManager[TargetRenderer]:
+        """See ``Sources``."""
+        return self.opened(name)
 
 
 def network_file(reference: str) -> Path | None:
@@ -70,19 +142,30 @@ def network_file(reference: str) -> Path | None:
     return Path(reference) if is_file else None
 
 
-@contextlib.contextmanager
-def running(name: str) -> Iterator[TargetRenderer]:
-    """The renderer at HOST:PORT, or a worker of our own with the engine ``name`` for the block.
+def _shipped(name: str) -> JudgedObject:
+    data = shipped_objects()[name].read()
+    return JudgedObject(load_object(data), HashedFile(source=name, sha256=identity_of(data), bytes=len(data)), name)
 
-    Raises ``RendererError``.
-    """
-    host, _, port = name.rpartition(":")
-    if host and port.isdecimal():
-        with contextlib.closing(SailenvTarget(host, int(port))) as target:
-            yield target
-        return
-    with local_renderer([*COMMAND, "--engine", name]) as target:
-        yield target
+
+def _imported(data: bytes, name: str, *, source: str, sha256: str | None = None) -> JudgedObject:
+    """The object in a model file called ``name``. Raises ``ObjectError``."""
+    file = HashedFile(source=source, sha256=sha256 or identity_of(data), bytes=len(data))
+    return JudgedObject(load_object(import_file(data, name=name).archive), file)
+
+
+def _judge(
+    network: Classifier, label: Sequence[str | int], file: str, reference: str, by_name: bool
+) -> tuple[Judge, JudgedNetwork]:
+    """A network in ``file`` (or by name) as a judge, and its record."""
+    judge, names = Judge.of(network, _known(label, network)), network.classes
+    return judge, JudgedNetwork(
+        name=reference if by_name else network.name,
+        reference=reference,
+        sha256=identity_of(classifier_file(file).read_bytes()),
+        image_size=network.image_size,
+        labels=list(judge.labels),
+        label_names=None if names is None else [names[index] for index in judge.labels],
+    )
 
 
 def _known(label: Sequence[str | int], network: Classifier) -> tuple[int, ...]:
@@ -96,10 +179,6 @@ def _known(label: Sequence[str | int], network: Classifier) -> tuple[int, ...]:
     if not found:
         raise unknown[0]
     return tuple(found)
-
-
-def _relative(source: str, folder: Path) -> str:
-    return Path(os.path.relpath(Path(source).resolve(), folder.resolve())).as_posix()
 
 
 def _hash_of_files(data: bytes) -> str:

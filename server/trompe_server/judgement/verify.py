@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from trompe_server.judgement.judge_files import noisy, sampled
 from trompe_server.judgement.manifest import view_of, view_record
-from trompe_server.judgement.request import JudgeRequest
-from trompe_server.judgement.sources import JudgedObject, network_file, open_judge, read_judged, running
+from trompe_server.judgement.sources import JudgedObject, LocalSources, Sources, network_file
+from trompe_server.judgement.suites import SUITES
 from trompe_server.judging.judge import Judge
 from trompe_server.judging.metrics import margins
 from trompe_server.renderers import TargetRenderer
@@ -35,10 +35,11 @@ def verify(manifest: Manifest, folder: Path, *, generator: np.random.Generator) 
     """
     yield from _views(manifest)
     yield from _figures(manifest)
+    sources = LocalSources(folder)
     objects, judges = dict[str, JudgedObject](), dict[str, Judge]()
     for kind, file in (("before", manifest.before), ("after", manifest.after)):
         try:
-            objects[kind] = read_judged(_source(file.source, folder), folder)
+            objects[kind] = sources.object(_source(file.source, folder), kind)
         except ObjectError as error:
             yield f"The file {kind} cannot be read again: {error}"
         else:
@@ -47,7 +48,7 @@ def verify(manifest: Manifest, folder: Path, *, generator: np.random.Generator) 
         if network.missing is not None:
             continue
         try:
-            judges[network.name], found = open_judge(_source(network.reference, folder), network.labels, folder)
+            judges[network.name], found = sources.network(_source(network.reference, folder), network.labels)
         except (ClassifierError, LabelError) as error:
             yield f"The network {network.name!r} cannot be loaded again: {error}"
         else:
@@ -56,7 +57,7 @@ def verify(manifest: Manifest, folder: Path, *, generator: np.random.Generator) 
         count = len(manifest.views)
         index = np.sort(generator.permutation(count)[:VIEWS_AGAIN])
         for renderer in manifest.renderers:
-            yield from _Again(manifest, objects, judges, index.tolist(), renderer).faults()
+            yield from _Again(manifest, sources, objects, judges, index.tolist(), renderer).faults()
 
 
 def _source(source: str, folder: Path) -> str:
@@ -72,14 +73,18 @@ def _same_hash(name: str, recorded: str | None, found: str | None) -> Iterator[s
 
 def _views(manifest: Manifest) -> Iterator[str]:
     """Views that are not the random ones of the seed, or not those of the suite."""
-    request = JudgeRequest("", "", ("",), views=len(manifest.views), seed=manifest.seed)
-    drawn = [view_record(view) for view in sampled(request, Framing((0.0, 0.0, 0.0), 1.0, (0.0, 0.0)))]
+    anywhere, count = Framing((0.0, 0.0, 0.0), 1.0, (0.0, 0.0)), len(manifest.views)
+    drawn = [view_record(view) for view in sampled(count, manifest.seed, anywhere, background="white")]
     free = {"distance", "elevation", "centre", "background"}
     if [view.model_dump(exclude=free) for view in drawn] != [view.model_dump(exclude=free) for view in manifest.views]:
         yield f"The views are not the random ones of seed {manifest.seed}."
     if manifest.suite is not None:
-        wanted, size = request.in_suite(manifest.suite), manifest.image_size
-        if (wanted.views, wanted.seed, wanted.image_size) != (request.views, request.seed, size):
+        wanted = SUITES.get(manifest.suite)
+        if wanted is None or (wanted.views, wanted.seed, wanted.image_size) != (
+            count,
+            manifest.seed,
+            manifest.image_size,
+        ):
             yield f"The number of views, their seed or the size of the images is not that of {manifest.suite}."
 
 
@@ -105,6 +110,7 @@ class _Again:
     """Some views in one renderer again."""
 
     manifest: Manifest
+    sources: Sources
     objects: Mapping[str, JudgedObject]
     judges: Mapping[str, Judge]
     index: Sequence[int]
@@ -115,7 +121,7 @@ class _Again:
         if self.renderer.engine is None:
             return
         try:
-            with running(self.renderer.name) as target:
+            with self.sources.running(self.renderer.name) as target:
                 if target.engine != self.renderer.engine:
                     yield f"The renderer here is {target.engine}, the manifest's {self.renderer.engine}."
                 yield from self._views(target)

@@ -1,4 +1,4 @@
-"""The work of a judgement, image by image: kept in a folder, so that a stopped one goes on, and timed."""
+"""The work of a judgement, image by image: kept in files, so that a stopped one goes on, and timed."""
 
 import hashlib
 import json
@@ -7,15 +7,15 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from trompe_server.job.protocol import Artifacts
 from trompe_server.storage.arrays import pack_arrays, unpack_arrays
-from trompe_server.system.files import write_whole
 from trompe_server.system.versions import versions
+from trompe_shared.api import Progress
 
 __all__ = ["Kept", "OnWork", "Timed", "Work", "key_of"]
 
@@ -32,6 +32,11 @@ class Work:
     what: str
     done: float
     seconds_left: float
+
+    @property
+    def progress(self) -> Progress:
+        """The same in the words of a job."""
+        return Progress(phase=self.what, fraction=self.done, eta_seconds=self.seconds_left)
 
 
 OnWork = Callable[[Work], None]
@@ -54,7 +59,7 @@ class Timed:
 
     @contextmanager
     def step(self, kind: str, images: int, *, kept: bool = False) -> Iterator[None]:
-        """Some images of a kind. kept: found in the folder, so that their time tells nothing."""
+        """Some images of a kind. kept: found in the files, so that their time tells nothing."""
         self._tell(kind)
         began = self.clock()
         yield
@@ -79,24 +84,25 @@ class Timed:
 
 @dataclass(frozen=True)
 class Kept:
-    """Arrays in a folder, each named by a hash of all that it depends on."""
+    """Arrays in files, each named by a hash of all that it depends on."""
 
-    folder: Path
+    files: Artifacts
 
     def has(self, key: str) -> bool:
         """Whether the array is there."""
-        return self._path(key).exists()
+        return self.files.exists(_name(key))
 
     def array(self, key: str, make: Callable[[], NDArray[T]]) -> NDArray[T]:
         """The kept array, or else the one that ``make`` gives, which is saved. The write is atomic."""
         with suppress(FileNotFoundError, ValueError, OSError, KeyError):
-            return unpack_arrays(self._path(key).read_bytes())["kept"]
+            return unpack_arrays(self.files.read(_name(key)))["kept"]
         made = make()
-        write_whole(self._path(key), pack_arrays({"kept": made}))
+        self.files.write(_name(key), pack_arrays({"kept": made}))
         return made
 
-    def _path(self, key: str) -> Path:
-        return self.folder / f"{key}.npz"
+
+def _name(key: str) -> str:
+    return f"{key}.npz"
 
 
 def key_of(*parts: Any) -> str:

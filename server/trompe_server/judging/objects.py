@@ -74,6 +74,11 @@ class ObjectPair:
         """Differences other than of the albedo's colours, each in one sentence."""
         return self._shape or [*self._layout(), *self._shading(), *self._maps(), *self._sizes()]
 
+    @property
+    def is_one(self) -> bool:
+        """Whether the two have as many triangles. If not, no difference between their images has a meaning."""
+        return len(self._old) == len(self._new)
+
     @cached_property
     def textures(self) -> tuple[Textures, Textures]:
         """Albedo textures that belong together and have one size, by the first object's name: before and after."""
@@ -93,9 +98,12 @@ class ObjectPair:
     def _shape(self) -> list[Finding]:
         """Why the two are not one shape; empty if they are."""
         old, new = self._old, self._new
-        if len(old) != len(new):
-            text = f"These are not one object: the first has {len(old)} triangles, the second {len(new)}. "
-            return [Finding(kind="object", text=f"{text}Textures are not compared.")]
+        if not self.is_one:
+            text = (
+                f"These are not one object: the first has {len(old)} triangles, the second {len(new)}. Each is judged "
+                "by itself; there is no A_drop, and neither textures nor images are compared."
+            )
+            return [Finding(kind="object", text=text)]
         places, _ = _matched(old.corners, new.corners)
         back, _ = _matched(new.corners, old.corners)
         moved = max(int((places < 0).sum()), int((back < 0).sum()))

@@ -7,7 +7,7 @@ from typing import Any
 from trompe_server.errors import NotFoundError
 from trompe_server.library import Library
 from trompe_server.pages.present import ClassNames, JobRow, job_row
-from trompe_shared.api import OPTIONS, Job, JobSpec
+from trompe_shared.api import OPTIONS, Job, JobSpec, JudgementSpec
 
 __all__ = ["Names"]
 
@@ -21,24 +21,34 @@ class Names:
     def row(self, job: Job) -> JobRow:
         """A job in a list."""
         spec = job.spec
+        if isinstance(spec, JudgementSpec):
+            before, after = (_named(job, each) for each in (spec.before, spec.after))
+            return job_row(
+                job,
+                object=after if after == before else f"{after}, judged beside {before}",
+                classifier=", ".join(_named(job, spec.networks)) or spec.suite or "tiny",
+                label=" or ".join(map(str, spec.label)),
+                epsilon=spec.epsilon,
+            )
         return job_row(
             job,
             object=_named(job, spec.object),
             classifier=_named(job, spec.victim.classifier),
             label=self._object_classes(spec),
+            epsilon=spec.paint.epsilon,
         )
 
     def options(self, job: Job) -> dict[str, Any]:
-        """Options by keyword, with names in place of ids and class indices."""
-        goal, dumped = job.spec.goal, job.spec.model_dump()
+        """Options of an attack by keyword, with names in place of ids and class indices."""
+        spec, dumped = job.attack, job.attack.model_dump()
         return {
             keyword: _named(job, dumped[option.part][option.field])
             if option.file
             else dumped[option.part][option.field]
             for keyword, option in OPTIONS.items()
         } | {
-            "label": self._object_classes(job.spec),
-            "target": None if goal.target is None else self._class(job.spec, goal.target),
+            "label": self._object_classes(spec),
+            "target": None if spec.goal.target is None else self._class(spec, spec.goal.target),
         }
 
     def _object_classes(self, spec: JobSpec) -> str:

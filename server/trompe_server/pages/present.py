@@ -10,6 +10,7 @@ from trompe_server.job.protocol import THUMBNAIL, numbered
 from trompe_server.pages.outcomes import Outcome
 from trompe_server.pages.sphere import Sphere, sphere
 from trompe_shared.api import (
+    MANIFEST_PAGE,
     OPTIONS,
     VIEW_LIMITS,
     Accuracy,
@@ -103,6 +104,11 @@ class JobRow:
         return f"/v1/jobs/{self.id}/artifacts/{THUMBNAIL}" if THUMBNAIL in self.artifacts else None
 
     @property
+    def judgement(self) -> str | None:
+        """Address of the page of a judgement, once it is there."""
+        return f"/v1/judgements/{self.id}/page" if MANIFEST_PAGE in self.artifacts else None
+
+    @property
     def percent(self) -> int:
         """Progress in per cent."""
         return round(100 * self.fraction)
@@ -113,7 +119,7 @@ class JobRow:
         return f"{self.state}-{self.fraction:.3f}-{self.phase}-{self.eta}"
 
 
-def job_row(job: Job, *, object: str, classifier: str, label: str) -> JobRow:
+def job_row(job: Job, *, object: str, classifier: str, label: str, epsilon: float | None) -> JobRow:
     """A job with names in place of ids."""
     progress, live = job.progress, not job.state.final
     kind = progress.phase.partition("-")[0]
@@ -122,7 +128,7 @@ def job_row(job: Job, *, object: str, classifier: str, label: str) -> JobRow:
         object=object,
         label=label,
         classifier=classifier,
-        epsilon=f"{job.spec.paint.epsilon:g}",
+        epsilon="none stated" if epsilon is None else f"{epsilon:g}",
         state=job.state.value,
         live=live,
         fraction=progress.fraction,

@@ -18,6 +18,7 @@ from trompe_server.api.jobs import RESULT, Cursor, labels_of
 from trompe_server.api.services import Services, ServicesDep
 from trompe_server.errors import NotFoundError
 from trompe_server.formats import write_glb
+from trompe_server.judgement.suites import SUITES
 from trompe_server.pages.chart import chart
 from trompe_server.pages.estimate import Effort, estimate
 from trompe_server.pages.experiment import columns_and_lines, differing_options, points_of
@@ -31,7 +32,7 @@ from trompe_server.pages.serving import COOKIE, page, render
 from trompe_server.pages.turntable import TURNS, turntable
 from trompe_server.storage.database import DatabaseDownError
 from trompe_server.storage.tokens import hash_secret
-from trompe_shared.api import Job, JobState, Result, in_parts
+from trompe_shared.api import JOB_RESULT, Job, JobSpec, JobState, Result, in_parts
 from trompe_shared.presets import PRESETS
 from trompe_shared.shipped import shipped_objects
 
@@ -101,26 +102,14 @@ def follow_list(
 @router.get("/jobs/new")
 def new_job(request: Request, services: ServicesDep) -> HTMLResponse:
     """The form of a new job."""
-    labels = {name: shipped.label for name, shipped in shipped_objects().items()}
-    objects = [
-        {"reference": info.reference, "name": info.name, "label": labels.get(info.name, "")}
-        for info in services.library.objects()
-    ]
-    classifiers = [
-        {"reference": info.reference, "name": info.name, "white_box": info.white_box}
-        for info in services.library.classifiers()
-    ]
     return page(
         request,
         "new.html",
-        objects=objects,
-        classifiers=classifiers,
+        **_choices(services),
         fields=form_fields(),
         renderers=list(dict.fromkeys(each.identity for each in services.renderers() if each.identity)),
         presets={name: {"help": one.help, "options": in_parts(one.options)} for name, one in PRESETS.items()},
         turns=TURNS,
-        endings=".zip,.glb,.gltf,.fbx,.ply,.stl,.obj",
-        formats="GLB, FBX, PLY, STL, or a zip of an .obj or .gltf with its textures.",
     )
 
 
@@ -139,6 +128,23 @@ def show_estimate(
     outcomes = request.app.state.outcomes
     ended = [(job, outcome) for job in found if (outcome := outcomes.of(services.artifacts(job.id)))]
     return {"text": estimate(Effort(pool, steps, epsilon), ended)}
+
+
+@router.get("/judgements/new")
+def new_judgement(request: Request, services: ServicesDep, job: str | None = None) -> HTMLResponse:
+    """The form of a new judgement; of the result of ``job``, if it is given."""
+    attack = None if job is None else services.store.get(job)
+    given = None
+    if attack is not None:
+        spec = attack.attack
+        given = {
+            "before": spec.object,
+            "after": f"{JOB_RESULT}{attack.id}",
+            "label": spec.goal.label[0],
+            "network": spec.victim.classifier,
+            "epsilon": spec.paint.epsilon,
+        }
+    return page(request, "new_judgement.html", **_choices(services), given=given, suites=list(SUITES))
 
 
 @router.get("/jobs/turntable/{reference}.png")
@@ -249,7 +255,8 @@ def show_experiment(request: Request, services: ServicesDep, name: str, cursor: 
     if not found.jobs:
         raise NotFoundError(f"There is no experiment {name!r}.")
     names = Names(services.library)
-    entries = [(names.row(job), names.options(job), _result(services, job)) for job in found.jobs]
+    attacks = [job for job in found.jobs if isinstance(job.spec, JobSpec)]
+    entries = [(names.row(job), names.options(job), _result(services, job)) for job in attacks]
     states = [row.state for row, _, _ in entries]
     options = differing_options(entries)
     columns, lines = columns_and_lines(entries, options)
@@ -302,6 +309,23 @@ def sign_out() -> Response:
     answer = RedirectResponse("/", status_code=303)
     answer.delete_cookie(COOKIE, httponly=True, samesite="strict")
     return answer
+
+
+def _choices(services: Services) -> dict[str, Any]:
+    """Stored objects and networks for a form."""
+    labels = {name: shipped.label for name, shipped in shipped_objects().items()}
+    return {
+        "objects": [
+            {"reference": info.reference, "name": info.name, "label": labels.get(info.name, "")}
+            for info in services.library.objects()
+        ],
+        "classifiers": [
+            {"reference": info.reference, "name": info.name, "white_box": info.white_box}
+            for info in services.library.classifiers()
+        ],
+        "endings": ".zip,.glb,.gltf,.fbx,.ply,.stl,.obj",
+        "formats": "GLB, FBX, PLY, STL, or a zip of an .obj or .gltf with its textures.",
+    }
 
 
 def _rows(

@@ -7,8 +7,9 @@ import numpy as np
 from trompe_server.api.services import Services
 from trompe_server.spec.framing import framing_of
 from trompe_shared.api import ViewOptions
+from trompe_shared.colours import colour_of
 from trompe_shared.errors import RendererError, SpecError
-from trompe_shared.geometry import Camera, Light, View, colour_of
+from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import encode_png, load_object
 from trompe_shared.sailenv_client import SailenvTarget
 

@@ -28,10 +28,12 @@ from trompe_server.queue.tables import (
     workers,
 )
 from trompe_server.storage.database import clock, connect, write
-from trompe_shared.api import Event, Job, JobList, JobRequest, JobState, Progress, WorkerInfo
+from trompe_shared.api import Event, Job, JobList, JobRequest, JobState, JudgementRequest, Progress, WorkerInfo
 from trompe_shared.errors import SpecError
 
 __all__ = ["JobGroup", "JobStore", "Statistics"]
+
+AnyRequest = JobRequest | JudgementRequest
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class JobStore:
         self.engine.dispose()
 
     def create(
-        self, request: JobRequest, *, names: Mapping[str, str] | None = None, idempotency_key: str | None = None
+        self, request: AnyRequest, *, names: Mapping[str, str] | None = None, idempotency_key: str | None = None
     ) -> tuple[Job, bool]:
         """Queue a job. Returns the job and whether it is new: the same ``idempotency_key`` returns the same job.
 
@@ -86,7 +88,7 @@ class JobStore:
             with write(self.engine) as connection:
                 return self._create(connection, request, row)
 
-    def _create(self, connection: sa.Connection, request: JobRequest, values: dict[str, Any]) -> tuple[Job, bool]:
+    def _create(self, connection: sa.Connection, request: AnyRequest, values: dict[str, Any]) -> tuple[Job, bool]:
         key = values["idempotency_key"]
         if key is not None:
             known = connection.execute(sa.select(jobs).where(jobs.c.idempotency_key == key)).one_or_none()
@@ -220,20 +222,27 @@ def _check_ended(row: Row) -> None:
         raise ConflictError(f"Job {row.id} is {row.state}: only ended jobs can be deleted. Cancel it first.")
 
 
-def _row(request: JobRequest, names: Mapping[str, str], key: str | None) -> dict[str, Any]:
+def _row(request: AnyRequest, names: Mapping[str, str], key: str | None) -> dict[str, Any]:
     spec = request.spec().model_dump(mode="json")
     return _NEW | {
         "id": secrets.token_hex(8),
         "spec": spec,
         "names": dict(names),
-        "object": request.object,
-        "classifier": request.victim.classifier,
+        "object": request.before if isinstance(request, JudgementRequest) else request.object,
+        "classifier": _network(request),
         "priority": PRIORITIES[request.priority],
         "needs": needs_text(request.needs),
         "labels": request.labels,
         "idempotency_key": key,
         "created": clock(),
     }
+
+
+def _network(request: AnyRequest) -> str:
+    """The network that a job is listed under."""
+    if isinstance(request, JudgementRequest):
+        return next(iter(request.networks), "")
+    return request.victim.classifier
 
 
 _NEW: Final = {
@@ -248,7 +257,7 @@ _NEW: Final = {
 }
 
 
-def _the_same(job: Job, request: JobRequest, key: str) -> Job:
+def _the_same(job: Job, request: AnyRequest, key: str) -> Job:
     """Return ``job``; raise ``ConflictError`` if ``request`` asks for another one."""
     if (job.spec, job.priority, job.labels, job.needs) != (
         request.spec(),

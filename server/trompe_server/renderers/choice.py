@@ -9,7 +9,7 @@ from trompe_shared.api import JobSpec
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, SpecError
 
-__all__ = ["JobEngines", "listed"]
+__all__ = ["JobEngines", "listed", "named"]
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class JobEngines:
         Raises ``RendererError`` for a name that none has, ``SpecError`` for a name that several have and for a renderer
         that is attacked and judges.
         """
-        attacked = [_named(name, "renderers", there) for name in spec.views.renderers] or [there[0]]
-        judging = [_named(name, "judge_renderers", there) for name in spec.judges.renderers]
+        attacked = [named(name, "renderers", there) for name in spec.views.renderers] or [there[0]]
+        judging = [named(name, "judge_renderers", there) for name in spec.judges.renderers]
         for both in set(attacked) & set(judging):
             raise SpecError(
                 f"`judge_renderers: {both}` is attacked and judges anyway. Name a renderer that is not attacked: "
@@ -51,7 +51,9 @@ class JobEngines:
         return cls(*(tuple(EngineInfo(**each) for each in parts[name]) for name in ("attacked", "judging")))
 
 
-def _named(name: str, option: str, there: Sequence[EngineInfo]) -> EngineInfo:
+def named(name: str, option: str, there: Sequence[EngineInfo]) -> EngineInfo:
+    """The engine called ``name``, by its name alone or in full. Raises ``RendererError``, or ``SpecError`` if several
+    have the name."""
     found = [engine for engine in there if str(engine) == name] or [engine for engine in there if engine.name == name]
     if not found:
         raise RendererError(f"No renderer answers to `{option}: {name}`. There are: {listed(there)}.")

@@ -6,7 +6,7 @@ from typing import Final
 
 from fastapi import FastAPI
 
-from trompe_server.api import classify, experiments, fleet, health, jobs, library, metrics
+from trompe_server.api import classify, experiments, fleet, health, jobs, judgements, library, metrics
 from trompe_server.api.contract import contract
 from trompe_server.api.downloads import Digests
 from trompe_server.api.guard import Guard
@@ -28,6 +28,7 @@ ROUTERS: Final = (
     library.router,
     classify.router,
     jobs.router,
+    judgements.router,
     experiments.router,
     fleet.router,
     health.router,

@@ -1,6 +1,6 @@
 """The HTTP contract between client and server. Needs pydantic alone.
 
-``jobs`` (what a job asks for), ``results`` (``result.json``), ``manifest``
+``jobs`` (what an attack asks for), ``judgements`` (what a judgement does), ``results`` (``result.json``), ``manifest``
 (``judgement.json``), ``stored`` (objects, classifiers, backgrounds),
 ``service`` (the record of jobs, workers, problems).
 """
@@ -35,8 +35,11 @@ from trompe_shared.api.jobs import (
     in_parts,
     levels_within,
 )
+from trompe_shared.api.judgements import JOB_RESULT, JudgementRequest, JudgementSpec
 from trompe_shared.api.manifest import (
     AS_RENDERED,
+    MANIFEST,
+    MANIFEST_PAGE,
     Cell,
     Finding,
     HashedFile,
@@ -78,6 +81,9 @@ __all__ = [
     "ADVERSARIAL",
     "AS_RENDERED",
     "FEW_RECOGNISED",
+    "JOB_RESULT",
+    "MANIFEST",
+    "MANIFEST_PAGE",
     "MOST_VIEWS",
     "OPTIONS",
     "PAPER_AZIMUTHS",
@@ -106,6 +112,8 @@ __all__ = [
     "JudgedNetwork",
     "JudgedRenderer",
     "Judgement",
+    "JudgementRequest",
+    "JudgementSpec",
     "Labels",
     "Loss",
     "Manifest",

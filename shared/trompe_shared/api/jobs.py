@@ -116,9 +116,27 @@ def _as_list(given: Any) -> Any:
     return [given] if isinstance(given, str | int) else given
 
 
+ClassNames = Annotated[
+    list[str | int],
+    BeforeValidator(_as_list, json_schema_input_type=str | int | list[str | int]),
+    Field(min_length=1, max_length=64),
+]
+
+
 def levels_within(epsilon: float) -> int:
     """Largest change of an 8-bit channel within a budget."""
     return math.floor(epsilon * 255 + 1e-9)
+
+
+def _in_order(elevation: Range) -> Range:
+    low, high = elevation
+    if not -90 <= low <= high <= 90:
+        raise ValueError(f"must be a range within -90..90 degrees, low end first; got {low} {high}")
+    return elevation
+
+
+Distance = Annotated[float, Field(gt=0, le=1000)]
+Elevation = Annotated[Range, AfterValidator(_in_order)]
 
 
 def _one_level(epsilon: float) -> float:
@@ -217,11 +235,7 @@ class PaintOptions(_Part):
 class GoalOptions(_Part):
     """Goal of the attack."""
 
-    label: Annotated[
-        list[str | int],
-        BeforeValidator(_as_list, json_schema_input_type=str | int | list[str | int]),
-        Field(min_length=1, max_length=64),
-    ] = _option(
+    label: ClassNames = _option(
         ...,
         "the object's true class, by name or index; each of several counts as the object",
         metavar="NAME_OR_INDEX",
@@ -268,10 +282,10 @@ class ViewOptions(_Part):
         "point that cameras look at: the middle of the object's bounding sphere, or the origin; default: origin for "
         "the grid, else object",
     )
-    distance: Annotated[float, Field(gt=0, le=1000)] | None = _option(
+    distance: Distance | None = _option(
         None, "camera distance in metres; default: a shipped object's own, or to fit the frame", in_form=True
     )
-    elevation: tuple[float, float] | None = _option(
+    elevation: Elevation | None = _option(
         None, "range of camera elevations in degrees; default: a shipped object's own, or 0 50", metavar="LO HI"
     )
     background: Annotated[list[str], BeforeValidator(_as_list), Field(min_length=1, max_length=64)] = _option(
@@ -330,9 +344,6 @@ class ViewOptions(_Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        low, high = self.elevation or (0.0, 0.0)
-        if not -90 <= low <= high <= 90:
-            raise ValueError(f"`elevation` must be a range within -90..90 degrees, low end first; got {low} {high}")
         if self.grid and self._changed("pool"):
             raise ValueError(f"`grid` attacks the paper's grid, `pool: {self.pool}` random views: use one of the two")
         if not self.grid and self._changed("azimuths", "elevations"):
@@ -435,12 +446,16 @@ class JobSpec(_Part):
         return self
 
 
-class JobRequest(JobSpec):
-    """A job to queue: the attack's spec and options of the queue; the latter change no result."""
+class QueueOptions(Schema):
+    """Options of the queue. They change no result."""
 
     priority: Priority = Field("normal", description="interactive jobs run first, sweeps last")
     labels: Labels = Field(default_factory=dict)
     needs: Needs = Field(default_factory=Needs, description="what the job occupies: cpu, gpu, memory (GiB)")
+
+
+class JobRequest(QueueOptions, JobSpec):
+    """An attack to queue: its spec and options of the queue."""
 
     def spec(self) -> JobSpec:
         """The job alone."""

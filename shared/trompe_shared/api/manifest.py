@@ -12,6 +12,10 @@ from trompe_shared.engine import EngineInfo
 AS_RENDERED: Final = "as rendered"
 """Name of the images themselves among the image pipelines."""
 
+MANIFEST: Final = "judgement.json"
+MANIFEST_PAGE: Final = "judgement.html"
+"""Names of the files of a judgement."""
+
 FindingKind = Literal[
     "object", "geometry", "uv", "material", "size", "epsilon", "label", "network", "renderer", "views"
 ]

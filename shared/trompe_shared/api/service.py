@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from trompe_shared.api.jobs import JobSpec, Labels, Needs, Priority
+from trompe_shared.api.judgements import JudgementSpec
 from trompe_shared.api.schema import Schema
 from trompe_shared.engine import EngineInfo
 
@@ -45,11 +46,11 @@ class Progress(Schema):
 
 
 class Job(Schema):
-    """A job on the server. ``error`` and ``note`` are for people."""
+    """An attack or a judgement on the server. ``error`` and ``note`` are for people."""
 
     id: str
     state: JobState
-    spec: JobSpec
+    spec: JobSpec | JudgementSpec
     names: dict[str, str] = Field(default_factory=dict, description="names of stored things in ``spec``, by id")
     priority: Priority = "normal"
     labels: Labels = Field(default_factory=dict)
@@ -63,6 +64,13 @@ class Job(Schema):
     error: str | None = None
     note: str | None = None
     artifacts: list[str] = Field(default_factory=list)
+
+    @property
+    def attack(self) -> JobSpec:
+        """The spec of an attack. Raises ``TypeError`` for a judgement."""
+        if isinstance(self.spec, JudgementSpec):
+            raise TypeError(f"Job {self.id} is a judgement, not an attack.")
+        return self.spec
 
 
 class JobList(Schema):

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from tests.fakes import FAKE, FakeTarget
 from trompe_server.judgement.judge_files import judge_files
-from trompe_server.judgement.manifest import Judged, manifest_of
-from trompe_server.judgement.request import JudgeRequest
+from trompe_server.judgement.manifest import Judged
+from trompe_server.judgement.sources import LocalSources
 from trompe_server.judgement.work import OnWork
 from trompe_server.renderers import TargetRenderer
-from trompe_shared.api import Manifest
+from trompe_server.storage.folders import LocalArtifacts
+from trompe_shared.api import JudgementSpec
 from trompe_shared.errors import RendererError
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
@@ -40,13 +41,12 @@ def fake_renderer(monkeypatch: pytest.MonkeyPatch) -> CountingTarget:
     target = CountingTarget(engine=FAKE)
 
     @contextmanager
-    def running(name: str) -> Iterator[TargetRenderer]:
+    def running(_sources: LocalSources, name: str) -> Iterator[TargetRenderer]:
         if name != "fake":
             raise RendererError(f"The renderer worker did not start. There is no engine {name!r}.")
         yield target
 
-    for module in ("judge_files", "verify"):
-        monkeypatch.setattr(f"trompe_server.judgement.{module}.running", running)
+    monkeypatch.setattr(LocalSources, "running", running)
     return target
 
 
@@ -69,15 +69,12 @@ def judge(fake_renderer: CountingTarget, tmp_path: Path) -> Judge:
     assert fake_renderer.rendered == []
 
     def run(after: Path, *, on_work: OnWork = lambda _: None, **options: Any) -> Judged:
-        return judge_files(request_of(after, **options), tmp_path, kept=tmp_path / "kept", on_work=on_work)
+        kept = LocalArtifacts(tmp_path / "kept")
+        return judge_files(spec_of(after, **options), LocalSources(tmp_path), kept=kept, on_work=on_work)
 
     return run
 
 
-def request_of(after: Path, **options: Any) -> JudgeRequest:
-    asked: dict[str, Any] = {"label": ("mug",), "renderers": ("fake",), "views": 6, **options}
-    return JudgeRequest("mug", str(after), **asked)
-
-
-def manifest_for(judged: Judged, after: Path, **options: Any) -> Manifest:
-    return manifest_of(judged, request_of(after, **options), seconds=1.0)
+def spec_of(after: Path, **options: Any) -> JudgementSpec:
+    asked: dict[str, Any] = {"label": "mug", "renderers": ["fake"], "views": 6, **options}
+    return JudgementSpec.of("mug", str(after), **asked)

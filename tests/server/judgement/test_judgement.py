@@ -3,7 +3,6 @@
 import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -12,19 +11,20 @@ import numpy as np
 import pytest
 
 from tests.job_runs import run_job
-from tests.server.judgement.conftest import CountingTarget, Judge, manifest_for, request_of
+from tests.server.judgement.conftest import CountingTarget, Judge, spec_of
 from trompe_server.image_pipelines import SUITE
 from trompe_server.judgement.judge_files import judge_files
 from trompe_server.judgement.manifest import manifest_of
 from trompe_server.judgement.pictures import judgement_pictures
-from trompe_server.judgement.request import JudgeRequest
-from trompe_server.judgement.suites import SUITES, Suite
+from trompe_server.judgement.sources import LocalSources
+from trompe_server.judgement.suites import SUITES, Suite, suite_of
 from trompe_server.judgement.verify import verify
 from trompe_server.judgement.work import Timed, Work
 from trompe_server.library import Library
 from trompe_server.pages.judgement import judgement_page
 from trompe_server.renderers import SailenvTarget
-from trompe_shared.api import AS_RENDERED, JobSpec, Manifest
+from trompe_server.storage.folders import LocalArtifacts
+from trompe_shared.api import AS_RENDERED, JobSpec, JudgementSpec, Manifest, Visibility
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
@@ -44,18 +44,19 @@ def test_an_attacked_object_gets_the_figures_of_its_job(
     assert job.a_drop
     for ending, seed in ((".zip", 0), (".glb", 0), (".glb", 7)):
         (tmp_path / f"after{ending}").write_bytes(run.artifacts.read(f"mug-adversarial{ending}"))
-        request = JudgeRequest(
+        spec = JudgementSpec.of(
             "mug",
             str(tmp_path / f"after{ending}"),
-            label=("mug",),
-            renderers=(f"{worker[0]}:{worker[1]}",),
+            label="mug",
+            renderers=[f"{worker[0]}:{worker[1]}"],
             views=12,
             seed=seed,
             epsilon=0.15,
         )
-        judged = judge_files(request, tmp_path, kept=tmp_path / "kept", on_work=lambda _: None)
-        manifest = manifest_of(judged, request, seconds=1.0)
-        found = manifest.cell(request.renderers[0], "tiny")
+        kept = LocalArtifacts(tmp_path / "kept")
+        judged = judge_files(spec, LocalSources(tmp_path), kept=kept, on_work=lambda _: None)
+        manifest = manifest_of(judged, seconds=1.0)
+        found = manifest.cell(spec.renderers[0], "tiny")
         assert found is not None
         assert manifest.findings == []
         if (ending, seed) == (".zip", 0):
@@ -71,7 +72,7 @@ def test_an_attacked_object_gets_the_figures_of_its_job(
 
 
 def test_every_cell_has_figures_and_every_view_its_classes(judge: Judge, dark: Path) -> None:
-    manifest = manifest_for(judge(dark), dark)
+    manifest = manifest_of(judge(dark), seconds=1.0)
     assert [cell.pipeline for cell in manifest.cells] == [AS_RENDERED, *SUITE]
     assert all(cell.accuracy is not None and cell.accuracy.views == 6 for cell in manifest.cells)
     (predictions,) = manifest.predictions
@@ -86,15 +87,19 @@ def test_every_cell_has_figures_and_every_view_its_classes(judge: Judge, dark: P
 # Whatever does not fit is said in a sentence, and the rest is judged
 
 
-def test_each_thing_that_does_not_fit_is_a_sentence_and_the_rest_is_judged(judge: Judge, dark: Path) -> None:
+def test_each_thing_that_does_not_fit_is_a_sentence_and_the_rest_is_judged(
+    judge: Judge, dark: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     missing = dark.with_name("nowhere.pt2")
     options = {
-        "networks": ("tiny", str(missing)),
-        "renderers": ("fake", "none-such"),
-        "image_size": (64, 96),
+        "networks": ["tiny", str(missing)],
+        "renderers": ["fake", "none-such"],
+        "views": None,
+        "suite": "small",
         "epsilon": 0.1,
     }
-    manifest = manifest_for(judge(dark, **options), dark, **options)
+    monkeypatch.setitem(SUITES, "small", Suite(6, 0, (64, 96), (), ()))
+    manifest = manifest_of(judge(dark, **options), seconds=1.0)
     texts = {(found.kind, found.text.split(":")[0]) for found in manifest.findings}
     assert texts == {
         (
@@ -110,30 +115,36 @@ def test_each_thing_that_does_not_fit_is_a_sentence_and_the_rest_is_judged(judge
 
 
 def test_an_object_that_is_not_recognised_before_is_said(judge: Judge, dark: Path) -> None:
-    manifest = manifest_for(judge(dark, label=("ball",)), dark, label=("ball",))
+    manifest = manifest_of(judge(dark, label=("ball",)), seconds=1.0)
     assert [found.text for found in manifest.findings if found.kind == "views"] == [
         "fake, tiny: None of the 6 views was recognised before the attack: A_drop is n.a."
     ]
 
 
 def test_a_label_counts_for_the_networks_that_know_it(judge: Judge, dark: Path) -> None:
-    known = manifest_for(judge(dark, label=("coffee mug", "mug")), dark)
+    known = manifest_of(judge(dark, label=("coffee mug", "mug")), seconds=1.0)
     assert known.networks[0].label_names == ["mug"]
-    unknown = manifest_for(judge(dark, label=("coffee mug",)), dark)
+    unknown = manifest_of(judge(dark, label=("coffee mug",)), seconds=1.0)
     (found,) = unknown.findings
     assert re.match("No figures of 'tiny': 'tiny' has no class 'coffee mug'; an example of a class", found.text)
     assert unknown.textures
 
 
-def test_another_object_is_judged_but_its_texels_are_not(judge: Judge, tmp_path: Path) -> None:
+def test_another_object_is_judged_by_itself_and_has_no_drop(judge: Judge, tmp_path: Path) -> None:
     ball = tmp_path / "ball.zip"
     ball.write_bytes(shipped_objects()["ball"].read())
-    manifest = manifest_for(judge(ball), ball)
+    judged = judge(ball)
+    manifest = manifest_of(judged, seconds=1.0)
     assert manifest.findings[0].kind == "object"
-    assert manifest.textures == []
-    visibility = manifest.renderers[0].visibility
-    assert (visibility.texels_altered, visibility.ssim is None) == (None, False)
-    assert manifest.cell("fake", "tiny") is not None
+    assert "Each is judged by itself; there is no A_drop" in manifest.findings[0].text
+    assert (manifest.textures, manifest.renderers[0].visibility) == ([], Visibility())
+    for cell in manifest.cells:
+        assert cell.accuracy is not None
+        assert cell.accuracy.a_after is not None
+        assert (cell.accuracy.a_drop, cell.accuracy.a_drop_interval) == (None, None)
+    page = judgement_page(manifest, judgement_pictures(judged))
+    assert page.index("These are not one object") < page.index("Images as rendered")
+    assert "Image pipeline" in page
 
 
 # Resume, and the time left
@@ -154,12 +165,12 @@ def test_a_stopped_judgement_goes_on_to_the_same_figures(
         judge(dark, on_work=stop)
     rendered = len(fake_renderer.rendered)
     assert rendered == 2
-    resumed = manifest_for(judge(dark), dark)
+    resumed = manifest_of(judge(dark), seconds=1.0)
     assert len(fake_renderer.rendered) == rendered
     assert any((tmp_path / "kept").iterdir())
     for file in (tmp_path / "kept").iterdir():
         file.write_bytes(b"damaged")
-    assert manifest_for(judge(dark), dark) == resumed
+    assert manifest_of(judge(dark), seconds=1.0) == resumed
 
 
 def test_the_time_left_is_that_of_the_images_to_come() -> None:
@@ -197,7 +208,7 @@ def test_the_page_needs_no_network_and_escapes_names(judge: Judge, dark: Path) -
     named = dark.with_name("<script>x.zip")
     named.write_bytes(dark.read_bytes())
     judged = judge(named, renderers=("fake", "none-such"))
-    manifest = manifest_for(judged, named, renderers=("fake", "none-such"))
+    manifest = manifest_of(judged, seconds=1.0)
     page = judgement_page(manifest, judgement_pictures(judged))
     references = References()
     references.feed(page)
@@ -264,7 +275,7 @@ CHANGES: dict[str, tuple[Change, str]] = {
 def test_verification_names_what_is_not_as_the_manifest_says(
     judge: Judge, dark: Path, tmp_path: Path, change: Change, fault: str
 ) -> None:
-    manifest = manifest_for(judge(dark), dark)
+    manifest = manifest_of(judge(dark), seconds=1.0)
     assert list(verify(manifest, tmp_path, generator=np.random.default_rng(0))) == []
     changed = change(manifest, dark)
     faults = list(verify(changed, tmp_path, generator=np.random.default_rng(0)))
@@ -287,24 +298,28 @@ def test_a_suite_never_changes() -> None:
 
 
 def test_a_suite_keeps_its_own_and_takes_more_on_top(dark: Path) -> None:
-    request = replace(request_of(dark), networks=("mine.pt2",), renderers=("mitsuba",)).in_suite("standard-1")
-    assert request.networks == (*SUITES["standard-1"].networks, "mine.pt2")
-    assert request.renderers == ("pyrender", "three", "mitsuba")
-    assert (request.views, request.image_size, request.suite) == (100, (224, 224), "standard-1")
+    spec = spec_of(dark, views=None, suite="standard-1", networks=["mine.pt2"], renderers=["mitsuba"])
+    suite = suite_of(spec, renderer="other")
+    assert suite.networks == (*SUITES["standard-1"].networks, "mine.pt2")
+    assert suite.renderers == ("pyrender", "three", "mitsuba")
+    assert (suite.views, suite.image_size) == (100, (224, 224))
+    assert suite_of(spec_of(dark, renderers=[]), renderer="other") == Suite(6, 0, None, ("other",), ("tiny",))
 
 
 WRONG: list[tuple[dict[str, Any], str]] = [
-    ({"label": ()}, "needs the object's true class"),
-    ({"views": 0}, "from 1 to 1000; got 0"),
-    ({"epsilon": 12.75}, "at most 1; got 12.75"),
+    ({"label": []}, "label: .* at least 1"),
+    ({"views": 0}, "views: .* greater than or equal to 1"),
+    ({"epsilon": 12.75}, "epsilon: .* less than or equal to 1"),
     ({"background": "room.png"}, "is not a colour"),
-    ({"seed": -1}, "0 or more; got -1"),
+    ({"seed": -1}, "seed: .* greater than or equal to 0"),
     ({"distance": -1.0}, "distance: .* greater than 0"),
     ({"elevation": (50.0, 0.0)}, "low end first; got 50.0 0.0"),
+    ({"suite": "standard-1"}, "the suite standard-1 fixes views and seed"),
+    ({"surprise": 1}, "surprise: .* not permitted"),
 ]
 
 
 @pytest.mark.parametrize(("options", "text"), WRONG)
 def test_a_wrong_option_is_an_error(dark: Path, options: dict[str, Any], text: str) -> None:
     with pytest.raises(SpecError, match=text):
-        request_of(dark, **options)
+        spec_of(dark, **options)

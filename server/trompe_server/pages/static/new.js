@@ -1,5 +1,6 @@
 // The form of a new job: uploads at once, and shows the API's faults before anything is queued.
-import { Refused, ask, words } from "./common.js";
+import { ask } from "./common.js";
+import { complain, send, submits, upload } from "./form.js";
 
 const form = document.getElementById("new");
 const { object } = form.elements;
@@ -8,44 +9,6 @@ const classifier = option("victim.classifier"), label = option("goal.label");
 const file = document.getElementById("file");
 const drop = document.getElementById("drop");
 const says = document.getElementById("file-says");
-const keys = new Map();
-
-// The same request has the same key, and makes one job.
-function keyOf(body) {
-  if (!keys.has(body)) keys.set(body, Array.from(crypto.getRandomValues(new Uint32Array(4)), (n) => n.toString(16)).join("-"));
-  return keys.get(body);
-}
-
-function complain(error, fallback = "") {
-  for (const place of form.querySelectorAll("[data-error]")) place.hidden = true;
-  if (!error) return;
-  const problems = error instanceof Refused && error.problem.errors?.length
-    ? error.problem.errors.map((each) => [String(each.field ?? each.loc?.at(-1) ?? ""), each.message ?? each.msg ?? ""])
-    : [[fallback, words(error)]];
-  for (const [field, text] of problems) {
-    const known = [...form.querySelectorAll("[data-error]")].find(
-      (each) => each.dataset.error && each.dataset.error.split(" ").some((name) => `${field}.`.startsWith(`${name}.`)));
-    const place = known ?? form.querySelector('[data-error=""]');
-    place.textContent = known || !field ? text : `${field}: ${text}`;
-    place.hidden = false;
-  }
-}
-
-async function upload(path, picked, select, place) {
-  const body = new FormData();
-  body.append("file", picked);
-  try {
-    const stored = await ask(path, { method: "POST", body });
-    const option = [...select.options].find((each) => each.value === stored.id) ?? new Option(stored.name, stored.id);
-    option.selected = true;
-    select.append(option);
-    complain(null);
-    return stored;
-  } catch (error) {
-    complain(error, place);
-    return null;
-  }
-}
 
 async function take(picked) {
   if (!picked) return;
@@ -100,9 +63,6 @@ function request() {
   return JSON.stringify({ ...spec, object: object.value, priority: "interactive" });
 }
 
-const send = (path, headers = {}) =>
-  ask(path, { method: "POST", body: request(), headers: { "Content-Type": "application/json", ...headers } });
-
 async function foresee() {
   const { victim, views, search, paint } = JSON.parse(request());
   const asked = new URLSearchParams({ classifier: victim.classifier, pool: views.pool, steps: search.steps, epsilon: paint.epsilon });
@@ -116,7 +76,7 @@ let timer;
 function check() {
   clearTimeout(timer);
   foresee();
-  timer = setTimeout(() => label.value && send("/v1/jobs/check").then(() => complain(null), (error) => complain(error)), 400);
+  timer = setTimeout(() => label.value && send("/v1/jobs/check", request()).then(() => complain(null), (error) => complain(error)), 400);
 }
 
 file.onchange = () => take(file.files[0]);
@@ -151,16 +111,5 @@ form.addEventListener("input", (event) => {
   if (event.target.name === "paint.epsilon") form.elements["epsilon-says"].value = event.target.value;
 });
 form.addEventListener("change", check);
-form.addEventListener("submit", async (event) => {
-  event.preventDefault();
-  const button = form.querySelector(":scope > button");
-  button.disabled = true;
-  try {
-    const job = await send("/v1/jobs", { "Idempotency-Key": keyOf(request()) });
-    location.assign(`/jobs/${job.id}`);
-  } catch (error) {
-    complain(error);
-    button.disabled = false;
-  }
-});
+submits("/v1/jobs", request);
 await Promise.all([chosen(), classes(), foresee()]);

@@ -1,0 +1,126 @@
+"""``trompe judge``: on this machine, or on a server."""
+
+import sys
+from collections.abc import Callable
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from pydantic import ValidationError
+
+from trompe_client._client import Client
+from trompe_client._progress import shown
+from trompe_client.cli.connection import token_option
+from trompe_client.cli.following import deliver, follow
+from trompe_client.cli.output import json_option, say
+from trompe_shared.api import MANIFEST, MANIFEST_PAGE, OPTIONS, Event, JobState, JudgementSpec, Manifest, Progress
+from trompe_shared.errors import SpecError
+
+HERE: Final = "trompe.here"
+"""Entry points of the server package with the functions that judge without a service."""
+
+
+def _help(keyword: str) -> str:
+    """The words of a job's option."""
+    words = OPTIONS[keyword].help
+    return words[0].upper() + words[1:]
+
+
+@click.command()
+@click.argument("before", required=False)
+@click.argument("after", required=False)
+@click.option("--label", multiple=True, metavar="NAME_OR_INDEX", help=f"{_help('label')}. *")
+@click.option("--suite", metavar="NAME", help="Views, networks and renderers by name: standard-1 (docs/benchmark.md).")
+@click.option("--network", "networks", multiple=True, metavar="FILE_OR_NAME", help="A network. Default: tiny. *")
+@click.option(
+    "--renderer",
+    "renderers",
+    multiple=True,
+    metavar="NAME",
+    help="An engine; without --server also HOST:PORT of a running renderer. Default: pyrender, or the server's own. *",
+)
+@click.option("--views", type=int, help="Random views and lights. Default: 60.")
+@click.option("--seed", type=int, help="Of the views. Default: 0.")
+@click.option("--epsilon", type=float, help="The budget that AFTER is said to keep, 0..1.")
+@click.option("--distance", type=float, help=f"{_help('distance')}.")
+@click.option("--elevation", type=(float, float), metavar="LO HI", help=f"{_help('elevation')}.")
+@click.option("--background", metavar="COLOUR", help="white, black or '#rrggbb'. Default: white.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Folder for the results.")
+@click.option(
+    "--verify", type=click.Path(path_type=Path, exists=True, dir_okay=False), help="Check a manifest instead."
+)
+@click.option("--server", envvar="TROMPE_SERVER", metavar="URL", help="Judge on a running server (or TROMPE_SERVER).")
+@token_option
+@json_option
+def judge(
+    before: str | None,
+    after: str | None,
+    out: Path | None,
+    verify: Path | None,
+    server: str | None,
+    token: str | None,
+    **options: Any,
+) -> None:
+    """Judge AFTER, a repaint of BEFORE by anyone: zips, model files, folders with one, or shipped objects.
+
+    On a server also stored objects, and job:ID, the result of a job. Writes judgement.json, the manifest, and
+    judgement.html. The same command continues after Ctrl-C. Options marked * can be given several times.
+    """
+    given = {name: value for name, value in options.items() if value not in (None, ())}
+    if verify is not None:
+        if before is not None or out is not None or given:
+            raise click.UsageError("--verify takes a manifest alone.")
+        sys.exit(_verify(verify))
+    if before is None or after is None or out is None or "label" not in given:
+        raise click.UsageError("Give two files, --label and --out: trompe judge BEFORE AFTER --label mug --out DIR")
+    spec = JudgementSpec.of(before, after, **given)
+    out.mkdir(parents=True, exist_ok=True)
+    if server is None:
+        manifest = _judge_here(spec, out)
+    else:
+        with Client(server, token=token) as client:
+            deliver(follow(client.judge(before, after, **given)), out)
+        manifest = Manifest.model_validate_json((out / MANIFEST).read_bytes())
+    sys.exit(not any(cell.accuracy for cell in manifest.cells))
+
+
+def _judge_here(spec: JudgementSpec, out: Path) -> Manifest:
+    from trompe_client._report import judgement_report
+
+    judge_here = _here("judge")
+    with shown(True) as show:
+
+        def tell(progress: Progress) -> None:
+            show(Event(id=0, time=datetime.now(UTC), state=JobState.running, progress=progress))
+
+        try:
+            manifest: Manifest = judge_here(spec, out, tell)
+        except KeyboardInterrupt:
+            click.echo(f"\nFinished work is kept in {out}. The same command goes on with it.", err=True)
+            raise
+    say(manifest, lambda: judgement_report(manifest, [out / MANIFEST, out / MANIFEST_PAGE]))
+    return manifest
+
+
+def _here(name: str) -> Callable[..., Any]:
+    """A function of the server package. Raises ``ModuleNotFoundError`` without it."""
+    (found,) = metadata.entry_points(group=HERE, name=name)
+    function: Callable[..., Any] = found.load()
+    return function
+
+
+def _verify(file: Path) -> int:
+    """Print the faults of a manifest; the exit code."""
+    try:
+        manifest = Manifest.model_validate_json(file.read_bytes())
+    except ValidationError as error:
+        raise SpecError(f"{file} is not a manifest of trompe judge ({error.error_count()} faults).") from error
+    faults = 0
+    for fault in _here("verify")(manifest, file.parent):
+        click.echo(fault)
+        faults += 1
+    if not faults:
+        click.echo("The files are those of the manifest, and random views rendered again have the same classes.")
+    return int(faults > 0)

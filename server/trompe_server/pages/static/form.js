@@ -1,0 +1,61 @@
+// Shared by the forms: uploads at once, faults beside their fields, one job for one request.
+import { Refused, ask, words } from "./common.js";
+
+const form = document.getElementById("new");
+const keys = new Map();
+
+// The same request has the same key, and makes one job.
+function keyOf(body) {
+  if (!keys.has(body)) keys.set(body, Array.from(crypto.getRandomValues(new Uint32Array(4)), (n) => n.toString(16)).join("-"));
+  return keys.get(body);
+}
+
+export function complain(error, fallback = "") {
+  for (const place of form.querySelectorAll("[data-error]")) place.hidden = true;
+  if (!error) return;
+  const problems = error instanceof Refused && error.problem.errors?.length
+    ? error.problem.errors.map((each) => [String(each.field ?? each.loc?.at(-1) ?? ""), each.message ?? each.msg ?? ""])
+    : [[fallback, words(error)]];
+  for (const [field, text] of problems) {
+    const known = [...form.querySelectorAll("[data-error]")].find(
+      (each) => each.dataset.error && each.dataset.error.split(" ").some((name) => `${field}.`.startsWith(`${name}.`)));
+    const place = known ?? form.querySelector('[data-error=""]');
+    place.textContent = known || !field ? text : `${field}: ${text}`;
+    place.hidden = false;
+  }
+}
+
+export async function upload(path, picked, select, place) {
+  const body = new FormData();
+  body.append("file", picked);
+  try {
+    const stored = await ask(path, { method: "POST", body });
+    const option = [...select.options].find((each) => each.value === stored.id) ?? new Option(stored.name, stored.id);
+    option.selected = true;
+    select.append(option);
+    complain(null);
+    return stored;
+  } catch (error) {
+    complain(error, place);
+    return null;
+  }
+}
+
+export const send = (path, body, headers = {}) =>
+  ask(path, { method: "POST", body, headers: { "Content-Type": "application/json", ...headers } });
+
+// Submit what `request` gives as JSON, and go to the job.
+export function submits(path, request) {
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const button = form.querySelector(":scope > button");
+    button.disabled = true;
+    try {
+      const job = await send(path, request(), { "Idempotency-Key": keyOf(request()) });
+      location.assign(`/jobs/${job.id}`);
+    } catch (error) {
+      complain(error);
+      button.disabled = false;
+    }
+  });
+}

@@ -1,0 +1,75 @@
+"""What a judgement of two objects is asked for."""
+
+from typing import Annotated, Any, Final, Self
+
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from trompe_shared.api.jobs import ClassNames, Distance, Elevation, QueueOptions
+from trompe_shared.api.schema import Schema
+from trompe_shared.colours import colour_of
+from trompe_shared.errors import SpecError
+from trompe_shared.faults import faults_of
+
+__all__ = ["JOB_RESULT", "JudgementRequest", "JudgementSpec"]
+
+JOB_RESULT: Final = "job:"
+"""Begins the name of a job's result, as ``job:8f14e45fceea167a``."""
+
+MOST_VIEWS: Final = 1000
+
+
+def _plain(given: Any) -> Any:
+    return list(given) if isinstance(given, tuple) else given
+
+
+_Names = Annotated[list[str], BeforeValidator(_plain), Field(max_length=16)]
+
+
+class JudgementSpec(Schema):
+    """What to judge, and how.
+
+    ``before`` and ``after`` name shipped or stored objects, and ``after`` may be a job's result (``job:ID``). A
+    judgement on one machine, without a service, also takes paths of files.
+    """
+
+    model_config = ConfigDict(
+        frozen=True,
+        json_schema_extra={"examples": [{"before": "mug", "after": "job:8f14e45fceea167a", "label": "mug"}]},
+    )
+
+    before: str = Field(min_length=1)
+    after: str = Field(min_length=1, description="the object of `before`, repainted by anyone")
+    label: Annotated[ClassNames, BeforeValidator(_plain)] = Field(description="each class counts as the object")
+    networks: _Names = Field(default=[], description="default: the shipped one, or those of the suite")
+    renderers: _Names = Field(default=[], description="engines by name; default: the first, or those of the suite")
+    views: Annotated[int, Field(ge=1, le=MOST_VIEWS)] | None = Field(None, description="random views; default: 60")
+    seed: Annotated[int, Field(ge=0, lt=2**31)] | None = Field(None, description="of the views; default: 0")
+    epsilon: Annotated[float, Field(gt=0, le=1)] | None = Field(None, description="the stated budget, 0..1")
+    distance: Distance | None = Field(None, description="of the cameras, metres; default: as for an attack")
+    elevation: Elevation | None = Field(None, description="range in degrees; default: as for an attack")
+    background: str = Field("white", description="white, black or '#rrggbb'")
+    suite: str | None = Field(None, description="fixes views and seed, and adds networks and renderers: standard-1")
+
+    @classmethod
+    def of(cls, before: str, after: str, **options: Any) -> Self:
+        """A judgement by keywords. Raises ``SpecError``."""
+        try:
+            return cls.model_validate({"before": before, "after": after, **options})
+        except ValidationError as error:
+            raise SpecError(f"Invalid options: {'; '.join(map(str, faults_of(error)))}.") from error
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if colour_of(self.background) is None:
+            raise ValueError(f"the background {self.background!r} is not a colour; use white, black or #rrggbb")
+        if self.suite is not None and (self.views is not None or self.seed is not None):
+            raise ValueError(f"the suite {self.suite} fixes views and seed: leave them out")
+        return self
+
+
+class JudgementRequest(QueueOptions, JudgementSpec):
+    """A judgement to queue: its spec and options of the queue."""
+
+    def spec(self) -> JudgementSpec:
+        """The judgement alone."""
+        return JudgementSpec.model_validate(self.model_dump(include=set(JudgementSpec.model_fields)))
