@@ -41,6 +41,7 @@ def run(file: str, out: Path | None, server: str | None, token: str | None, dry_
 
     Run it again to continue a stopped run: only missing jobs are submitted.
     """
+    from trompe_experiments.judged import judge_all
     from trompe_experiments.progress import experiment_display
     from trompe_experiments.run import run_experiment
 
@@ -51,6 +52,8 @@ def run(file: str, out: Path | None, server: str | None, token: str | None, dry_
         return
     with service(server, token) as client, experiment_display(console(stderr=True)) as show:
         rows = run_experiment(plan, Service(client), folder, show=show, retry_failed=retry_failed)
+        if plan.experiment.judgement is not None:
+            judge_all(plan, Service(client), folder, seconds={row.key: row.seconds for row in rows}, show=click.echo)
     command = f"trompe experiment run {file}" + (f" --out {out}" if out else "")
     write_about(folder, command, seconds=monotonic() - started, source=experiment_file(file))
     _conclude(rows, folder)

@@ -6,6 +6,7 @@
     grid: {epsilon: [0.02, 0.05], tau: [null, 0.05]}      # all combinations; each grid of a list is one series
     cases: {dark: {ranges: {intensity: [0.2, 0.2]}}}      # named variations, each combined with the grid
     seeds: [0, 1, 2]
+    judgement: {views: 60, seed: 1}     # judges the painted objects, the unpainted one and noise on the same views
 
 Options are keywords of the SDK (``trompe_shared.api.OPTIONS``). Later ones override earlier ones: base, object, grid,
 case.
@@ -125,6 +126,9 @@ class Experiment(_Schema):
     )
     cases: dict[str, Annotated[Options, AfterValidator(_case)]] = Field(default_factory=dict)
     seeds: Annotated[list[int], BeforeValidator(_seeds), Field(min_length=1)] = Field(default_factory=lambda: [0])
+    judgement: dict[str, Any] | None = Field(
+        default=None, description="judge the painted objects, the unpainted one and noise, with these options"
+    )
     artifacts: list[str] = Field(default_factory=list, description="files of each job to keep; * and ? match")
     folder: Path = Path()
 

@@ -4,9 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from trompe_experiments.baselines import baselines_chart, baselines_markdown
 from trompe_experiments.between import between_chart, between_markdown
 from trompe_experiments.engines import engines_chart, engines_markdown
 from trompe_experiments.histograms import prediction_histograms
+from trompe_experiments.judged import JudgedRow, read_judgements
 from trompe_experiments.paper import paper_means_markdown, table_one_chart, table_one_markdown
 from trompe_experiments.pareto import pareto_markdown, speed_accuracy_chart
 from trompe_experiments.scatter import texels_scatter
@@ -24,16 +26,17 @@ MOST_PANELS = 12
 
 @dataclass(frozen=True)
 class Data:
-    """The two tables of an experiment, and their folder."""
+    """The tables of an experiment, and their folder."""
 
     folder: Path
     rows: tuple[ResultRow, ...]
     predictions: tuple[PredictionRow, ...]
+    judgements: tuple[JudgedRow, ...] = ()
 
     @property
     def stamp(self) -> str:
         """Name of these tables."""
-        return stamp_of([*self.rows, *self.predictions])
+        return stamp_of([*self.rows, *self.predictions, *self.judgements])
 
     def draw(self, name: str) -> list[Path]:
         """Draw the figure ``name`` into ``figures`` as SVG and PNG; returns their paths."""
@@ -56,7 +59,8 @@ def read_data(folder: Path) -> Data:
     if not rows:
         raise SpecError(f"{str(folder / RESULTS)!r} has no rows yet; `trompe experiment run` writes them as jobs end.")
     path = folder / PREDICTIONS
-    return Data(folder, tuple(rows), tuple(read_table(path, PredictionRow)) if path.exists() else ())
+    predictions = tuple(read_table(path, PredictionRow)) if path.exists() else ()
+    return Data(folder, tuple(rows), predictions, tuple(read_judgements(folder)))
 
 
 @dataclass(frozen=True)
@@ -117,6 +121,12 @@ FIGURES: dict[str, Kind] = {
         lambda data: between_chart(data.results),
         lambda data: between_markdown(data.results),
     ),
+    "baselines": Kind(
+        "Methods of painting, judged on the same unseen views",
+        lambda data: bool(data.judgements),
+        lambda data: baselines_chart(data.judgements),
+        lambda data: baselines_markdown(data.judgements),
+    ),
     "histograms": Kind(
         "Predicted classes, before and after",
         lambda data: _one_setting(data) and bool(data.predictions and plain_rows(data)),
@@ -145,7 +155,7 @@ FIGURES: dict[str, Kind] = {
     ),
     "stability": Kind(
         "Where methods fail",
-        lambda data: _cases(data),
+        lambda data: _cases(data) and not data.judgements,
         lambda data: stability_chart(data.rows),
         lambda data: stability_markdown(data.rows),
     ),

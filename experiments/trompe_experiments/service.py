@@ -7,7 +7,7 @@ from trompe_client._client import Client
 from trompe_client._errors import NotFound
 from trompe_client._plan import Upload
 from trompe_experiments.plan import LABEL
-from trompe_shared.api import Job, JobRequest, Result
+from trompe_shared.api import Job, JobRequest, JudgementRequest, Manifest, Result
 
 __all__ = ["Service"]
 
@@ -26,6 +26,10 @@ class Service:
     def submit(self, request: JobRequest, key: str) -> Job:
         """Submit a job, or find the job submitted with the same key."""
         return self._client.submit(request, key=key).status
+
+    def judge(self, request: JudgementRequest, *, key: str) -> Manifest:
+        """Judge, or find the judgement submitted with the same key. Raises ``JobFailed``."""
+        return self._client.submit(request, key=key).wait().manifest()
 
     def job(self, job: str) -> Job:
         """Current state of a job."""

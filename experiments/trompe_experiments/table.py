@@ -269,7 +269,7 @@ def prediction_rows(key: str, result: Result, classes: Sequence[str] | None) -> 
 R = TypeVar("R", bound=_Row)
 
 
-def write_table(path: Path, rows: Iterable[ResultRow] | Iterable[PredictionRow], kind: type[_Row] = ResultRow) -> None:
+def write_table(path: Path, rows: Iterable[RowId] | Iterable[PredictionRow], kind: type[BaseModel] = ResultRow) -> None:
     """Write rows of one kind as CSV, atomically."""
     partial = path.with_name(f".{path.name}.part")
     with partial.open("w", newline="", encoding="utf-8") as file:

@@ -272,7 +272,9 @@ def test_a_job_that_contradicts_itself_is_told_before_anything_is_asked() -> Non
 
 
 def test_what_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(SpecError, match="one of engines, few_texels, paper, path_tracers, perceptual, quick"):
+    with pytest.raises(
+        SpecError, match="one of baselines, baselines_real, engines, few_texels, paper, path_tracers, perceptual, quick"
+    ):
         load_experiment("nothing")
     (tmp_path / "bad.yaml").write_text("name: [")
     with pytest.raises(SpecError, match="is not YAML"):

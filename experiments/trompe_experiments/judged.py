@@ -1,0 +1,158 @@
+"""Judgements of the painted objects of an experiment, beside the unpainted object and noise.
+
+All objects of an experiment are judged on views that no attack has seen; ``judgements.csv`` has a row for each.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+
+from trompe_client._plan import Upload
+from trompe_experiments.plan import Plan, Row
+from trompe_experiments.service import Service
+from trompe_experiments.table import RowId, job_key, read_table, write_table
+from trompe_server.formats import import_file
+from trompe_shared.api import ADVERSARIAL, AS_RENDERED, JobRequest, JudgementRequest, Manifest, levels_within
+from trompe_shared.comparison import grouped
+from trompe_shared.object3d import Object3D, load_object
+from trompe_shared.shipped import shipped_objects
+
+__all__ = ["JUDGEMENTS", "NOISE", "NOTHING", "JudgedRow", "judge_all", "noised", "read_judgements"]
+
+JUDGEMENTS: Final = "judgements.csv"
+NOTHING, NOISE = "no change", "noise"
+"""What is judged beside the painted objects: the object itself, and random noise within the budget."""
+
+HALF_SIZE, JPEG = "half size", "JPEG 30"
+
+
+class JudgedRow(RowId):
+    """One judgement. ``case``: the method; shares, intervals and colour differences as in ``Accuracy``, ``Visibility``.
+
+    seconds: of the attack. max_levels: largest change of a texel, in levels of 255.
+    """
+
+    object: str
+    views: int
+    a_before: float
+    a_after: float | None = None
+    a_drop: float | None = None
+    a_drop_low: float | None = None
+    a_drop_high: float | None = None
+    half_size_drop: float | None = None
+    jpeg_drop: float | None = None
+    delta_e: float | None = None
+    max_levels: int | None = None
+    seconds: float | None = None
+
+    @classmethod
+    def of(cls, place: RowId, name: str, manifest: Manifest, seconds: float | None) -> Self:
+        """A judgement with one network and one renderer. Raises ``ValueError`` for one without figures."""
+        through = {cell.pipeline: cell.accuracy for cell in manifest.cells}
+        drops = {pipeline: each.a_drop for pipeline, each in through.items() if each is not None}
+        found, seen = through.get(AS_RENDERED), manifest.renderers[0].visibility
+        if found is None:
+            raise ValueError(
+                f"{name}, {place.case}: {manifest.findings[0].text if manifest.findings else 'no figures'}"
+            )
+        low, high = found.a_drop_interval or (None, None)
+        return cls(
+            **place.model_dump(),
+            object=name,
+            views=found.views,
+            a_before=found.a_before,
+            a_after=found.a_after,
+            a_drop=found.a_drop,
+            a_drop_low=low,
+            a_drop_high=high,
+            half_size_drop=drops.get(HALF_SIZE),
+            jpeg_drop=drops.get(JPEG),
+            delta_e=seen.delta_e,
+            max_levels=max((each.max_levels for each in manifest.textures), default=None),
+            seconds=seconds,
+        )
+
+
+def judge_all(
+    plan: Plan, service: Service, folder: Path, *, seconds: Mapping[str, float | None], show: Callable[[str], None]
+) -> list[JudgedRow]:
+    """Judge all painted objects in ``folder``, and write the table. Rows that it has already are kept.
+
+    seconds: of each job, by key. show: gets a line before each judgement. Raises ``ClientError``, and ``ValueError``
+    for a judgement without figures.
+    """
+    path = folder / JUDGEMENTS
+    known = {(row.object, row.case): row for row in read_judgements(folder)}
+    rows: list[JudgedRow] = []
+    for name, own in grouped(plan.rows, lambda row: row.object).items():
+        for place, after in _judged(own, folder):
+            row = known.get((name, place.case))
+            if row is None or row.key != place.key:
+                show(f"judging {name}, {place.case}")
+                manifest = _judgement(plan, own[0], after, service, key=place.key)
+                row = JudgedRow.of(place, name, manifest, seconds.get(place.key))
+            rows.append(row)
+            write_table(path, rows, JudgedRow)
+    return rows
+
+
+def read_judgements(folder: Path) -> list[JudgedRow]:
+    """The rows of a folder; none without the table."""
+    path = folder / JUDGEMENTS
+    return read_table(path, JudgedRow) if path.exists() else []
+
+
+def noised(obj: Object3D, epsilon: float, *, seed: int) -> Object3D:
+    """``obj`` with uniform random noise within ``epsilon`` on each channel of each texel."""
+    generator, most = np.random.default_rng(seed), levels_within(epsilon)
+
+    def noisy(image: Any) -> Any:
+        noise = generator.integers(-most, most, size=image.shape, endpoint=True)
+        return np.clip(image.astype(np.int16) + noise, 0, 255).astype(np.uint8)
+
+    return obj.with_textures({name: noisy(image) for name, image in obj.textures.items()})
+
+
+def _judged(rows: Sequence[Row], folder: Path) -> Iterator[tuple[RowId, Upload | str]]:
+    """What to judge of one object: the object itself, with noise, and painted by each job that has a painting."""
+    first = rows[0]
+    given, request = first.attack.options["object"], first.request
+    for case in (NOTHING, NOISE):
+        key = job_key(first.place.experiment, request.spec(), case)
+        place = first.place.model_copy(update={"case": case, "configuration": case, "key": key})
+        yield place, given if case == NOTHING else _noise(given, request)
+    for row in rows:
+        for file in sorted((folder / "jobs" / row.key).glob(f"*{ADVERSARIAL}.zip")):
+            yield row.place, Upload(file.name, file)
+
+
+def _noise(given: Upload | str, request: JobRequest) -> Upload:
+    if isinstance(given, Upload):
+        obj = load_object(import_file(given.content, name=given.filename).archive)
+    else:
+        obj = load_object(shipped_objects()[given].read())
+    return Upload("noise.zip", noised(obj, request.paint.epsilon, seed=request.search.seed).to_zip())
+
+
+def _judgement(plan: Plan, row: Row, after: Upload | str, service: Service, *, key: str) -> Manifest:
+    """Judge ``after`` as the jobs of its object were asked to: by their network, distance, elevation, background."""
+
+    def stored(given: Upload | str) -> str:
+        return service.store(given) if isinstance(given, Upload) else given
+
+    asked = row.request
+    request = JudgementRequest.of(
+        stored(row.attack.options["object"]),
+        stored(after),
+        label=asked.goal.label,
+        networks=[stored(row.attack.options.get("classifier", asked.victim.classifier))],
+        epsilon=asked.paint.epsilon,
+        distance=asked.views.distance,
+        elevation=asked.views.elevation,
+        background=asked.views.background[0],
+        priority="sweep",
+        **(plan.experiment.judgement or {}),
+    )
+    return service.judge(request, key=f"{key}-judged")

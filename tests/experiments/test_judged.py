@@ -1,0 +1,113 @@
+"""Judgements of the results of an experiment: what is judged, with which options, and that rows are kept."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.experiments.test_run import FakeService, Silent
+from trompe_experiments import Experiment, Plan, load_experiment, plan_experiment, run_experiment
+from trompe_experiments.baselines import baselines_markdown
+from trompe_experiments.figures import read_data
+from trompe_experiments.judged import NOISE, NOTHING, JudgedRow, judge_all, noised, read_judgements
+from trompe_server.api.examples import MANIFEST
+from trompe_shared.api import Job, JudgementRequest, Manifest
+from trompe_shared.object3d import load_object
+from trompe_shared.shipped import shipped_objects
+
+EXAMPLE: dict[str, Any] = MANIFEST["content"]["application/json"]["example"]
+FILE = {
+    "name": "small",
+    "objects": {"mug": {"elevation": [5, 15]}, "ball": {}},
+    "base": {"epsilon": 0.05},
+    "cases": {"weak": {"steps": 5}, "strong": {"steps": 50}},
+    "judgement": {"views": 4, "seed": 1},
+    "artifacts": ["*-adversarial.zip"],
+}
+
+
+class JudgingService(FakeService):
+    """Keeps the requests of judgements; the painted objects are the shipped ones."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.judged: list[JudgementRequest] = []
+
+    def job(self, job: str) -> Job:
+        found = super().job(job)
+        return found.model_copy(update={"artifacts": [*found.artifacts, f"{found.attack.object}-adversarial.zip"]})
+
+    def artifact(self, job: str, name: str) -> bytes | None:
+        return shipped_objects()[name.partition("-")[0]].read() if name.endswith(".zip") else b"picture"
+
+    def judge(self, request: JudgementRequest, *, key: str) -> Manifest:
+        self.judged.append(request)
+        return Manifest.model_validate(EXAMPLE)
+
+
+@pytest.fixture
+def plan() -> Plan:
+    return plan_experiment(Experiment.model_validate(FILE))
+
+
+def judged(plan: Plan, service: JudgingService, folder: Path) -> list[JudgedRow]:
+    rows = run_experiment(plan, service, folder, show=Silent())
+    return judge_all(plan, service, folder, seconds={row.key: row.seconds for row in rows}, show=lambda _: None)
+
+
+def test_each_object_is_judged_as_it_is_with_noise_and_painted(plan: Plan, tmp_path: Path) -> None:
+    service = JudgingService()
+    rows = judged(plan, service, tmp_path)
+    cases = [NOTHING, NOISE, "weak", "strong"]
+    assert [(row.object, row.case) for row in rows] == [(name, case) for name in ("mug", "ball") for case in cases]
+    assert [row.seconds for row in rows[:4]] == [None, None, 6.5, 6.5]
+    assert {row.a_drop for row in rows} == {EXAMPLE["cells"][0]["accuracy"]["a_drop"]}
+    assert service.judged[0].after == "mug"
+    assert {(one.before, one.epsilon, one.views, one.seed, one.elevation) for one in service.judged} == {
+        ("mug", 0.05, 4, 1, (5, 15)),
+        ("ball", 0.05, 4, 1, None),
+    }
+    assert [list(one.label) for one in service.judged] == [["mug"]] * 4 + [["ball"]] * 4
+
+
+def test_rows_are_kept_and_made_into_a_table_and_a_chart(plan: Plan, tmp_path: Path) -> None:
+    first = judged(plan, JudgingService(), tmp_path)
+    again = JudgingService()
+    assert judged(plan, again, tmp_path) == read_judgements(tmp_path)
+    assert again.judged == []
+    table = baselines_markdown(first).splitlines()
+    assert table[0] == "| method | A_drop | at half size | JPEG 30 | CIEDE2000 | seconds |"
+    assert len(table) == 2 + 4
+    assert [path.suffix for path in read_data(tmp_path).draw("baselines")] == [".svg", ".png"]
+
+
+def test_a_judgement_without_figures_says_why(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    empty = Manifest.model_validate(EXAMPLE | {"cells": []})
+    monkeypatch.setattr(JudgingService, "judge", lambda *_args, **_options: empty)
+    with pytest.raises(ValueError, match=f"mug, {NOTHING}: The texture is 512"):
+        judged(plan, JudgingService(), tmp_path)
+
+
+@given(epsilon=st.floats(0.004, 1), seed=st.integers(0, 9))
+@settings(deadline=None, max_examples=10)
+def test_noise_keeps_within_the_budget_and_depends_on_its_seed(epsilon: float, seed: int) -> None:
+    obj = load_object(shipped_objects()["ball"].read())
+    noisy = noised(obj, epsilon, seed=seed)
+    for name, image in obj.textures.items():
+        change = np.abs(noisy.textures[name].astype(int) - image)
+        assert 0 < change.max() <= epsilon * 255 + 1e-9
+        assert (noised(obj, epsilon, seed=seed).textures[name] == noisy.textures[name]).all()
+        assert (noised(obj, epsilon, seed=seed + 1).textures[name] != noisy.textures[name]).any()
+
+
+def test_the_shipped_baselines_are_judged_alike() -> None:
+    experiment = load_experiment("baselines")
+    assert experiment.judgement == {"views": 60, "seed": 1}
+    specs = {row.place.case: row.request for row in plan_experiment(experiment).rows}
+    assert list(specs) == ["paper", "eot", "fast", "balanced", "best"]
+    assert {spec.search.seed for spec in specs.values()} == {0}
+    assert {spec.paint.epsilon for spec in specs.values()} == {0.05}
+    assert (specs["paper"].views.count, specs["paper"].image_pipeline) == (60, "none")
