@@ -21,6 +21,8 @@ HAS_TOKENS: Final = (
     "The embedded service uses data with tokens (TROMPE_DATA, TROMPE_DATABASE); `trompe token create NAME` makes "
     "another token."
 )
+ALL_NETWORKS: Final = '["*"]'
+"""The service is the user's own: it may load any network by name."""
 TAIL_LINES: Final = 20
 STOP_SECONDS: Final = 20.0
 
@@ -49,7 +51,7 @@ def embedded_server(*, command: Sequence[str] = SERVE, start_seconds: float = 18
 
 def _start(command: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
     """Start the service in its own session, so that Ctrl-C does not reach it and the job can be cancelled first."""
-    environment = dict(os.environ, PYTHONUNBUFFERED="1")
+    environment = {"TROMPE_NETWORKS": ALL_NETWORKS} | os.environ | {"PYTHONUNBUFFERED": "1"}
     with log.open("wb") as output:
         return subprocess.Popen(
             command,

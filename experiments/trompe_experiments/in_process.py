@@ -30,7 +30,7 @@ class Done:
 
 def run_job(spec: JobSpec, target: TargetRenderer, folder: Path, *, change: Change | None = None) -> Done:
     """Run one job with its files in ``folder``, which must be new or empty. Raises ``TrompeError``."""
-    library, artifacts = Library(folder / "library"), LocalArtifacts(folder / "job")
+    library, artifacts = Library(folder / "library", networks=("*",)), LocalArtifacts(folder / "job")
     setup = open_setup(spec, library=library, target=target)
     if change is not None:
         members = tuple(change(member) for member in setup.members)

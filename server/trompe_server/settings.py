@@ -45,6 +45,9 @@ class Settings(BaseSettings):
     """Engine of these renderer workers, as in ``trompe render --engine``: a name or ``module:Class``."""
     engine_options: tuple[str, ...] = ()
     """Options of that engine, each ``NAME=VALUE``; in the environment a JSON list."""
+    networks: tuple[str, ...] = ()
+    """Networks by name that jobs may use, as patterns (``timm:*``, ``hf:google/vit-base-patch16-224``); in the
+    environment a JSON list."""
     renderer_patience: float = 10.0
     """Seconds a job waits for a renderer."""
     pipeline: str = "trompe_server.job.texture_attack:open_job"

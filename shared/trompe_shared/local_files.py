@@ -20,8 +20,8 @@ __all__ = [
 ]
 
 CLASSIFIER_SUFFIXES: Final = (".pt2", ".onnx")
-LOOKED_UP: Final = "torchvision:"
-"""Prefix of names of torchvision's networks, whatever their suffix."""
+LOOKED_UP: Final = ("torchvision:", "timm:", "robustbench:", "hf:")
+"""Prefixes of networks by name, whatever their suffix."""
 SPLIT_SUFFIXES: Final = {".obj", ".gltf"}
 """Models with textures and materials in files beside them."""
 MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, ".glb", ".fbx", ".ply", ".stl"}

@@ -1,5 +1,6 @@
 """A white-box classifier around a torch network."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,9 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from trompe_server.classifiers.protocol import Images, Logits, finite, fit_images, in_batches
+from trompe_server.classifiers.contract import prepared
+from trompe_server.classifiers.protocol import Images, Logits, check_classes, finite, fit_images, in_batches
 
-__all__ = ["NetworkClassifier"]
+__all__ = ["NetworkClassifier", "prepared_classifier"]
 
 BATCH = 10
 
@@ -45,3 +47,14 @@ class NetworkClassifier:
         for batch in in_batches(images, BATCH):
             chunks.append(finite(self.logits(fit_images(batch, self.image_size))).numpy())
         return np.concatenate(chunks)
+
+
+def prepared_classifier(
+    network: nn.Module, size: tuple[int, int], name: str, classes: Sequence[str] | None, *, device: str
+) -> NetworkClassifier:
+    """The network, normalisation inside, as a classifier of images of ``size`` (H, W), faster if torch can export it.
+
+    Raises ``ClassifierError`` if it breaks the contract, or has another number of classes.
+    """
+    fast, n_classes = prepared(network, size, name, device=device)
+    return NetworkClassifier(name, fast, size, n_classes, check_classes(classes, n_classes, name), device)

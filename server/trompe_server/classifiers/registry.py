@@ -6,8 +6,10 @@ reference                                classifier
 ``tiny``                                 the shipped network; can be attacked
 ``x.pt2``                                file of ``torch.export.save``; can be attacked
 ``x.onnx``                               gives scores only; attacked through ``score_based``
-``torchvision:NAME``, or the bare name   torchvision's network with its own size and
-                                         normalisation; can be attacked
+``torchvision:NAME``, or the bare name   network of torchvision, timm, RobustBench (ImageNet) or
+``timm:NAME``                            of the Hugging Face hub, with its own image size,
+``robustbench:NAME``                     normalisation and class names; can be attacked
+``hf:ORG/MODEL``
 ======================================== ====================================================
 """
 
@@ -19,20 +21,33 @@ from typing import Final
 import torch
 
 from trompe_server.classifiers.exported import load_exported
+from trompe_server.classifiers.huggingface import huggingface_weights, load_huggingface
 from trompe_server.classifiers.network import NetworkClassifier
 from trompe_server.classifiers.onnx import load_onnx
 from trompe_server.classifiers.protocol import Classifier
+from trompe_server.classifiers.robustbench_networks import load_robustbench, robustbench_weights
+from trompe_server.classifiers.timm_networks import load_timm, timm_weights
 from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, WEIGHTS, load_tiny
-from trompe_server.classifiers.vision import load_torchvision, weights_file
+from trompe_server.classifiers.vision import load_torchvision, torchvision_weights
 from trompe_shared.errors import ClassifierError
+from trompe_shared.local_files import LOOKED_UP
 
 __all__ = ["LOADERS", "classifier_file", "load_classifier"]
 
 LOADERS: Final[Mapping[str, Callable[..., Classifier]]] = {".pt2": load_exported, ".onnx": load_onnx}
 """By the ending of the file."""
 
+ZOOS: Final[Mapping[str, tuple[Callable[..., NetworkClassifier], Callable[[str], Path]]]] = {
+    "torchvision:": (load_torchvision, torchvision_weights),
+    "timm:": (load_timm, timm_weights),
+    "robustbench:": (load_robustbench, robustbench_weights),
+    "hf:": (load_huggingface, huggingface_weights),
+}
+"""Loader of a network by name, and its file of weights, by the prefix of the reference."""
+
 KNOWN: Final = (
-    "'tiny' (the shipped network), a .pt2 file (torch.export.save), an .onnx file (scores only) or torchvision:NAME"
+    "'tiny' (the shipped network), a .pt2 file (torch.export.save), an .onnx file (scores only), or a network by name "
+    f"({', '.join(ZOOS)})"
 )
 
 
@@ -48,20 +63,20 @@ def load_classifier(
 
     name: name for reports; by default the file's name without its ending, or the network's.
     classes: class names in the order of the logits.
-    weights: for networks by name: one of torchvision's weights, or a file with a state dict.
+    weights: for networks of torchvision and timm: a file with a state dict, or one of torchvision's weights by name.
 
     Raises ``ClassifierError`` for an unknown reference and for a network that breaks the contract.
     """
     _check_device(device)
     reference = str(path_or_name)
-    kind, colon, model = reference.partition(":")
-    if colon and kind == "torchvision":
-        return load_torchvision(model, name=name, classes=classes, weights=weights, device=device)
+    if reference.startswith(LOOKED_UP):
+        load, _, model = _zoo(reference)
+        return load(model, name=name, classes=classes, weights=weights, device=device)
     if reference != "tiny" and re.fullmatch(r"[a-z]\w*", reference, re.ASCII):
         return _by_bare_name(reference, name=name, classes=classes, weights=weights, device=device)
     if weights is not None:
         raise ClassifierError(
-            f"{reference!r} has its own weights. Pass weights only with a torchvision network (torchvision:NAME)."
+            f"{reference!r} has its own weights. Pass weights only with torchvision:NAME or timm:NAME."
         )
     if reference == "tiny":
         return NetworkClassifier("tiny", load_tiny().to(device), IMAGE_SIZE, len(CLASSES), tuple(CLASSES), device)
@@ -72,7 +87,16 @@ def classifier_file(reference: str) -> Path:
     """The file with the weights of the classifier that ``load_classifier`` loads. Raises ``ClassifierError``."""
     if reference == "tiny":
         return WEIGHTS
-    return Path(reference) if reference.endswith(tuple(LOADERS)) else weights_file(reference.rpartition(":")[2])
+    if reference.startswith(LOOKED_UP):
+        _, weights, model = _zoo(reference)
+        return weights(model)
+    return Path(reference) if reference.endswith(tuple(LOADERS)) else torchvision_weights(reference)
+
+
+def _zoo(reference: str) -> tuple[Callable[..., NetworkClassifier], Callable[[str], Path], str]:
+    """(Loader, file of weights, name of the network) of a network by name."""
+    prefix = next(prefix for prefix in ZOOS if reference.startswith(prefix))
+    return *ZOOS[prefix], reference.removeprefix(prefix)
 
 
 def _by_bare_name(

@@ -5,7 +5,6 @@ that no layer keeps random weights.
 """
 
 import difflib
-import importlib
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -14,12 +13,12 @@ from urllib.parse import urlparse
 import torch
 from torch import nn
 
-from trompe_server.classifiers.contract import Normalised, prepared
-from trompe_server.classifiers.network import NetworkClassifier
-from trompe_server.classifiers.protocol import check_classes
+from trompe_server.classifiers.contract import Normalised
+from trompe_server.classifiers.extras import import_extra
+from trompe_server.classifiers.network import NetworkClassifier, prepared_classifier
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["load_torchvision", "read_weights", "weights_file"]
+__all__ = ["load_torchvision", "read_weights", "torchvision_weights"]
 
 
 class _LocalWeights:
@@ -62,30 +61,16 @@ def load_torchvision(
     (side,) = transforms.crop_size
     network = _built(models, model, entry, path, names)
     whole = Normalised(network, mean=tuple(transforms.mean), std=tuple(transforms.std))
-    fast, n_classes = prepared(whole, (side, side), model, device=device)
-    check_classes(names, n_classes, model)
-    return NetworkClassifier(name or model, fast, (side, side), n_classes, names, device)
+    return prepared_classifier(whole, (side, side), name or model, names, device=device)
 
 
-def weights_file(model: str) -> Path:
+def torchvision_weights(model: str) -> Path:
     """The file with torchvision's default weights of ``model`` in torch's cache. Raises ``ClassifierError``."""
     return _find_weights(_torchvision(), model, None)[1]
 
 
 def _torchvision() -> Any:
-    """The module ``torchvision.models``. Raises ``ClassifierError``."""
-    try:
-        return importlib.import_module("torchvision.models")
-    except ImportError as error:
-        raise ClassifierError(
-            "torchvision is not installed; networks by name come from it. Install the version for torch "
-            f"{torch.__version__} (the 'vision' extra of trompe), or give a .pt2 file."
-        ) from error
-    except RuntimeError as error:
-        raise ClassifierError(
-            f"torchvision is installed, but for another build of torch than {torch.__version__} ({error}). "
-            "Install both from one index and for the same device, or give a .pt2 file."
-        ) from error
+    return import_extra("torchvision.models", extra="vision")
 
 
 def _find_weights(models: Any, model: str, weights: str | Path | None) -> tuple[Any, Path]:

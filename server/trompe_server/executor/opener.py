@@ -35,7 +35,7 @@ class JobOpener:
 
     def __init__(self, settings: Settings, files: Folder, renderers: RendererAddresses) -> None:
         self._settings, self._files, self._renderers = settings, files, renderers
-        self._library = Library(files.within("library"), cache=settings.data / "cache")
+        self._library = Library(files.within("library"), cache=settings.data / "cache", networks=settings.networks)
 
     def open(self, claim: Claim) -> OpenedJob:
         """Open the job of ``claim``. Raises ``TrompeError`` for errors the user can fix."""

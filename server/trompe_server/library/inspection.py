@@ -7,13 +7,12 @@ from typing import Final
 from trompe_server.system.sandbox import run_limited
 from trompe_shared.api import ClassifierInfo
 from trompe_shared.errors import ClassifierError
-from trompe_shared.local_files import LOOKED_UP
 
 __all__ = [
     "Inspect",
     "check_classes",
     "inspect_classifier",
-    "torchvision_classifier",
+    "named_classifier",
 ]
 
 _SECONDS: Final = 300.0
@@ -31,10 +30,10 @@ def inspect_classifier(path_or_name: str) -> dict[str, object]:
 
 
 @cache
-def torchvision_classifier(reference: str) -> ClassifierInfo:
-    """The classifier ``torchvision:NAME``. Raises ``ClassifierError`` if torchvision has no such one."""
-    name = reference.removeprefix(LOOKED_UP)
-    return ClassifierInfo.model_validate(inspect_classifier(reference) | {"id": reference, "name": name})
+def named_classifier(reference: str, inspect: Inspect) -> ClassifierInfo:
+    """A network by name, such as ``timm:NAME``. Raises ``ClassifierError`` if it cannot be loaded."""
+    name = reference.partition(":")[2]
+    return ClassifierInfo.model_validate(inspect(reference) | {"id": reference, "name": name})
 
 
 def check_classes(classes: Sequence[str] | None, n_classes: object) -> None:

@@ -3,6 +3,7 @@
 import os
 import tempfile
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -12,7 +13,7 @@ from trompe_server.library.inspection import (
     Inspect,
     check_classes,
     inspect_classifier,
-    torchvision_classifier,
+    named_classifier,
 )
 from trompe_server.library.intake import copy, identity_of, intake
 from trompe_server.library.shipped import list_shipped_classifiers, list_shipped_objects
@@ -34,11 +35,16 @@ class Library:
     """Uploads in ``folder``, and shipped things. References are ids, unique beginnings of ids, or names.
 
     ``cache``: local folder for files of a remote store that need a path; default: a temporary one.
-    ``inspect`` describes an uploaded classifier.
+    ``inspect`` describes a classifier. ``networks``: allowed networks by name, as patterns (``timm:*``).
     """
 
     def __init__(
-        self, folder: Folder | Path, *, cache: Path | None = None, inspect: Inspect = inspect_classifier
+        self,
+        folder: Folder | Path,
+        *,
+        cache: Path | None = None,
+        inspect: Inspect = inspect_classifier,
+        networks: Sequence[str] = (),
     ) -> None:
         folder = LocalArtifacts(folder) if isinstance(folder, Path) else folder
         self._objects = Catalogue("object", folder.within("objects"), ObjectInfo, list_shipped_objects)
@@ -50,6 +56,7 @@ class Library:
         """Calibrations of the target, shared by jobs."""
         self._cache = cache or Path(tempfile.gettempdir(), f"trompe-cache-{os.getuid()}")
         self._inspect = inspect
+        self._networks = networks
 
     def objects(self) -> list[ObjectInfo]:
         """All objects."""
@@ -103,13 +110,24 @@ class Library:
         return self._classifiers.all()
 
     def classifier(self, reference: str) -> ClassifierInfo:
-        """One classifier, or ``torchvision:NAME`` with its weights from the local cache.
+        """One classifier, or a network by name (``timm:NAME``).
 
-        Raises ``NotFoundError``, ``AmbiguousError``, or ``ClassifierError`` if torchvision has no such one.
+        Raises ``NotFoundError``, ``AmbiguousError``, or ``ClassifierError`` for a network by name that is not
+        allowed or cannot be loaded.
         """
         if reference.startswith(LOOKED_UP):
-            return torchvision_classifier(reference)
+            self._check_allowed(reference)
+            return named_classifier(reference, self._inspect)
         return self._classifiers.find(reference)
+
+    def _check_allowed(self, reference: str) -> None:
+        """Raise ``ClassifierError`` unless jobs may use the network by name."""
+        if not any(fnmatchcase(reference, pattern) for pattern in self._networks):
+            allowed = ", ".join(self._networks) or "none"
+            raise ClassifierError(
+                f"This service does not allow the network {reference!r}; it allows {allowed}. Its operator names "
+                "them in TROMPE_NETWORKS; or upload a .pt2 file."
+            )
 
     def classifier_path(self, reference: str) -> str:
         """Argument for ``load_classifier``: the path of an upload, or the name of any other classifier."""

@@ -2,6 +2,7 @@
 it opens. No torch.
 """
 
+import re
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -107,6 +108,12 @@ def check_same_classes(classifiers: Sequence[Classes]) -> None:
         _check_pair(first, other)
 
 
+def _same_class(one: str, other: str) -> bool:
+    """Whether one name has all words of the other, as "tench" and "tench, Tinca tinca"."""
+    words, others = (set(re.findall(r"\w+", name.casefold())) for name in (one, other))
+    return words <= others or others <= words
+
+
 def _check_pair(first: Classes, other: Classes) -> None:
     both = f"{first.name!r} and {other.name!r} cannot be attacked together:"
     if first.n_classes != other.n_classes:
@@ -116,7 +123,7 @@ def _check_pair(first: Classes, other: Classes) -> None:
     if first.classes is None or other.classes is None:
         return
     for index, (mine, its) in enumerate(zip(first.classes, other.classes, strict=True)):
-        if mine != its:
+        if not _same_class(mine, its):
             raise ClassifierError(
                 f"{both} class {index} is {mine!r} for one and {its!r} for the other; "
                 "name classifiers of the same classes in the same order."

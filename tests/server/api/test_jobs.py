@@ -54,6 +54,7 @@ def test_a_classifier_without_gradients_can_be_attacked_by_its_scores(stocked: A
     [
         pytest.param({"object": "trumpet"}, 404, "no object 'trumpet'", id="object"),
         pytest.param({"classifier": "resnet"}, 404, "no classifier 'resnet'", id="classifier"),
+        pytest.param({"classifier": "timm:resnet50"}, 422, "does not allow the network", id="network by name"),
         pytest.param({"judges": ["resnet"]}, 404, "no classifier 'resnet'", id="judge"),
         pytest.param({"label": "vaze"}, 422, "'net' has no class 'vaze'; did you mean 'vase'?", id="label"),
         pytest.param({"label": "zebra"}, 422, "or another network by `classifier`", id="other network"),

@@ -1,6 +1,5 @@
 """torchvision's networks by name: their own size and normalisation, and never random weights."""
 
-import importlib
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import pytest
 import torch
 from torch import nn
 
+from tests.torchvision_here import import_torchvision
 from trompe_server.classifiers import NetworkClassifier, load_classifier
 from trompe_server.classifiers.fold import Formatted
 from trompe_shared.errors import ClassifierError
@@ -17,17 +17,7 @@ from trompe_shared.errors import ClassifierError
 
 @pytest.fixture(scope="module")
 def models() -> Any:
-    """torchvision's networks. Where torchvision was built for another torch its compiled operators are missing; no
-    classification network uses one, so names for those that it looks for while it is imported are enough."""
-    try:
-        return importlib.import_module("torchvision.models")
-    except ImportError:
-        pytest.skip("torchvision is not installed")
-    except RuntimeError:
-        for name in ("nms", "qnms"):
-            schema = "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor"
-            torch.library.define(f"torchvision::{name}", schema)
-        return importlib.import_module("torchvision.models")
+    return import_torchvision()
 
 
 @pytest.fixture

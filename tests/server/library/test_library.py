@@ -117,3 +117,22 @@ def test_the_api_process_never_imports_torch_and_alembic_only_to_migrate() -> No
     script = f"import sys, {modules}; print('torch' in sys.modules, 'alembic' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False False"
+
+
+def test_jobs_name_networks_of_the_operators_list_only(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def inspect(reference: str) -> dict[str, object]:
+        asked.append(reference)
+        return {"white_box": True, "image_size": [8, 8], "n_classes": 2, "classes": None}
+
+    library = Library(tmp_path, inspect=inspect, networks=("timm:vit_*", "torchvision:resnet50"))
+    for reference in ("timm:vit_tiny", "torchvision:resnet50", "timm:vit_tiny"):
+        assert library.classifier(reference).id == reference
+    assert asked == ["timm:vit_tiny", "torchvision:resnet50"]
+    assert library.classifier_path("timm:vit_tiny") == "timm:vit_tiny"
+    for refused in ("timm:resnet50", "hf:org/model", "torchvision:resnet50x"):
+        with pytest.raises(ClassifierError, match=rf"does not allow the network '{refused}'; it allows timm:vit_\*, "):
+            library.classifier(refused)
+    with pytest.raises(ClassifierError, match="it allows none"):
+        Library(tmp_path).classifier("timm:vit_tiny")

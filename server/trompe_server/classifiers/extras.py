@@ -1,0 +1,30 @@
+"""Import of libraries that come with an extra."""
+
+import importlib
+from typing import Any
+
+import torch
+
+from trompe_shared.errors import ClassifierError
+
+__all__ = ["import_extra"]
+
+
+def import_extra(module: str, *, extra: str) -> Any:
+    """The module of a library that ``trompe[extra]`` installs.
+
+    Raises ``ClassifierError`` if it is missing, or if torchvision, on which it may depend, is built for another torch.
+    """
+    library = module.partition(".")[0]
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ClassifierError(
+            f"{library} is not installed or incomplete ({error}). Install the version for torch {torch.__version__} "
+            f"(the {extra!r} extra: pip install 'trompe[{extra}]'), or give a .pt2 file."
+        ) from error
+    except RuntimeError as error:
+        raise ClassifierError(
+            f"torchvision is installed, but for another build of torch than {torch.__version__} ({error}). "
+            "Install both from one index and for the same device, or give a .pt2 file."
+        ) from error

@@ -1,0 +1,226 @@
+"""Networks of timm, RobustBench and the Hugging Face hub by name, on random weights in caches made here."""
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import nn
+
+from tests.torchvision_here import import_torchvision
+from trompe_server import attack_object
+from trompe_server.attack import Budget, ViewDistribution
+from trompe_server.classifiers import NetworkClassifier, classifier_file, load_classifier, timm_networks
+from trompe_server.classifiers.registry import ZOOS
+from trompe_server.renderers import SailenvTarget
+from trompe_shared.errors import ClassifierError
+from trompe_shared.local_files import LOOKED_UP
+from trompe_shared.object3d import Object3D
+
+TAGS: Final = {
+    "vit_tiny_patch16_224": "vit_tiny_patch16_224.augreg_in21k_ft_in1k",
+    "mobilenetv3_small_050": "mobilenetv3_small_050.lamb_in1k",
+    "inception_v3": "inception_v3.tv_in1k",
+    "vit_tiny_patch16_384": "vit_tiny_patch16_384.augreg_in21k_ft_in1k",
+}
+"""Networks of timm and their repositories."""
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """Makes the folder of a repository in an empty cache of the Hugging Face hub, which cannot be reached."""
+    constants = pytest.importorskip("huggingface_hub.constants")
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+
+    def folder(repository: str) -> Path:
+        made = tmp_path / "hub" / f"models--{repository.replace('/', '--')}"
+        snapshot = made / "snapshots" / ("0" * 40)
+        snapshot.mkdir(parents=True)
+        (made / "refs").mkdir()
+        (made / "refs" / "main").write_text("0" * 40)
+        return snapshot
+
+    return folder
+
+
+@pytest.fixture
+def timm() -> Any:
+    import_torchvision()
+    return pytest.importorskip("timm")
+
+
+@pytest.fixture
+def stored(timm: Any, hub: Callable[[str], Path]) -> Callable[..., nn.Module]:
+    """Puts a network of timm with random weights where timm's hub keeps it, and returns it."""
+
+    def store(name: str, **options: Any) -> nn.Module:
+        from safetensors.torch import save_file
+
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            network: nn.Module = timm.create_model(name, pretrained=False, **options).eval()
+        save_file(network.state_dict(), hub(f"timm/{TAGS[name]}") / "model.safetensors")
+        return network
+
+    return store
+
+
+def test_every_prefix_has_a_loader() -> None:
+    assert tuple(ZOOS) == LOOKED_UP
+
+
+@pytest.mark.parametrize("name", TAGS)
+def test_images_are_normalised_as_timm_does(
+    name: str, timm: Any, stored: Callable[..., nn.Module], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """timm's resizing and cropping falls away: a renderer draws images at the network's size."""
+    network, seen = stored(name), dict[str, Any]()
+    monkeypatch.setattr(
+        timm_networks, "prepared_classifier", lambda whole, size, *_, **__: seen.update(w=whole, s=size)
+    )
+    load_classifier(f"timm:{name}")
+    seen["w"].network = nn.Identity()
+    image = np.random.default_rng(0).integers(0, 256, (*seen["s"], 3), np.uint8)
+    config = timm.data.resolve_model_data_config(network) | {"crop_pct": 1.0}
+    its = timm.data.create_transform(**config, is_training=False)(Image.fromarray(image))
+    ours = seen["w"](torch.from_numpy(image).permute(2, 0, 1)[None] / 255)[0]
+    torch.testing.assert_close(ours, its, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "side"), [("vit_tiny_patch16_224", 224), ("inception_v3", 299), ("vit_tiny_patch16_384", 384)]
+)
+def test_a_network_of_timm_has_its_own_size_and_the_classes_of_imagenet(
+    name: str, side: int, timm: Any, stored: Callable[..., nn.Module]
+) -> None:
+    network, classifier = stored(name), load_classifier(f"timm:{name}")
+    assert isinstance(classifier, NetworkClassifier)
+    assert (classifier.name, classifier.image_size, classifier.n_classes) == (name, (side, side), 1000)
+    assert classifier.classes is not None
+    assert classifier.classes[999] == "toilet tissue, toilet paper, bathroom tissue"
+    images = torch.rand((1, 3, side, side), generator=torch.Generator().manual_seed(1))
+    config = timm.data.resolve_model_data_config(network)
+    mean, std = (torch.tensor(config[key]).reshape(3, 1, 1) for key in ("mean", "std"))
+    with torch.no_grad():
+        expected = network((images - mean) / std)
+    torch.testing.assert_close(classifier.scores(images), expected, atol=1e-4, rtol=1e-3)
+    assert classifier_file(f"timm:{name}").name == "model.safetensors"
+
+
+def test_a_network_of_timm_takes_a_file_and_other_classes(
+    timm: Any, stored: Callable[..., nn.Module], tmp_path: Path
+) -> None:
+    file = tmp_path / "own.pth"
+    torch.save(stored("mobilenetv3_small_050", num_classes=3).state_dict(), file)
+    classifier = load_classifier("timm:mobilenetv3_small_050", weights=file, classes=["mug", "ball", "lamp"])
+    assert (classifier.n_classes, classifier.classes) == (3, ("mug", "ball", "lamp"))
+    with pytest.raises(ClassifierError, match=r"'own.pth' do not fit timm's 'mobilenetv3_small_050'"):
+        load_classifier("timm:mobilenetv3_small_050", weights=file)
+    with pytest.raises(ClassifierError, match=r"no file '.*absent.pth'"):
+        load_classifier("timm:mobilenetv3_small_050", weights=tmp_path / "absent.pth")
+
+
+def test_names_and_weights_that_are_nowhere_are_errors(timm: Any, hub: Callable[[str], Path]) -> None:
+    with pytest.raises(ClassifierError, match=r"timm has no network 'resnet5'; try one of .*resnet50"):
+        load_classifier("timm:resnet5")
+    with pytest.raises(ClassifierError, match=r"'model.safetensors' of 'timm/resnet18.*' is neither in the cache"):
+        load_classifier("timm:resnet18")
+    with pytest.raises(ClassifierError, match="expected ORG/MODEL"):
+        load_classifier("hf:../secret")
+    with pytest.raises(ClassifierError, match="leave out weights"):
+        load_classifier("hf:org/model", weights="x.pth")
+
+
+@pytest.mark.parametrize("prefix", [prefix for prefix in ZOOS if prefix != "torchvision:"])
+def test_without_its_library_a_name_says_what_to_install(prefix: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    extra = prefix.removesuffix(":")
+    for library in ("huggingface_hub", "robustbench", "timm", "pyautoattack"):
+        monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ClassifierError, match=rf"not installed or incomplete.*pip install 'trompe\[{extra}\]'"):
+        load_classifier(f"{prefix}org/model")
+
+
+def test_a_vision_transformer_by_name_is_attacked_end_to_end(
+    stored: Callable[..., nn.Module], mug: Object3D, target: SailenvTarget
+) -> None:
+    stored("vit_tiny_patch16_224")
+    network = load_classifier("timm:vit_tiny_patch16_224")
+    assert isinstance(network, NetworkClassifier)
+    views = ViewDistribution(distance=0.3, elevation=(10, 50)).sample(3, generator=np.random.default_rng(0))
+    label = int(network.predict(target.render(mug, views[:1], size=network.image_size)).argmax())
+    attacked = attack_object(
+        mug,
+        network,
+        label=label,
+        target=target,
+        views=views[:2],
+        held_out=views[2:],
+        budget=Budget(epsilon=0.5, alpha=0.1),
+        steps=4,
+        image_pipeline="none",
+    )
+    before, after = attacked.target.a_before, attacked.target.a_after
+    assert before is not None
+    assert after is not None
+    assert after < before
+
+
+def test_a_repository_of_transformers_is_a_white_box(hub: Callable[[str], Path]) -> None:
+    transformers = pytest.importorskip("transformers")
+    torch.manual_seed(0)
+    labels = {0: "tench, Tinca tinca", 1: "mug", 2: "lamp"}
+    shape = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 4, "intermediate_size": 64}
+    config = transformers.ViTConfig(**shape, image_size=32, patch_size=8, id2label=labels)
+    network = transformers.ViTForImageClassification(config).eval()
+    folder = hub("org/model")
+    network.save_pretrained(folder)
+    its = {"do_normalize": True, "image_mean": [0.5, 0.4, 0.3], "image_std": [0.5, 0.6, 0.7]}
+    (folder / "preprocessor_config.json").write_text(json.dumps(its | {"size": {"height": 32, "width": 32}}))
+    classifier = load_classifier("hf:org/model")
+    assert isinstance(classifier, NetworkClassifier)
+    assert (classifier.image_size, classifier.classes) == ((32, 32), tuple(labels.values()))
+    images = torch.rand((2, 3, 32, 32), generator=torch.Generator().manual_seed(1))
+    mean, std = (torch.tensor(its[key]).reshape(3, 1, 1) for key in ("image_mean", "image_std"))
+    with torch.no_grad():
+        expected = network((images - mean) / std).logits
+    torch.testing.assert_close(classifier.scores(images), expected, atol=1e-5, rtol=1e-4)
+    assert classifier_file("hf:org/model") == folder / "model.safetensors"
+
+
+def test_a_repository_with_a_pickle_is_refused(hub: Callable[[str], Path]) -> None:
+    folder = hub("org/model")
+    for name in ("preprocessor_config.json", "config.json"):
+        (folder / name).write_text("{}")
+    torch.save({}, folder / "pytorch_model.bin")
+    with pytest.raises(ClassifierError, match=r"'model.safetensors' of 'org/model'.*only safetensors are read"):
+        load_classifier("hf:org/model")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_network_of_robustbench_contains_its_normalisation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    models = import_torchvision()
+    pytest.importorskip("pyautoattack")
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    file = classifier_file("robustbench:Salman2020Do_R18")
+    os.makedirs(file.parent)
+    network = models.resnet18().eval()
+    torch.save(network.state_dict(), file)
+    classifier = load_classifier("robustbench:Salman2020Do_R18")
+    assert isinstance(classifier, NetworkClassifier)
+    assert (classifier.image_size, classifier.n_classes) == ((224, 224), 1000)
+    assert classifier.classes is not None
+    assert classifier.classes[999] == "toilet tissue"
+    images = torch.rand((1, 3, 224, 224), generator=torch.Generator().manual_seed(1))
+    mean, std = (torch.tensor(v).reshape(3, 1, 1) for v in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
+    with torch.no_grad():
+        expected = network((images - mean) / std)
+    torch.testing.assert_close(classifier.scores(images), expected, atol=1e-3, rtol=1e-3)
+    with pytest.raises(ClassifierError, match=r"no ImageNet network 'Salman'"):
+        load_classifier("robustbench:Salman")
