@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test chaos cluster compose check scoreboard audit format clean egl
+.PHONY: help demo test chaos cluster compose check scoreboard audit docs format clean egl
 
 help:
 	@echo "make demo    attack an object that comes with Trompe; results in trompe-demo/"
@@ -15,6 +15,7 @@ help:
 	@echo "make compose build the images and test the stack of docker-compose.yml (needs Docker)"
 	@echo "make scoreboard ROW=name  measure speed and accuracy (under 20 minutes; needs TROMPE_ASSETS)"
 	@echo "make audit   look for known faults in what is installed, and write its list to out/sbom.json"
+	@echo "make docs    build the documentation as a site in out/docs"
 	@echo "make check   format, lint, types, import rules"
 	@echo "make format  put the code into its form"
 	@echo "make clean   remove .venv, caches and trompe-demo/"
@@ -52,6 +53,9 @@ audit: $(VENV)/.installed-dev
 	$(VENV)/audit/bin/cyclonedx-py environment --output-format JSON --output-file out/sbom.json $(BIN)/python
 	$(BIN)/pip freeze --exclude-editable | sed 's/+cpu//' >out/installed.txt
 	$(VENV)/audit/bin/pip-audit --strict --no-deps --disable-pip -r out/installed.txt
+
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .

@@ -1,8 +1,9 @@
 """Code blocks of the pages in docs/."""
 
+import json
 import re
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 DOCS: Final = Path(__file__).parents[1] / "docs"
 
@@ -15,3 +16,12 @@ def blocks(page: str, language: str) -> list[tuple[str, str]]:
         if match[2] == language:
             found.append((heading, match[3]))
     return found
+
+
+def cells(notebook: str) -> list[str]:
+    """The code cells of a notebook."""
+    return ["".join(cell["source"]) for cell in _read(notebook)["cells"] if cell["cell_type"] == "code"]
+
+
+def _read(notebook: str) -> Any:
+    return json.loads((DOCS / notebook).read_text())
