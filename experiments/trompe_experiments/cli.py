@@ -11,6 +11,7 @@ import click
 from trompe_client._client import Client
 from trompe_client.cli.connection import out_option, server_option, service, token_option, with_client
 from trompe_client.cli.output import console, say
+from trompe_client.tracking import TRACKERS
 from trompe_experiments.about import estimated_seconds, in_words, write_about
 from trompe_experiments.design import experiment_file, load_experiment, shipped_experiments
 from trompe_experiments.plan import Plan, plan_experiment
@@ -36,7 +37,16 @@ def experiment() -> None:
 @token_option
 @click.option("--dry-run", is_flag=True, help="Check the file; print the number of jobs and an estimate of the time.")
 @click.option("--retry-failed", is_flag=True, help="Submit failed jobs of an earlier run again.")
-def run(file: str, out: Path | None, server: str | None, token: str | None, dry_run: bool, retry_failed: bool) -> None:
+@click.option("--track", type=click.Choice(list(TRACKERS)), help="Log each job as a run there.")
+def run(
+    file: str,
+    out: Path | None,
+    server: str | None,
+    token: str | None,
+    dry_run: bool,
+    retry_failed: bool,
+    track: str | None,
+) -> None:
     """Run the experiment of FILE: a .yaml, or the name of a shipped one.
 
     Run it again to continue a stopped run: only missing jobs are submitted.
@@ -44,13 +54,15 @@ def run(file: str, out: Path | None, server: str | None, token: str | None, dry_
     from trompe_experiments.judged import judge_all
     from trompe_experiments.progress import experiment_display
     from trompe_experiments.run import run_experiment
+    from trompe_experiments.tracking import Tracked
 
     started, plan = monotonic(), plan_experiment(load_experiment(file))
     folder = out or Path("experiments") / plan.experiment.name
     click.echo(_announcement(plan, folder))
     if dry_run:
         return
-    with service(server, token) as client, experiment_display(console(stderr=True)) as show:
+    with service(server, token) as client, experiment_display(console(stderr=True)) as display:
+        show = display if track is None else Tracked(display, TRACKERS[track])
         rows = run_experiment(plan, Service(client), folder, show=show, retry_failed=retry_failed)
         if plan.experiment.judgement is not None:
             judge_all(plan, Service(client), folder, seconds={row.key: row.seconds for row in rows}, show=click.echo)

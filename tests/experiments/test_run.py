@@ -35,8 +35,9 @@ from trompe_experiments.progress import experiment_display
 from trompe_experiments.service import Service
 from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, RowId, read_table
 from trompe_experiments.terminal import compared, differences, failures, read_results
+from trompe_experiments.tracking import Tracked
 from trompe_server.api.examples import RESULT
-from trompe_shared.api import Job, JobRequest, JobState, Problem, Progress, Result
+from trompe_shared.api import Job, JobRequest, JobSpec, JobState, Problem, Progress, Result
 from trompe_shared.errors import SpecError
 
 EXAMPLE = RESULT["content"]["application/json"]["example"]
@@ -408,6 +409,31 @@ def test_rows_of_other_jobs_that_nothing_else_is_left_of_are_never_overwritten(
     with pytest.raises(SpecError, match=r"rows of 2 jobs .* mug, epsilon 0.05, .* choose another --out"):
         ran(narrower, service, tmp_path)
     assert (tmp_path / RESULTS).read_bytes() == table
+
+
+def test_each_job_is_a_run_of_a_tracker(service: FakeService, tmp_path: Path) -> None:
+    runs: dict[str, list[object]] = {}
+
+    class Logged:
+        def __init__(self, name: str, spec: JobSpec) -> None:
+            self.said = runs[name] = [spec.paint.epsilon]
+
+        def progress(self, progress: Progress) -> None:
+            """A point of the curves."""
+
+        def end(self, result: Result | None, folder: Path | None = None) -> None:
+            self.said.append(result and result.target.a_drop)
+
+    service.failing = {"chair"}
+    show = Silent()
+    run_experiment(plan_of(), service, tmp_path, show=Tracked(show, Logged))
+    assert runs == {
+        "small  mug  epsilon 0.02": [0.02, 0.2],
+        "small  mug  epsilon 0.05": [0.05, 0.5],
+        "small  chair  epsilon 0.02": [0.02, None],
+        "small  chair  epsilon 0.05": [0.05, None],
+    }
+    assert len(show.ended) == 4
 
 
 def test_the_jobs_of_an_experiment_are_found_on_a_server(

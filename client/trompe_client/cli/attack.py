@@ -12,6 +12,7 @@ from trompe_client.cli.connection import out_option, server_option, service, tok
 from trompe_client.cli.following import deliver, follow, follow_our_own
 from trompe_client.cli.options import Sectioned, SectionOption, tag_option
 from trompe_client.cli.output import json_option, say
+from trompe_client.tracking import TRACKERS, tracked
 from trompe_shared.api import OPTIONS, VIEW_LIMITS, JobRequest, Needs, Option, ViewRanges, in_flags
 from trompe_shared.errors import SpecError
 
@@ -94,10 +95,17 @@ PARAMETERS: Final = [click.Argument(["object"]), *map(flag_of, OPTIONS.values())
 @tag_option("Label of your own, to find the job by. *")
 @click.option("--key", metavar="KEY", help="Submit once for this key, however often the command runs.")
 @click.option("--detach", is_flag=True, help="Submit and print the job's id; needs --server.")
+@click.option("--track", type=click.Choice(list(TRACKERS)), help="Log parameters, curves, result and files there.")
 @out_option(required=False, help="Folder for the results; required without --detach.")
 @json_option
 def attack(
-    server: str | None, token: str | None, key: str | None, detach: bool, out: Path | None, **options: Any
+    server: str | None,
+    token: str | None,
+    key: str | None,
+    detach: bool,
+    track: str | None,
+    out: Path | None,
+    **options: Any,
 ) -> None:
     """Attack OBJECT: a zip, a model file (.obj, .glb, .gltf, .fbx, .ply, .stl), a folder with one, or a stored object.
 
@@ -105,7 +113,7 @@ def attack(
     """
     try:
         plan = plan_attack(**{name: value for name, value in options.items() if value not in (None, (), {})})
-        _check_destination(server, detach=detach, out=out)
+        _check_destination(server, detach=detach, out=out, track=track)
     except SpecError as error:
         raise click.UsageError(in_flags(str(error))) from error
     if out is not None:
@@ -117,14 +125,17 @@ def attack(
         if out is None:
             say(job.status, lambda: f"Job {job.id} is submitted. Follow it: trompe watch {job.id} --server {server}")
             return
-        done = follow(job) if server else follow_our_own(job)
-        source = options["object"] if isinstance(plan.options["object"], Upload) else None
-        deliver(done, out, source=source, began=began, start_up=start_up)
+        with tracked(track, job, out) as log:
+            done = follow(job, also=log) if server else follow_our_own(job, also=log)
+            source = options["object"] if isinstance(plan.options["object"], Upload) else None
+            deliver(done, out, source=source, began=began, start_up=start_up)
 
 
-def _check_destination(server: str | None, *, detach: bool, out: Path | None) -> None:
+def _check_destination(server: str | None, *, detach: bool, out: Path | None, track: str | None) -> None:
     """Raise ``SpecError`` for results without a place, or with two."""
     if detach and (server is None or out is not None):
         raise SpecError("--detach leaves the job and its results on a server: add --server, and leave out --out.")
+    if detach and track is not None:
+        raise SpecError("--track follows the job: leave out --detach.")
     if not detach and out is None:
         raise SpecError("Add --out DIR for the results, or --detach to submit only.")

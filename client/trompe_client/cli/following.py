@@ -8,35 +8,43 @@ import click
 
 from trompe_client._delivery import in_the_form_of
 from trompe_client._job import JobHandle
-from trompe_client._progress import Progress, shown
+from trompe_client._progress import Progress, Show, shown
 from trompe_client.cli.output import as_json, console, print_json, say
 from trompe_shared.api import Event, JobState, JudgementSpec, in_flags
 from trompe_shared.errors import TrompeError
 
 
-def follow(job: JobHandle, *, timeout: float | None = None, progress: Progress = True) -> JobHandle:
-    """Follow a job on a running server. Ctrl-C leaves the job running and prints how to follow it again."""
+def follow(
+    job: JobHandle, *, timeout: float | None = None, progress: Progress = True, also: Show | None = None
+) -> JobHandle:
+    """Follow a job on a running server. Ctrl-C leaves the job running and prints how to follow it again.
+
+    ``also`` gets each event too.
+    """
     try:
-        return _wait(job, timeout, progress)
+        return _wait(job, timeout, progress, also)
     except KeyboardInterrupt:
         click.echo(f"\nJob {job.id} continues. Follow it: trompe watch {job.id} --server {job.server}", err=True)
         raise
 
 
-def _wait(job: JobHandle, timeout: float | None, progress: Progress) -> JobHandle:
+def _wait(job: JobHandle, timeout: float | None, progress: Progress, also: Show | None) -> JobHandle:
     """Wait for the end. Messages for people name flags."""
 
-    def with_flags(event: Event) -> Event:
-        return event.model_copy(update={"message": event.message and in_flags(event.message)})
+    def each(event: Event) -> None:
+        if also is not None:
+            also(event)
+        words = event.message and in_flags(event.message)
+        show(event.model_copy(update={"message": words}) if progress is True else event)
 
     with shown(progress) as show:
-        return job.wait(timeout, progress=(lambda event: show(with_flags(event))) if progress is True else show)
+        return job.wait(timeout, progress=each)
 
 
-def follow_our_own(job: JobHandle) -> JobHandle:
+def follow_our_own(job: JobHandle, *, also: Show | None = None) -> JobHandle:
     """Follow a job on the embedded server, which ends with the command: Ctrl-C cancels the job."""
     try:
-        return _wait(job, None, True)
+        return _wait(job, None, True, also)
     except KeyboardInterrupt:
         with suppress(TrompeError):
             job.cancel()
