@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test chaos cluster compose check scoreboard audit docs format clean egl
+.PHONY: help demo test chaos cluster compose check scoreboard audit docs release-check format clean egl
 
 help:
 	@echo "make demo    attack an object that comes with Trompe; results in trompe-demo/"
@@ -16,6 +16,7 @@ help:
 	@echo "make scoreboard ROW=name  measure speed and accuracy (under 20 minutes; needs TROMPE_ASSETS)"
 	@echo "make audit   look for known faults in what is installed, and write its list to out/sbom.json"
 	@echo "make docs    build the documentation as a site in out/docs"
+	@echo "make release-check  build wheel and sdist into dist/, check them, install the wheel and run the demo"
 	@echo "make check   format, lint, types, import rules"
 	@echo "make format  put the code into its form"
 	@echo "make clean   remove .venv, caches and trompe-demo/"
@@ -56,6 +57,22 @@ audit: $(VENV)/.installed-dev
 
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# What users install, in environments of its own: first without an extra, which names the missing one in one line.
+RELEASE := out/release
+release-check:
+	rm -rf dist $(RELEASE)
+	$(PYTHON) -m venv $(RELEASE)/tools
+	$(RELEASE)/tools/bin/pip install --quiet build twine
+	$(RELEASE)/tools/bin/python -m build --outdir dist
+	$(RELEASE)/tools/bin/twine check --strict dist/*
+	$(PYTHON) -m venv $(RELEASE)/bare
+	$(RELEASE)/bare/bin/pip install --quiet dist/*.whl
+	cd $(RELEASE) && ! bare/bin/trompe demo >said 2>&1 && cat said
+	test "$$(wc -l <$(RELEASE)/said)" = 1 && grep -qF "pip install 'trompe[server]'" $(RELEASE)/said
+	$(RELEASE)/bare/bin/pip install --quiet -c constraints.txt "$$(echo dist/*.whl)[server]"
+	cd $(RELEASE) && bare/bin/trompe demo --out demo && test -s demo/result.json
+	cd $(RELEASE) && bare/bin/trompe attack mug --label mug --epsilon 0.1 --steps 10 --grid --azimuths 3 --elevations 2 --out mug
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .
