@@ -79,7 +79,7 @@ def tracked(tracker: str | None, job: JobHandle, folder: Path | None) -> Iterato
     if tracker is None:
         yield lambda _event: None
         return
-    spec, result = job.status.spec, None
+    spec, result = job.status.attack, None
     run = TRACKERS[tracker](f"{job.status.names.get(spec.object, spec.object)} {job.id}", spec)
 
     def log(event: Event) -> None:

@@ -35,7 +35,7 @@ class FakeExecutor:
         return next((name for name in self._rooms if fits(needs, self._left(name))), None)
 
     def submit(self, claim: Claim) -> None:
-        deadly = claim.job.spec.goal.label == ["deadly"]
+        deadly = claim.job.attack.goal.label == ["deadly"]
         run = (lambda: "it died (signal 9)") if deadly else partial(run_here, self._setup, claim)
         self._running[self._threads.submit(run)] = claim
 

@@ -80,9 +80,9 @@ def checked_judgement(spec: JudgementRequest, services: Services) -> tuple[Judge
     networks = [services.library.classifier(name) for name in spec.networks]
     stored: list[ObjectInfo | ClassifierInfo] = [before, after, *networks]
     update = {
-        "before": _reference(before),
-        "after": _reference(after),
-        "networks": [_reference(network) for network in networks],
+        "before": before.reference,
+        "after": after.reference,
+        "networks": [network.reference for network in networks],
     }
     return spec.model_copy(update=update), {one.id: one.name for one in stored if not one.shipped}
 

@@ -25,7 +25,7 @@ class Effort:
 
     def is_like(self, job: Job) -> bool:
         """Whether ``job`` has the same views and steps, and about the same epsilon."""
-        spec = job.spec
+        spec = job.attack
         ratio = max(spec.paint.epsilon, self.epsilon) / max(min(spec.paint.epsilon, self.epsilon), 1e-6)
         return (spec.views.pool, spec.search.steps) == (self.pool, self.steps) and ratio <= CLOSE
 

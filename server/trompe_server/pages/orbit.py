@@ -44,7 +44,7 @@ def orbit(result: Result, job: str, classifiers: Sequence[ClassifierInfo]) -> Ma
 def painted(services: Services, job: Job, side: str) -> Object3D:
     """The object ``before`` or ``after`` the attack. Raises ``NotFoundError`` if it is not stored any more."""
     if side == "before":
-        return load_object(services.library.object_bytes(job.spec.object))
+        return load_object(services.library.object_bytes(job.attack.object))
     for ending in ARCHIVES:
         for name in job.artifacts:
             if name.endswith(ending):

@@ -32,7 +32,7 @@ from trompe_server.pages.serving import COOKIE, page, render
 from trompe_server.pages.turntable import TURNS, turntable
 from trompe_server.storage.database import DatabaseDownError
 from trompe_server.storage.tokens import hash_secret
-from trompe_shared.api import JOB_RESULT, Job, JobSpec, JobState, Result, in_parts
+from trompe_shared.api import JOB_RESULT, MANIFEST_PAGE, Job, JobSpec, JobState, Result, in_parts
 from trompe_shared.presets import PRESETS
 from trompe_shared.shipped import shipped_objects
 
@@ -133,17 +133,7 @@ def show_estimate(
 @router.get("/judgements/new")
 def new_judgement(request: Request, services: ServicesDep, job: str | None = None) -> HTMLResponse:
     """The form of a new judgement; of the result of ``job``, if it is given."""
-    attack = None if job is None else services.store.get(job)
-    given = None
-    if attack is not None:
-        spec = attack.attack
-        given = {
-            "before": spec.object,
-            "after": f"{JOB_RESULT}{attack.id}",
-            "label": spec.goal.label[0],
-            "network": spec.victim.classifier,
-            "epsilon": spec.paint.epsilon,
-        }
+    given = None if job is None else _painted(services.store.get(job))
     return page(request, "new_judgement.html", **_choices(services), given=given, suites=list(SUITES))
 
 
@@ -193,12 +183,15 @@ def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
 def result_file(request: Request, services: ServicesDep, job: str) -> Response:
     """The result as one HTML file to keep. It has scripts of its own, so it is not to be opened on this server."""
     found = services.store.get(job)
-    result = _result(services, found)
-    if result is None:
+    result, text = _result(services, found), ""
+    if result is not None:
+        names = Names(services.library)
+        known = names.classes(result.spec.victim.classifier)
+        text = offline_page(services, request.app.state.pictures, found, names.row(found), result, names=known)
+    elif MANIFEST_PAGE in found.artifacts:
+        text = services.artifacts(job).read(MANIFEST_PAGE).decode()
+    else:
         raise NotFoundError(f"Job {job} is {found.state} and has no result.")
-    names = Names(services.library)
-    known = names.classes(result.spec.victim.classifier)
-    text = offline_page(services, request.app.state.pictures, found, names.row(found), result, names=known)
     disposition = {"Content-Disposition": f'attachment; filename="{found.id}.html"'}
     return Response(text, media_type="text/html", headers=disposition)
 
@@ -309,6 +302,20 @@ def sign_out() -> Response:
     answer = RedirectResponse("/", status_code=303)
     answer.delete_cookie(COOKIE, httponly=True, samesite="strict")
     return answer
+
+
+def _painted(job: Job) -> dict[str, Any]:
+    """Values of the form for the result of an attack. Raises ``NotFoundError`` for a judgement."""
+    if not isinstance(job.spec, JobSpec):
+        raise NotFoundError(f"Job {job.id} is a judgement; the form takes the result of an attack.")
+    spec = job.spec
+    return {
+        "before": spec.object,
+        "after": f"{JOB_RESULT}{job.id}",
+        "label": spec.goal.label[0],
+        "network": spec.victim.classifier,
+        "epsilon": spec.paint.epsilon,
+    }
 
 
 def _choices(services: Services) -> dict[str, Any]:
