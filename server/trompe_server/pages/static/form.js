@@ -44,11 +44,11 @@ export async function upload(path, picked, select, place) {
 export const send = (path, body, headers = {}) =>
   ask(path, { method: "POST", body, headers: { "Content-Type": "application/json", ...headers } });
 
-// Submit what `request` gives as JSON, and go to the job.
+// Submit what `request` gives as JSON, and go to the job. Until then the button is disabled: the form has no address.
 export function submits(path, request) {
+  const button = form.querySelector(":scope > button");
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
-    const button = form.querySelector(":scope > button");
     button.disabled = true;
     try {
       const job = await send(path, request(), { "Idempotency-Key": keyOf(request()) });
@@ -58,4 +58,5 @@ export function submits(path, request) {
       button.disabled = false;
     }
   });
+  button.disabled = false;
 }
