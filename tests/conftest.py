@@ -44,6 +44,11 @@ def pytest_configure() -> None:
     register()
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """One process more than cores: many tests wait for other processes."""
+    return len(os.sched_getaffinity(0)) + 1
+
+
 def share_the_cores(processes: int) -> None:
     """Give each of several test processes, and their children, a share of the threads."""
     if processes > 1:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from tests.served import Served, wait_until
 from trompe_client import Client
@@ -38,6 +39,7 @@ def agree(one: Accuracy, other: Accuracy) -> bool:
     )
 
 
+@pytest.mark.thorough
 def test_a_job_is_judged_through_the_service_over_a_killed_worker(tmp_path: Path) -> None:
     with served(tmp_path, patience=120) as serve, Client(serve.url) as client:
         job = client.attack("mug", label="mug", **ATTACK).wait(timeout=240)

@@ -11,6 +11,7 @@ from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
 
+@pytest.mark.thorough
 def test_the_page_runs_from_its_beginning_to_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -105,6 +105,7 @@ def test_jobs_outlive_the_service(serve: Served) -> None:
     assert serve.get("/v1/jobs?state=succeeded")["jobs"][0]["id"] == job
 
 
+@pytest.mark.thorough
 def test_an_attack_whose_renderer_and_worker_are_killed_ends_with_the_same_bytes(tmp_path: Path) -> None:
     few = {"grid": True, "azimuths": 2, "elevations": 2, "held_out": 2, "steps": 30}
     spec = JobRequest.of("mug", label="mug", **few).model_dump(mode="json")

@@ -124,6 +124,7 @@ def test_a_renderer_without_our_extensions_is_sailenv(opening: Opening) -> None:
         assert opening.engines(("127.0.0.1", port)) == ["sailenv", "|"]
 
 
+@pytest.mark.thorough
 def test_one_paint_for_two_renderers_judged_by_a_third(
     tmp_path: Path, sharp: tuple[str, int], flat: tuple[str, int]
 ) -> None:

@@ -12,6 +12,7 @@ from trompe_shared.api import JobSpec
 SPEC = JobSpec.of("mug", label="mug", steps=1, grid=True, azimuths=4, elevations=2, held_out=2)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("disturbance", "reliable"),
     [

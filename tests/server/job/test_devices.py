@@ -43,7 +43,9 @@ def done(kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *, device: st
 
 
 @pytest.mark.usefixtures("no_pictures")
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[] if kind == "calibrated" else pytest.mark.thorough) for kind in KINDS]
+)
 def test_a_job_on_another_device_is_the_same_job(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = done(kind, tmp_path / "cpu", monkeypatch, device="cpu")
     found = done(kind, tmp_path / "other", monkeypatch, device=pretend_device(monkeypatch))

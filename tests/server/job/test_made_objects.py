@@ -43,11 +43,13 @@ def test_an_attack_repaints_glass_leaves_its_transparency_and_says_that_little_i
 @pytest.mark.parametrize(
     "made",
     [
-        pytest.param({"offset": (0.3, 0.5, -0.2)}, id="off centre"),
+        pytest.param({"offset": (0.3, 0.5, -0.2)}, id="off centre", marks=pytest.mark.thorough),
         pytest.param({"scale": 0.0005 / 0.127}, id="1 mm"),
-        pytest.param({"scale": 50 / 0.127, "offset": (0, 50, 0)}, id="100 m, its origin at the foot"),
-        pytest.param({"pieces": 40, "side": 32}, id="40 materials"),
-        pytest.param({"side": 0}, id="without textures"),
+        pytest.param(
+            {"scale": 50 / 0.127, "offset": (0, 50, 0)}, id="100 m, its origin at the foot", marks=pytest.mark.thorough
+        ),
+        pytest.param({"pieces": 40, "side": 32}, id="40 materials", marks=pytest.mark.thorough),
+        pytest.param({"side": 0}, id="without textures", marks=pytest.mark.thorough),
         pytest.param({"side": 1}, id="one texel"),
     ],
 )

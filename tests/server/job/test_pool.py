@@ -83,7 +83,9 @@ def test_an_attack_that_loses_few_of_the_further_views_adds_none(
     assert run.result.further_renders == 4
 
 
-@pytest.mark.parametrize("surrogate", ["diffuse", "calibrated", "curve"])
+@pytest.mark.parametrize(
+    "surrogate", ["diffuse", *(pytest.param(each, marks=pytest.mark.thorough) for each in ("calibrated", "curve"))]
+)
 def test_a_pool_grows_to_the_same_bytes_after_interruption(library: Library, surrogate: str) -> None:
     spec = spec_of(**HARD | {"surrogate": surrogate})
     once, anew = run_job(spec, library), run_job(spec, library, new=True, times=2)
@@ -91,6 +93,7 @@ def test_a_pool_grows_to_the_same_bytes_after_interruption(library: Library, sur
     assert anew.artifacts.lasting() == once.artifacts.lasting()
 
 
+@pytest.mark.thorough
 def test_held_out_views_cannot_influence_the_texture(library: Library) -> None:
     setup = setup_of(library, **HARD)
     honest, target = run_job(spec_of(**HARD), library), Recorder(setup.held_out)
@@ -129,6 +132,7 @@ def test_attacks_whose_choice_rests_on_all_views_start_with_all(library: Library
     assert (len(setup.views), setup.further) == (options.get("pool", 16), ())
 
 
+@pytest.mark.thorough
 def test_backgrounds_of_added_views_are_drawn_too(library: Library) -> None:
     spec = spec_of(**HARD, background=["white", "black", "#808080"])
     once, anew = run_job(spec, library), run_job(spec, library, new=True)

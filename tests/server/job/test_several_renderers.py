@@ -59,6 +59,7 @@ def test_the_headline_is_of_the_attacked_renderer_with_the_smallest_drop(run: Ru
     assert result.probe_renders == run.counts("calibrate")["target_renders"]
 
 
+@pytest.mark.thorough
 def test_one_paint_works_in_both_where_a_paint_for_one_fails_in_the_other(run: Run, library: Library) -> None:
     """The paint for both has a larger loss in the worse renderer than the paint for the first alone."""
     alone = run_job(spec_of(**SPEC), library, target=TARGETS["target"], judge_targets=TARGETS["more_targets"])
@@ -69,6 +70,7 @@ def test_one_paint_works_in_both_where_a_paint_for_one_fails_in_the_other(run: R
     assert kept[0] < kept[1]
 
 
+@pytest.mark.thorough
 def test_a_job_resumed_at_each_phase_gives_the_same_bytes(run: Run, library: Library) -> None:
     again = run_job(spec_of(**SPEC), library, new=True, times=2, **TARGETS)
     assert again.artifacts.lasting().keys() == run.artifacts.lasting().keys()
@@ -127,6 +129,7 @@ class NoisyTarget(FakeTarget):
         return images
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("no_pictures")
 def test_held_out_views_have_noise_that_the_attack_has_not_seen(library: Library) -> None:
     target, spec = NoisyTarget(), spec_of(surrogate="calibrated", steps=2)
@@ -158,6 +161,7 @@ def test_pictures_before_and_after_have_the_same_noise(library: Library) -> None
         assert abs(after - before).max() <= 2
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize(("levels", "advised"), [(3, False), (12, True)])
 def test_more_samples_are_advised_where_noise_is_strong(library: Library, levels: int, advised: bool) -> None:

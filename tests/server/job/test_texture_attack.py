@@ -307,6 +307,7 @@ def test_the_views_are_rasterised_while_the_renderer_is_busy_with_probes(
     assert prepared == [job.setup.views]
 
 
+@pytest.mark.thorough
 def test_a_calibration_serves_only_its_renderer_and_is_made_anew_if_damaged(
     library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -431,7 +432,14 @@ class Liar(FakeTarget):
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize(
     "options",
-    [WHOLE, {"tau": 0.05}, {"keep": 0.2}, {"image_pipeline": "transfer"}, {"optimiser": "pgd"}, {"pool": 12}],
+    [
+        WHOLE,
+        {"tau": 0.05},
+        *(
+            pytest.param(options, marks=pytest.mark.thorough)
+            for options in ({"keep": 0.2}, {"image_pipeline": "transfer"}, {"optimiser": "pgd"}, {"pool": 12})
+        ),
+    ],
     ids=str,
 )
 def test_the_images_of_the_judgement_cannot_influence_the_texture(library: Library, options: dict[str, Any]) -> None:
