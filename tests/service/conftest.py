@@ -40,6 +40,10 @@ def _running() -> Iterator[Any]:
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     """The URL of an empty database; a test runs once on each kind."""
+    return _empty_database(request, tmp_path)
+
+
+def _empty_database(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     if request.param == "sqlite":
         return f"sqlite:///{tmp_path / 'trompe.sqlite'}"
     url: str = request.getfixturevalue("shared_postgres").database()
@@ -79,10 +83,11 @@ def renderer() -> Iterator[int]:
         yield port
 
 
-@pytest.fixture
-def service(database_url: str, tmp_path: Path, renderer: int) -> Iterator[Any]:
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.thorough)])
+def service(request: pytest.FixtureRequest, tmp_path: Path, renderer: int) -> Iterator[Any]:
     """A service on each kind of database. Workers count as dead after ten seconds without a heartbeat, longer than a
     busy machine holds up a worker that lives."""
-    service = Service(Settings(data=tmp_path, database=database_url, silence=10.0), renderer)
+    database = _empty_database(request, tmp_path)
+    service = Service(Settings(data=tmp_path, database=database, silence=10.0), renderer)
     yield service
     service.store.close()
