@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from trompe_server.surrogate.fidelity import Fidelity, measure_fidelity
+from trompe_server.surrogate.rasterize import Visibility
 from trompe_server.surrogate.sampling import SamplingModel
 from trompe_server.surrogate.surrogate import (
     NO_BACKDROPS,
@@ -27,7 +28,7 @@ from trompe_server.surrogate.surrogate import (
 )
 from trompe_server.surrogate.tone import ToneMap, measure_tone_map
 from trompe_shared.api import SurrogateModel
-from trompe_shared.geometry import View
+from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
 from trompe_shared.opacity import opacity_of
 
@@ -54,6 +55,9 @@ TRIAL_VIEWS: Final = 4
 
 KEPT_BYTES: Final = 2**29
 """Bytes of operators kept from earlier hypotheses."""
+
+KEPT_RASTERS: Final = 2
+"""The best hypothesis and the one that is tried."""
 
 Image8 = NDArray[np.uint8]
 Ask = Callable[[Object3D, Sequence[View]], Image8]
@@ -383,6 +387,8 @@ class _Trial:
     """Images so far, by grey."""
     geometries: dict[SamplingModel, Geometry] = field(default_factory=dict)
     """Geometries of recent hypotheses; hypotheses with the same geometry share one."""
+    visible: dict[tuple[object, ...], dict[Camera, Visibility]] = field(default_factory=dict)
+    """Visible triangles of the ``KEPT_RASTERS`` most recent rasterisations, by the members that change them."""
 
     @classmethod
     def of(
@@ -458,11 +464,21 @@ class _Trial:
         size = (self.clean.shape[1], self.clean.shape[2])
         known = self.geometries.pop(key, None)
         made = key.but(kernel=sampling.kernel)
-        self.geometries[key] = known or prepare_geometry(self.obj, self.views, size=size, sampling=made)
+        self.geometries[key] = known or prepare_geometry(
+            self.obj, self.views, size=size, sampling=made, known=self._visible(sampling)
+        )
         while len(self.geometries) > 1 and sum(each.nbytes for each in self.geometries.values()) > KEPT_BYTES:
             del self.geometries[next(iter(self.geometries))]
         found = self.geometries[key]
         return found if found.sampling.kernel == sampling.kernel else refiltered(found, sampling.kernel)
+
+    def _visible(self, sampling: SamplingModel) -> dict[Camera, Visibility]:
+        """What earlier hypotheses found visible that differ from ``sampling`` in other members only."""
+        key = sampling.samples, sampling.shift, sampling.cull
+        self.visible[key] = self.visible.pop(key, {})
+        while len(self.visible) > KEPT_RASTERS:
+            del self.visible[next(iter(self.visible))]
+        return self.visible[key]
 
 
 _COLOURS: Final = ("encoding", "filtered", "mips", "slope", "edges")

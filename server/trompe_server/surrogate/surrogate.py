@@ -27,11 +27,11 @@ from trompe_server.surrogate.canvas import Canvas, canvas_of
 from trompe_server.surrogate.opacity import Opacities
 from trompe_server.surrogate.pixel_filter import KernelName, PixelFilter, kernel_of
 from trompe_server.surrogate.pyramid import MipChain, MipLayout, mip_chains, mip_layout, read_texels
-from trompe_server.surrogate.rasterize import Mesh, mesh_of, project, rasterize
+from trompe_server.surrogate.rasterize import Mesh, Visibility, mesh_of, project, rasterize
 from trompe_server.surrogate.sampling import FilteredGather, Gather, SamplingModel, Taps, fragments_of, taps_of
 from trompe_server.surrogate.shading import Chord, DiffuseShading, Shading, decode, encode, fit_curve, lambert
 from trompe_server.surrogate.tone import ToneMap, fit_tone
-from trompe_shared.geometry import View, spherical
+from trompe_shared.geometry import Camera, View, spherical
 from trompe_shared.object3d import Object3D
 
 __all__ = [
@@ -127,12 +127,25 @@ def prepare_geometry(
     size: tuple[int, int],
     sampling: SamplingModel,
     device: torch.device | str = "cpu",
+    known: dict[Camera, Visibility] | None = None,
 ) -> Geometry:
-    """Rasterise ``obj`` once for all ``views`` and images of ``size`` (H, W)."""
+    """Rasterise ``obj`` once for all ``views`` and images of ``size`` (H, W).
+
+    known: the visible triangles of hypotheses with the same ``samples``, ``shift`` and ``cull``. Views of an opaque
+    object are looked up there, and added.
+    """
     mesh = mesh_of(obj, device=device)
     layout = mip_layout([obj.textures[name].shape[:2] for name in mesh.textures])
     opacities = Opacities.of(mesh, sampling)
-    prepared = [_prepare_view(mesh, layout, opacities, view, size, sampling) for view in views]
+
+    def visible(camera: Camera) -> Visibility:
+        if opacities is not None or known is None:
+            return _visible(mesh, opacities, camera, size, sampling)
+        if camera not in known:
+            known[camera] = _visible(mesh, None, camera, size, sampling)
+        return known[camera]
+
+    prepared = [_prepare_view(mesh, layout, opacities, view, visible(view.camera), size, sampling) for view in views]
     reads = _in_order_of_reading([view.taps.index for view in prepared], layout)
     starts = itertools.chain.from_iterable(layout.starts)
     texels = torch.cat([level + start for level, start in zip(reads, starts, strict=True)])
@@ -172,24 +185,30 @@ class _View:
     shade: Float[Tensor, "pixels 1"]
 
 
+def _visible(
+    mesh: Mesh, opacities: Opacities | None, camera: Camera, size: tuple[int, int], sampling: SamplingModel
+) -> Visibility:
+    size = (size[0] * sampling.subdivision, size[1] * sampling.subdivision)
+    planes = project(mesh, camera, size, cull=sampling.cull)
+    drawn, blended = None, None
+    if opacities is not None:
+        drawn = partial(opacities.drawn, planes)
+        blended = None if opacities.blended is None else opacities.blended[planes.face]
+    return rasterize(planes, size, sampling.positions, drawn=drawn, blended=blended)
+
+
 def _prepare_view(
     mesh: Mesh,
     layout: MipLayout,
     opacities: Opacities | None,
     view: View,
+    visibility: Visibility,
     size: tuple[int, int],
     sampling: SamplingModel,
 ) -> _View:
-    size = (size[0] * sampling.subdivision, size[1] * sampling.subdivision)
-    planes = project(mesh, view.camera, size, cull=sampling.cull)
-    samples = sampling.positions
-    drawn, blended, alpha = None, None, None
-    if opacities is not None:
-        drawn = partial(opacities.drawn, planes)
-        if opacities.blended is not None:
-            blended, alpha = opacities.blended[planes.face], opacities.of_fragments
-    visibility = rasterize(planes, size, samples, drawn=drawn, blended=blended)
-    fragments = fragments_of(visibility, mesh, size[1], samples=samples, shade_at=sampling.shade_at, alpha=alpha)
+    width, samples = size[1] * sampling.subdivision, sampling.positions
+    alpha = None if opacities is None or opacities.blended is None else opacities.of_fragments
+    fragments = fragments_of(visibility, mesh, width, samples=samples, shade_at=sampling.shade_at, alpha=alpha)
     n_pixels = len(visibility.pixel)
     normals = (fragments.barycentric.clamp(0, 1)[..., None] * mesh.normals[fragments.face]).sum(1)
     towards = torch.from_numpy(spherical(view.light.azimuth, view.light.elevation)).float().to(normals.device)

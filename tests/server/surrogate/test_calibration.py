@@ -18,6 +18,7 @@ from trompe_server.surrogate.calibration import (
     CALIBRATED_GREYS,
     CURVE_GREYS,
     SATISFYING,
+    TRIAL_VIEWS,
     Calibration,
     build_surrogate,
     calibrate,
@@ -27,6 +28,7 @@ from trompe_server.surrogate.calibration import (
 )
 from trompe_server.surrogate.calibration_file import pack_calibration, unpack_calibration
 from trompe_server.surrogate.fidelity import MAX_ERROR, MIN_EXPLAINED, Fidelity, measure_fidelity
+from trompe_server.surrogate.rasterize import Planes, Samples, Visibility, rasterize
 from trompe_server.surrogate.shading import ENCODERS, decode, encode
 from trompe_server.surrogate.tone import ToneMap, measure_tone_map
 from trompe_shared.api import SurrogateModel
@@ -142,6 +144,34 @@ def test_the_sampling_of_a_known_target_is_recovered(busy_mug: Object3D, truth: 
     assert calibration.fidelity.mean()["explained"] > 0.98
     assert calibration.fidelity.mean()["slope"] == pytest.approx(1, abs=0.03)
     assert calibration.fidelity.mean()["correlation"] > 0.98
+
+
+def test_hypotheses_that_see_the_same_triangles_rasterise_them_once(
+    busy_mug: Object3D, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rasterised: list[object] = []
+
+    def counting(planes: Planes, size: tuple[int, int], samples: Samples, **options: Any) -> Visibility:
+        rasterised.append((samples, len(planes.face)))
+        return rasterize(planes, size, samples, **options)
+
+    clean = USUAL(busy_mug, VIEWS)
+    monkeypatch.setattr("trompe_server.surrogate.surrogate.rasterize", counting)
+    calibrate(busy_mug, VIEWS, clean, USUAL, wanted="auto", generator=np.random.default_rng(0))
+    # USUAL's own two geometries; three kinds of samples, both sides of triangles, and the best again after those.
+    assert len(rasterised) <= TRIAL_VIEWS * (2 + 3 + 1 + 2)
+
+
+def test_triangles_known_from_another_hypothesis_make_the_same_geometry(mug: Object3D) -> None:
+    known: dict[Camera, Visibility] = {}
+    for model in (SamplingModel(), SamplingModel(lod="area", bias=0.5), SamplingModel(shade_at="centroid")):
+        shared = prepare_geometry(mug, VIEWS, size=SIZE, sampling=model, known=known)
+        alone = prepare_geometry(mug, VIEWS, size=SIZE, sampling=model)
+        for one, other in zip(shared.batches, alone.batches, strict=True):
+            texels = torch.rand(sum(map(len, alone.reads)), 3, generator=torch.Generator().manual_seed(0))
+            assert torch.equal(one.gather.forward(texels), other.gather.forward(texels))
+            assert torch.equal(one.pixel, other.pixel)
+    assert len(known) == len({view.camera for view in VIEWS})
 
 
 def test_a_view_in_which_hardly_anything_changes_does_not_outweigh_all_others(mug: Object3D) -> None:
