@@ -1,14 +1,16 @@
 """``result.json``."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from trompe_server.classifiers import Classifier
-from trompe_server.image_pipelines import SUITE, ImagePipeline
+from trompe_server.image_pipelines import SUITE
 from trompe_server.job.report.data import ReportData
 from trompe_server.job.report.outcome import classes_of_fooled, neighbour_warning
 from trompe_server.job.report.warnings import warnings_of
@@ -31,6 +33,9 @@ from trompe_shared.api import (
 
 __all__ = ["result_of", "worst"]
 
+S = TypeVar("S")
+T = TypeVar("T")
+
 
 def worst(seen: Sequence[ReportData]) -> ReportData:
     """The attacked renderer with the smallest ``a_drop``, on held-out views if there are any; the first of equals."""
@@ -47,6 +52,9 @@ def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
     """The result, with ``warnings`` before its own, but without its ``seconds``. ``seen``: one for each renderer."""
     data = worst(seen)
     spec, setup = data.spec, data.setup
+    beside = ThreadPoolExecutor(1, thread_name_prefix="visibility")
+    visibility = beside.submit(_visibility, data)  # needs no network
+    beside.shutdown(wait=False)
     became = classes_of_fooled(data)
     synonyms = neighbour_warning(became, data.target, data.held_out)
     names = [setup.judge.class_name(label) for label in setup.labels] if setup.classifier.classes else None
@@ -74,15 +82,12 @@ def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
         transfer_gap=transfer_gap(data.predicted, data.target),
         **_agreement(data),
         judges=[_judgement(_judge(network, data), data) for network in setup.judges],
-        image_pipelines=[
-            PipelineJudgement(pipeline=name, held_out=_through(pipeline, data))
-            for name, pipeline in (SUITE if setup.held_out and data.after is not None else {}).items()
-        ],
+        image_pipelines=_through_suite(data),
         **_calibration_fields(data),
         probe_renders=sum(each.calibration.renders for each in seen if each.calibration is not None),
         attacked_views=len(setup.views) + data.spent.added,
         further_renders=data.spent.renders,
-        **_visibility(data).model_dump(),
+        **visibility.result().model_dump(),
         goal_reached=_goal_reached(data),
         evaluations=data.spent.evaluations,
         queries=data.spent.queries,
@@ -144,11 +149,29 @@ def _judgement(judge: Judge, data: ReportData) -> Judgement:
     return Judgement(classifier=judge.network.name, target=judged("own"), held_out=held_out)
 
 
-def _through(pipeline: ImagePipeline, data: ReportData) -> Accuracy:
-    """Accuracy through ``pipeline`` on every second held-out view: all of them would take a fifth of a job's time."""
-    assert data.after is not None
-    shown = (pipeline.shown(each["held_out"][::2]) for each in (data.before, data.after))
-    return data.setup.judge.accuracy(*map(data.setup.classifier.predict, shown))
+def _through_suite(data: ReportData) -> list[PipelineJudgement]:
+    """Accuracy through each pipeline of the suite on every second held-out view: all would take a fifth of a job.
+
+    The images of the next pipeline are made while the network sees those of one.
+    """
+    if data.after is None or not data.setup.held_out:
+        return []
+    seen = [images["held_out"][::2] for images in (data.before, data.after)]
+    shown = _ahead(lambda pipeline: [pipeline.shown(images) for images in seen], SUITE.values())
+    predict, judge = data.setup.classifier.predict, data.setup.judge
+    judged = (judge.accuracy(*map(predict, images)) for images in shown)
+    return [PipelineJudgement(pipeline=name, held_out=found) for name, found in zip(SUITE, judged, strict=True)]
+
+
+def _ahead(make: Callable[[S], T], items: Iterable[S]) -> Iterator[T]:
+    """``make`` of each item in order; a thread makes the next one meanwhile."""
+    with ThreadPoolExecutor(1, thread_name_prefix="ahead") as executor:
+        made: deque[Future[T]] = deque()
+        for item in items:
+            made.append(executor.submit(make, item))
+            if len(made) > 1:
+                yield made.popleft().result()
+        yield from (each.result() for each in made)
 
 
 def _calibration_fields(data: ReportData) -> dict[str, Any]:
