@@ -239,7 +239,8 @@ def _statements(parts: tuple[Part, ...], library: str | None) -> Iterator[str]:
 def parse_mtl(text: str) -> dict[str, dict[str, str]]:
     """Maps of each material of an MTL text: ``{name: {"albedo": file, "normal": file}}``, files without folders.
 
-    Transparent materials have ``map_d`` (a file), ``d`` or ``tr`` (numbers), too; see ``dissolve``.
+    Transparent materials have ``map_d`` (a file), ``d`` or ``tr`` (numbers), too; see ``dissolve``. Raises
+    ``ObjectError`` for a map that is scaled or moved.
     """
     keys = {"map_kd": "albedo", "map_bump": "normal", "bump": "normal", "norm": "normal"}
     keys |= {key: key for key in ("map_d", "d", "tr")}
@@ -254,8 +255,19 @@ def parse_mtl(text: str) -> dict[str, dict[str, str]]:
         elif words[0].lower() in keys:
             # Options (-bm 1.0) precede the file name, then the last word. A name with blanks has no options.
             name = words[1].strip() if not words[1].startswith("-") else words[1].split()[-1]
+            if _moves(words[1].removesuffix(name)):
+                raise ObjectError(
+                    f"The MTL scales or moves the texture {name!r} ({words[1].strip()[:80]}), which is not supported; "
+                    "apply that to the texture coordinates in a modelling program."
+                )
             current[keys[words[0].lower()]] = name.replace("\\", "/").rsplit("/", 1)[-1]
     return materials
+
+
+def _moves(options: str) -> bool:
+    """Whether the options of a map change its scale (``-s``, by default 1 1 1) or its place (``-o``, 0 0 0)."""
+    given = re.findall(r"-([so])((?:\s+[-+]?[\d.]+(?:e[-+]?\d+)?)+)", options.lower())
+    return any(float(number) != (flag == "s") for flag, numbers in given for number in numbers.split())
 
 
 def dissolve(maps: Mapping[str, str], material: str) -> float | None:

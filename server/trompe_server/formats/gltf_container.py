@@ -145,10 +145,17 @@ def _document(text: bytes) -> Document:
     if not document.asset.version.startswith("2."):
         raise ObjectError(f"The glTF has version {document.asset.version[:20]!r}; export it as glTF 2.0.")
     unread = [name for name in document.extensions_required if not name.startswith(READ_EXTENSIONS)]
-    unread += [name for name in document.extensions_required if name == "KHR_materials_pbrSpecularGlossiness"]
     if unread:
         raise ObjectError(
-            f"The glTF requires {', '.join(unread)[:200]}, which is not supported; export it without compression."
+            f"The glTF requires {', '.join(unread)[:200]}, which is not supported; export it uncompressed, with PNG or "
+            "JPEG textures and without extensions."
+        )
+    if older := [
+        material.name or f"number {k}" for k, material in enumerate(document.materials) if material.colour_unread
+    ]:
+        raise ObjectError(
+            f"The glTF's materials {', '.join(older)[:200]} have their colours in KHR_materials_pbrSpecularGlossiness, "
+            "which glTF gave up; convert them to metallic-roughness, e.g. by `npx @gltf-transform/cli metalrough`."
         )
     return document
 

@@ -126,6 +126,7 @@ class _Editor:
         self._binary = bytearray(container.buffers[0]) if self._has_own_chunk() else bytearray()
         self._files = dict(container.upload.files)
         self._extra = bytearray()
+        self._binary_before = bytes(self._binary)
         self._serving = _users_of_images(self.document)
 
     def _has_own_chunk(self) -> bool:
@@ -249,9 +250,10 @@ class _Editor:
             self.add("buffers", {"byteLength": len(self._extra), "uri": _data_uri(self._extra, _BYTES)})
         if self._binary:
             self.document["buffers"][0]["byteLength"] = len(self._binary)
-        if self.document == self._before and self._files == upload.files:
+        same = self.document == self._before  # as if unpainted, if a new image has the length of the old one
+        if same and self._binary == self._binary_before and self._files == upload.files:
             return upload
-        text = self._container.text if self.document == self._before else _dumped(self.document, self._container.text)
+        text = self._container.text if same else _dumped(self.document, self._container.text)
         main = self._packed(text) if self._container.binary else text
         return Upload(upload.main, self._files | {upload.main: main}, upload.packed)
 

@@ -159,6 +159,12 @@ class Pbr(_Part):
     metallic_roughness_texture: TextureInfo | None = None
 
 
+class MaterialExtensions(_Part):
+    """The extension of a material that replaces its base colour."""
+
+    specular_glossiness: Any = Field(default=None, alias="KHR_materials_pbrSpecularGlossiness")
+
+
 class Material(_Part):
     """The supported properties of a material."""
 
@@ -168,6 +174,12 @@ class Material(_Part):
     alpha_mode: Literal["OPAQUE", "MASK", "BLEND"] = "OPAQUE"
     alpha_cutoff: Annotated[float, Field(ge=0.0, le=1e3)] = 0.5
     double_sided: bool = False
+    extensions: MaterialExtensions = MaterialExtensions()
+
+    @property
+    def colour_unread(self) -> bool:
+        """Whether only the older specular-glossiness extension tells the colour."""
+        return self.extensions.specular_glossiness is not None and self.pbr == Pbr()
 
     @property
     def maps(self) -> tuple[TextureInfo, ...]:

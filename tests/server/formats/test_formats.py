@@ -78,6 +78,23 @@ def test_a_colour_becomes_a_texture_and_the_obj_stays() -> None:
 
 
 @pytest.mark.parametrize(
+    ("options", "moved"),
+    [
+        pytest.param("-s 1.000 1.0 1 -o 0.0 0 0 -bm 2", False, id="the defaults"),
+        pytest.param("-s 2 2 1", True, id="scaled"),
+        pytest.param("-clamp on -o 0.25 0 0", True, id="moved"),
+    ],
+)
+def test_a_texture_that_the_mtl_scales_or_moves_is_refused(options: str, moved: bool) -> None:
+    mtl = f"newmtl red\nmap_Kd {options} red.png\n".encode()
+    data = pack_zip({"t.obj": OBJ.encode(), "t.mtl": mtl, "red.png": encode_png(PICTURE)})
+    if moved:
+        assert f"scales or moves the texture 'red.png' ({options} red.png)" in refusal(data, "t.zip")
+    else:
+        assert (next(iter(read_object(data, name="t.zip").obj.textures.values())) == PICTURE).all()
+
+
+@pytest.mark.parametrize(
     ("lines", "opacity", "alpha"),
     [
         pytest.param("d 0.3", 0.3, None, id="d"),

@@ -253,6 +253,10 @@ def test_what_cannot_be_shown_is_refused_with_a_reason() -> None:
     both.square(both.material(both.texture(GRADIENT)), COLOR_0=shade)
     assert "bake" in refusal(both.to_glb(), "scene.glb")
 
+    older = textured(extensions={"KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": {"index": 0}}})
+    del older.document["materials"][0]["pbrMetallicRoughness"]
+    assert "convert them to metallic-roughness" in refusal(older.to_glb(), "scene.glb")
+
     empty = textured()
     empty.document["nodes"] = [{}]
     assert "no triangles" in refusal(empty.to_glb(), "scene.glb")
@@ -264,6 +268,18 @@ def test_what_cannot_be_shown_is_refused_with_a_reason() -> None:
 def test_an_unchanged_object_gives_the_same_bytes() -> None:
     data = textured(factor=[0.5, 1.0, 1.0, 1.0]).to_glb()
     assert repainted(data, read(data)) == data
+
+
+def test_paint_as_long_as_the_image_before_comes_back() -> None:
+    """Incompressible pictures of one size are PNGs of one length, so that nothing changes in the JSON."""
+    random = np.random.default_rng(0)
+    before, after = (random.integers(0, 256, (16, 16, 3), dtype=np.uint8) for _ in range(2))
+    assert len(encode_png(before)) == len(encode_png(after))
+    data = textured(before).to_glb()
+    obj = read(data)
+    (name,) = obj.textures
+    (image,) = read(repainted(data, obj.with_textures({name: after}))).textures.values()
+    assert (image == after).all()
 
 
 def test_only_the_base_colour_image_changes() -> None:
