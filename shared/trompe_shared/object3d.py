@@ -301,7 +301,7 @@ def object_from_files(files: Mapping[str, bytes]) -> Object3D:
     """Read an object from the files of its archive. Raises ``ObjectError``."""
     mesh = _mesh_name(files)
     name = mesh[: -len(".obj")]
-    parts = parse_obj(files[mesh].decode("utf-8", "replace"), mesh)
+    parts = parse_obj(files[mesh].decode("utf-8-sig", "replace"), mesh)
     if not any(np.ptp(part.vertices, axis=0).any() for part in parts):
         raise ObjectError(f"{mesh!r} has no extent: all its corners are in one place.")
     materials = _materials(name, files)
@@ -353,7 +353,7 @@ def _materials(name: str, files: Mapping[str, bytes]) -> dict[str, Material]:
     materials = {}
     for file in files:
         if file.lower().endswith(".mtl"):
-            for material, maps in parse_mtl(files[file].decode("utf-8", "replace")).items():
+            for material, maps in parse_mtl(files[file].decode("utf-8-sig", "replace")).items():
                 if "albedo" in maps:
                     opacity = dissolve(maps, material)
                     materials[material] = Material(material, maps["albedo"], maps.get("normal"), opacity=opacity)

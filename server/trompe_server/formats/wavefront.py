@@ -11,6 +11,7 @@ from trompe_server.formats.comparison import repainted
 from trompe_server.formats.pictures import decode, shrink, with_alpha_of
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
+from trompe_shared.local_files import PICTURE_SUFFIXES
 from trompe_shared.object3d import Object3D, decode_alpha, decode_rgb, encode_png, object_from_files
 from trompe_shared.wavefront import Part, Surface, obj_text, parse_mtl, parse_surfaces
 
@@ -63,8 +64,10 @@ def complete(files: Mapping[str, bytes]) -> dict[str, bytes]:
     Complete files stay unchanged. An MTL gets the missing lines; a changed OBJ is rewritten.
     """
     mesh = next(name for name in files if name.lower().endswith(".obj"))
-    libraries = {name: data.decode("utf-8", "replace") for name, data in files.items() if name.lower().endswith(".mtl")}
-    surfaces = parse_surfaces(files[mesh].decode("utf-8", "replace"), mesh)
+    libraries = {
+        name: data.decode("utf-8-sig", "replace") for name, data in files.items() if name.lower().endswith(".mtl")
+    }
+    surfaces = parse_surfaces(files[mesh].decode("utf-8-sig", "replace"), mesh)
     return _Completion(mesh, dict(files), libraries, surfaces).files_of()
 
 
@@ -75,7 +78,7 @@ def dissolved(files: Mapping[str, bytes]) -> dict[str, bytes]:
     """
     masks: dict[str, str] = {}
     for name, data in files.items():
-        tables = parse_mtl(data.decode("utf-8", "replace")).values() if name.lower().endswith(".mtl") else ()
+        tables = parse_mtl(data.decode("utf-8-sig", "replace")).values() if name.lower().endswith(".mtl") else ()
         for albedo, mask in ((maps.get("albedo", ""), maps.get("map_d", "")) for maps in tables):
             if albedo in files and mask in files and masks.setdefault(albedo, mask) != mask:
                 raise ObjectError(
@@ -107,6 +110,7 @@ class _Completion:
     def files_of(self) -> dict[str, bytes]:
         """The completed files."""
         if not self._libraries:
+            self._refuse_unnamed_pictures()
             self._surfaces = [_renamed(surface) for surface in self._surfaces]
             names = dict.fromkeys(surface.material for surface in self._surfaces)
             self._libraries = {self._library: "".join(f"newmtl {name}\n" for name in names)}
@@ -118,6 +122,15 @@ class _Completion:
             changed |= {name: text.encode() for name, text in self._libraries.items()}
             changed[self._mesh] = obj_text(tuple(self._parts), library=self._library).encode()
         return self._files | changed
+
+    def _refuse_unnamed_pictures(self) -> None:
+        """Raise ``ObjectError`` if the mesh is ready for a picture that no material names."""
+        pictures = [name for name in self._files if name.lower().endswith(tuple(PICTURE_SUFFIXES))]
+        if pictures and any(surface.uvs is not None and surface.colours is None for surface in self._surfaces):
+            raise ObjectError(
+                f"There is no .mtl beside {self._mesh!r}, so nothing says what {sorted(pictures)[:4]} is for. Add the "
+                ".mtl, with map_Kd for the albedo, or leave the pictures away for a plain object."
+            )
 
     def _add(self, surface: Surface) -> None:
         maps = {name: found for text in self._libraries.values() for name, found in parse_mtl(text).items()}

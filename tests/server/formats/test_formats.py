@@ -77,6 +77,19 @@ def test_a_colour_becomes_a_texture_and_the_obj_stays() -> None:
     assert obj.textures["red_albedo.png"][0, 0].tolist() == [188, 0, 0]
 
 
+def test_a_picture_that_no_material_names_is_refused() -> None:
+    files = {"t.obj": OBJ.encode(), "t.png": encode_png(PICTURE)}
+    assert "no .mtl beside 't.obj'" in refusal(pack_zip(files), "t.zip")
+
+
+def test_a_byte_order_mark_costs_no_first_line() -> None:
+    mesh = "v 0 0 0\nv 1 0 0\nv 0 1 0\nmtllib o.mtl\nusemtl m\nf 1 2 3\n".encode("utf-8-sig")
+    files = {"o.obj": mesh, "o.mtl": "newmtl m\nKd 1 0 0\n".encode("utf-8-sig")}
+    obj = read_object(pack_zip(files), name="o.zip").obj
+    assert [len(part.vertices) for part in obj.parts] == [3]
+    assert [texture[0, 0].tolist() for texture in obj.textures.values()] == [[255, 0, 0]]
+
+
 @pytest.mark.parametrize(
     ("options", "moved"),
     [
