@@ -12,8 +12,6 @@ from typing import Final
 
 from trompe_shared.api import JobSpec
 
-__all__ = ["ABOUT", "SOURCE", "estimated_seconds", "in_words", "write_about"]
-
 ABOUT, SOURCE = "about.json", "experiment.yaml"
 
 RENDER: Final = 0.02

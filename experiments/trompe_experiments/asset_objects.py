@@ -7,8 +7,6 @@ from typing import Any
 
 from trompe_shared.errors import ObjectError
 
-__all__ = ["AssetObject", "asset_objects"]
-
 
 @dataclass(frozen=True)
 class AssetObject:

@@ -10,8 +10,6 @@ from trompe_experiments.markdown import figure_words, markdown_table
 from trompe_experiments.style import MARKERS, PALETTE, Drawing, drawing
 from trompe_shared.comparison import average, grouped
 
-__all__ = ["baselines_chart", "baselines_markdown"]
-
 
 def baselines_chart(rows: Sequence[JudgedRow]) -> Drawing:
     """A line for each method: a small dot with its interval for each object, a large one for their mean."""

@@ -10,8 +10,6 @@ from trompe_experiments.style import MARKERS, PALETTE, Drawing, drawing
 from trompe_experiments.table import ResultRow
 from trompe_shared.comparison import average, grouped
 
-__all__ = ["between_chart", "between_markdown"]
-
 NOTHING: Final = "nothing"
 """Images as they were rendered."""
 

@@ -20,8 +20,6 @@ from trompe_experiments.service import Service
 if TYPE_CHECKING:
     from trompe_experiments.table import ResultRow
 
-__all__ = ["experiment"]
-
 _folder = click.argument("folder", metavar="DIR", type=click.Path(exists=True, file_okay=False, path_type=Path))
 
 

@@ -28,8 +28,6 @@ from trompe_shared.errors import SpecError
 from trompe_shared.faults import Fault, faults_of
 from trompe_shared.presets import PRESETS
 
-__all__ = ["AssetsFolder", "Experiment", "expanded", "experiment_file", "load_experiment", "shipped_experiments"]
-
 ELSEWHERE: Final = {"object": "list objects under `objects`", "seed": "list seeds under `seeds`"}
 """Options of a job that a file sets in another place."""
 ALLOWED: Final = [*(name for name in OPTIONS if name not in ELSEWHERE), "priority", "needs"]

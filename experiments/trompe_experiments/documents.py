@@ -17,8 +17,6 @@ from trompe_experiments.figures import FIGURES, read_data
 from trompe_experiments.table import RESULTS
 from trompe_shared.errors import SpecError
 
-__all__ = ["fill", "outdated"]
-
 BLOCK = re.compile(r"(<!-- trompe: (\w+) of (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 

@@ -8,8 +8,6 @@ from trompe_experiments.style import MARKERS, PALETTE, Drawing, drawing
 from trompe_experiments.table import ResultRow
 from trompe_shared.comparison import average, grouped
 
-__all__ = ["engines_chart", "engines_markdown"]
-
 OWN: Final = "the service's own"
 """Renderers of jobs that named none."""
 

@@ -19,8 +19,6 @@ from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, Result
 from trompe_shared.comparison import grouped
 from trompe_shared.errors import SpecError
 
-__all__ = ["FIGURES", "Data", "Kind", "figures_of", "histogram_rows", "plain_rows", "read_data"]
-
 MOST_PANELS = 12
 
 

@@ -10,8 +10,6 @@ from trompe_experiments.table import PredictionRow, ResultRow
 from trompe_shared.comparison import grouped
 from trompe_shared.errors import SpecError
 
-__all__ = ["prediction_histograms"]
-
 TOP = 6
 COLUMNS = 3
 

@@ -13,8 +13,6 @@ from trompe_server.renderers import TargetRenderer
 from trompe_server.storage.folders import LocalArtifacts
 from trompe_shared.api import ADVERSARIAL, JobSpec, Result
 
-__all__ = ["Change", "Done", "run_job"]
-
 Change = Callable[[WhiteBoxClassifier], WhiteBoxClassifier]
 """Replacement of each attacked network."""
 

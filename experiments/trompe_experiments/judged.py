@@ -19,8 +19,6 @@ from trompe_shared.comparison import grouped
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
 
-__all__ = ["JUDGEMENTS", "NOISE", "NOTHING", "JudgedRow", "judge_all", "noised", "read_judgements"]
-
 JUDGEMENTS: Final = "judgements.csv"
 NOTHING, NOISE = "no change", "noise"
 """What is judged beside the painted objects: the object itself, and random noise within the budget."""

@@ -4,8 +4,6 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-__all__ = ["NOT_APPLICABLE", "cells_of", "figure_words", "markdown_row", "markdown_table"]
-
 DELIMITERS: Final = {"l": "---", "r": "---:"}
 
 NOT_APPLICABLE: Final = "n.a."

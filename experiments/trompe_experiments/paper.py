@@ -21,19 +21,6 @@ from trompe_experiments.table import ResultRow
 from trompe_shared.api import FEW_RECOGNISED
 from trompe_shared.comparison import average, grouped
 
-__all__ = [
-    "Cell",
-    "PaperCell",
-    "by_texels",
-    "paper_means_markdown",
-    "paper_numbers",
-    "recognised",
-    "table_one",
-    "table_one_chart",
-    "table_one_markdown",
-    "texels_words",
-]
-
 SUBSTITUTED: Final = "inception_v3"
 """The paper's network that we do not have."""
 MEAN: Final = f"**mean** where A_before ≥ {FEW_RECOGNISED:g}"

@@ -14,8 +14,6 @@ from trompe_experiments.style import GREY, INK, MARKERS, PALETTE, Drawing, drawi
 from trompe_experiments.table import ResultRow
 from trompe_shared.comparison import Job, Mean, charged, grouped, means_of, pareto_front
 
-__all__ = ["configurations", "pareto_markdown", "speed_accuracy_chart"]
-
 Cost = Literal["seconds", "evaluations", "delta_e", "dissimilarity"]
 Place = tuple[str, str]
 """Series and configuration."""

@@ -16,8 +16,6 @@ from trompe_shared.local_files import CLASSIFIER_SUFFIXES, PICTURE_SUFFIXES
 from trompe_shared.presets import PRESETS
 from trompe_shared.shipped import shipped_objects
 
-__all__ = ["CASE", "LABEL", "Plan", "Row", "plan_experiment"]
-
 LABEL, CASE = "experiment", "case"
 """Labels of an experiment's jobs."""
 FILE_SUFFIXES: Final = {*CLASSIFIER_SUFFIXES, *PICTURE_SUFFIXES}

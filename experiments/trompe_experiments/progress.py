@@ -12,8 +12,6 @@ from trompe_experiments.plan import Row
 from trompe_experiments.run import Finished, Show
 from trompe_shared.api import Job, JobState
 
-__all__ = ["experiment_display"]
-
 
 @contextmanager
 def experiment_display(console: Console) -> Iterator[Show]:

@@ -18,8 +18,6 @@ from trompe_experiments.markdown import cells_of, figure_words
 from trompe_experiments.table import RESULTS, SEPARATOR, ResultRow
 from trompe_shared.comparison import average
 
-__all__ = ["write_report"]
-
 PICTURES: Final = {
     "contact_sheet.png": "Before and after, view by view",
     "saliency_object.png": "Saliency on the objects",

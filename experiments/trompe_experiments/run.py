@@ -34,8 +34,6 @@ from trompe_experiments.table import (
 from trompe_shared.api import Job, JobState, Result
 from trompe_shared.errors import SpecError
 
-__all__ = ["Finished", "Show", "run_experiment"]
-
 PAUSE: Final = 1.0
 """Seconds between two polls of the jobs."""
 LOCK: Final = ".lock"

@@ -10,8 +10,6 @@ from trompe_experiments.style import INK, MARKERS, PALETTE, Drawing, drawing
 from trompe_experiments.table import ResultRow
 from trompe_shared.comparison import grouped
 
-__all__ = ["texels_scatter"]
-
 
 class _Dot(NamedTuple):
     panel: str

@@ -9,8 +9,6 @@ from trompe_client._plan import Upload
 from trompe_experiments.plan import LABEL
 from trompe_shared.api import Job, JobRequest, JudgementRequest, Manifest, Result
 
-__all__ = ["Service"]
-
 
 class Service:
     """Runs jobs on a Trompe server through the SDK. Every method raises ``ClientError``."""

@@ -12,21 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pydantic import BaseModel
 
-__all__ = [
-    "BLUE",
-    "GREEN",
-    "GREY",
-    "INK",
-    "MARKERS",
-    "ORANGE",
-    "PALETTE",
-    "RED",
-    "Drawing",
-    "drawing",
-    "drawing_in_rows",
-    "stamp_of",
-]
-
 INK: Final = "#262626"
 GREY: Final = "#999999"
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"

@@ -9,8 +9,6 @@ from trompe_experiments.style import GREY, MARKERS, PALETTE, Drawing, drawing
 from trompe_experiments.table import ResultRow
 from trompe_shared.comparison import average, grouped
 
-__all__ = ["surrogates_chart", "surrogates_markdown", "surrogates_of"]
-
 
 def surrogates_of(rows: Sequence[ResultRow]) -> list[str]:
     """The surrogates of the rows, in their order."""

@@ -17,21 +17,6 @@ from trompe_experiments.markdown import NOT_APPLICABLE, figure_words
 from trompe_shared.api import OPTIONS, Accuracy, JobSpec, JobState, Option, Result
 from trompe_shared.errors import SpecError
 
-__all__ = [
-    "PREDICTIONS",
-    "REFUSED",
-    "RESULTS",
-    "SEPARATOR",
-    "TO_RETRY",
-    "PredictionRow",
-    "ResultRow",
-    "RowId",
-    "job_key",
-    "prediction_rows",
-    "read_table",
-    "write_table",
-]
-
 RESULTS, PREDICTIONS = "results.csv", "predictions.csv"
 """File names in the folder of an experiment."""
 REFUSED: Final = "refused"

@@ -15,8 +15,6 @@ from trompe_experiments.table import RESULTS, ResultRow, read_table
 from trompe_shared.comparison import average, grouped
 from trompe_shared.errors import SpecError
 
-__all__ = ["Difference", "compared", "comparison_table", "differences", "failures", "read_results", "results_table"]
-
 FIGURES: Final = ("target_a_drop", "held_out_a_drop", "transfer_gap", "texels_altered", "seconds")
 CHANGED: Final = 0.1
 """Smallest difference of ``a_drop`` that is counted."""

@@ -7,8 +7,6 @@ from trompe_experiments.plan import Row
 from trompe_experiments.run import Finished, Show
 from trompe_shared.api import Job, JobSpec
 
-__all__ = ["Tracked"]
-
 
 class Tracked:
     """A display whose jobs are runs of a tracker too. Finished jobs of an earlier run are not logged again."""

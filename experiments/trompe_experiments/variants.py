@@ -23,8 +23,6 @@ from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import ShippedObject, shipped_objects
 
-__all__ = ["ATTACK", "Variant", "clean", "export_variants", "photographs"]
-
 CLEAN: Final = "clean"
 TEST_SHARE: Final = 0.2
 VIEW_STREAM: Final = 11

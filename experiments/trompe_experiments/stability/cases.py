@@ -15,8 +15,6 @@ from trompe_experiments.plan import Plan, plan_experiment
 from trompe_experiments.stability import AFTERWARDS, REFERENCE
 from trompe_experiments.stability.disturbed import bfloat16, quantised, saturated
 
-__all__ = ["CASES", "MEASURED", "UNFORESEEN", "Case", "stability_plan"]
-
 NAME: Final = "stability_targets"
 BASE: Final[Mapping[str, Any]] = {"classifier": "tiny", "epsilon": 0.05, "pool": 120, "steps": 20, "held_out": 100}
 

@@ -13,8 +13,6 @@ from trompe_experiments.style import BLUE, GREEN, GREY, INK, RED, Drawing, drawi
 from trompe_experiments.table import SEPARATOR, ResultRow
 from trompe_shared.comparison import average, grouped
 
-__all__ = ["Behaviour", "behaviours", "stability_chart", "stability_markdown"]
-
 FINE: Final = 0.8
 """Share of the undisturbed held-out drop below which a case breaks."""
 TRUSTED_GAP: Final = 0.1

@@ -20,8 +20,6 @@ from trompe_server.image_pipelines import ImagePipeline
 from trompe_server.renderers import SailenvTarget, local_renderer
 from trompe_shared.geometry import FIELD_OF_VIEW, look_rotation
 
-__all__ = ["Disturbance", "DisturbedEngine", "disturbed_renderer"]
-
 NAME: Final = "trompe_experiments.stability.disturbed_engine:DisturbedEngine"
 Picture = NDArray[np.uint8]
 Levels = NDArray[np.float64]

@@ -18,8 +18,6 @@ from trompe_shared.api import Job, JobRequest, JobSpec, JobState, Result
 from trompe_shared.errors import TrompeError
 from trompe_shared.object3d import load_object
 
-__all__ = ["DisturbedService"]
-
 
 class DisturbedService(Service):
     """Runs each job when it is submitted. The label ``case`` names its disturbance; without one, ``target`` renders."""

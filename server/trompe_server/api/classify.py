@@ -13,8 +13,6 @@ from trompe_server.library.classification import Networks
 from trompe_server.spec.labels import resolve_labels
 from trompe_shared.api import Classification
 
-__all__ = ["RATE", "router"]
-
 RATE: Final = 20.0
 """Requests per second of each token, or of each address without one."""
 MOST_BYTES: Final = 4 * 2**20

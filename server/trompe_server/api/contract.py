@@ -8,8 +8,6 @@ from fastapi.openapi.utils import get_openapi
 from trompe_server.api.guard import OPEN_PATHS
 from trompe_shared.api import Event, Problem
 
-__all__ = ["contract"]
-
 _REFERENCES: Final = "#/components/schemas/{model}"
 _OF_FASTAPI: Final = ("HTTPValidationError", "ValidationError")
 

@@ -15,8 +15,6 @@ from fastapi.responses import Response, StreamingResponse
 from trompe_server.api.problems import problem_response
 from trompe_server.storage.folders import JobArtifacts
 
-__all__ = ["Digests", "send_file", "zip_stream"]
-
 PART: Final = 256 * 2**10
 REMEMBERED: Final = 10_000
 _RANGE: Final = re.compile(r"bytes=(\d*)-(\d*)")

@@ -11,8 +11,6 @@ from trompe_server.api.services import StoreDep
 from trompe_server.errors import NotFoundError
 from trompe_shared.api import ExperimentInfo, JobList
 
-__all__ = ["LABEL", "router"]
-
 router = APIRouter(prefix="/v1/experiments", tags=["experiments"], responses=PROBLEMS)
 
 LABEL: Final = "experiment"

@@ -7,8 +7,6 @@ from trompe_server.api.problems import PROBLEMS
 from trompe_server.api.services import ServicesDep, StoreDep
 from trompe_shared.api import RendererInfo, WorkerInfo
 
-__all__ = ["router"]
-
 router = APIRouter(prefix="/v1", tags=["workers"], responses=PROBLEMS)
 
 

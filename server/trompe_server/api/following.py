@@ -13,8 +13,6 @@ from trompe_server.queue.store import JobStore
 from trompe_server.storage.database import DatabaseDownError
 from trompe_shared.api import Event
 
-__all__ = ["follow"]
-
 logger = logging.getLogger(__name__)
 
 INTERVAL: Final = 0.25

@@ -20,8 +20,6 @@ from trompe_server.api.problems import problem_response
 from trompe_server.api.rate import RateLimit
 from trompe_server.storage.tokens import Right, Token, Tokens, hash_secret
 
-__all__ = ["COOKIE", "OPEN_PATHS", "Guard"]
-
 OPEN_PATHS: Final = frozenset({"/docs", "/openapi.json", "/healthz", "/readyz", "/login", "/logout"})
 """Paths without a token: health, documentation, sign-in and sign-out."""
 OPEN_FOLDER: Final = "/static/"

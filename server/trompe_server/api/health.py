@@ -7,8 +7,6 @@ from trompe_server.api import examples
 from trompe_server.api.problems import PROBLEMS, problem_response
 from trompe_server.api.services import ServicesDep
 
-__all__ = ["router"]
-
 router = APIRouter(tags=["health"], responses=PROBLEMS)
 
 

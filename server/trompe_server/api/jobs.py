@@ -20,9 +20,6 @@ from trompe_server.queue.store import JobStore
 from trompe_shared.api import Job, JobList, JobRequest, JobState, JudgementRequest, JudgementSpec, Result
 from trompe_shared.errors import SpecError
 
-__all__ = ["NEW_OR_KNOWN", "RESULT", "Cursor", "IdempotencyKey", "Limit", "create", "labels_of", "router", "send"]
-__all__ += ["with_result"]
-
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=PROBLEMS)
 
 RESULT: Final = "result.json"

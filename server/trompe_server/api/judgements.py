@@ -13,8 +13,6 @@ from trompe_server.api.submission import checked_judgement
 from trompe_server.errors import NotFoundError
 from trompe_shared.api import MANIFEST, MANIFEST_PAGE, Job, JudgementRequest, JudgementSpec, Manifest
 
-__all__ = ["router"]
-
 router = APIRouter(prefix="/v1/judgements", tags=["judgements"], responses=PROBLEMS)
 
 PAGE_HEADERS: Final = {

@@ -14,8 +14,6 @@ from trompe_server.api.services import LibraryDep
 from trompe_shared.api import BackgroundInfo, ClassifierInfo, ObjectInfo
 from trompe_shared.errors import SpecError
 
-__all__ = ["UPLOADS", "router"]
-
 T = TypeVar("T")
 
 UPLOADS: Final = 2

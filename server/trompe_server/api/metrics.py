@@ -16,8 +16,6 @@ from trompe_server.api.problems import PROBLEMS
 from trompe_server.api.services import ServicesDep
 from trompe_server.queue.store import Statistics
 
-__all__ = ["HttpMetrics", "router"]
-
 router = APIRouter(tags=["health"], responses=PROBLEMS)
 
 METHODS: Final = frozenset({"DELETE", "GET", "HEAD", "POST"})

@@ -13,8 +13,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from trompe_server.api.metrics import HttpMetrics
 from trompe_server.api.problems import REQUEST_ID, failure_response, problem_response
 
-__all__ = ["BodyLimit", "Envelope", "Failures"]
-
 logger = logging.getLogger(__name__)
 
 HEADERS: Final = {

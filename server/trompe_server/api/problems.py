@@ -18,8 +18,6 @@ from trompe_shared.api import Problem
 from trompe_shared.errors import TrompeError
 from trompe_shared.faults import faults_of
 
-__all__ = ["PROBLEMS", "REQUEST_ID", "answer_with_problems", "failure_response", "problem_response"]
-
 logger = logging.getLogger(__name__)
 
 REQUEST_ID: Final = "X-Request-ID"

@@ -4,8 +4,6 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-__all__ = ["BURST", "RateLimit"]
-
 BURST: Final = 20.0
 """Seconds of requests that an idle client may make at once."""
 MAX_CLIENTS: Final = 10_000

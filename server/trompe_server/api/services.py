@@ -14,8 +14,6 @@ from trompe_server.storage.folders import Folder, JobArtifacts, job_artifacts
 from trompe_server.storage.tokens import Tokens
 from trompe_shared.api import RendererInfo
 
-__all__ = ["DigestsDep", "LibraryDep", "Services", "ServicesDep", "StoreDep"]
-
 
 @dataclass(frozen=True)
 class Services:

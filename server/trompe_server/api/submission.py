@@ -29,8 +29,6 @@ from trompe_shared.colours import colour_of
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import decode_rgb
 
-__all__ = ["checked_judgement", "checked_spec"]
-
 Spec = TypeVar("Spec", bound=JobSpec)
 
 

@@ -31,8 +31,6 @@ from torch.export.pt2_archive._package import load_pt2
 
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["read_program"]
-
 MEMBER: Final = re.compile(
     r"models/model\.json|data/(weights|constants)/(weight_\d+|tensor_\d+|model_\w+_config\.json)"
     r"|data/sample_inputs/model\.pt|extra/.*|archive_format|archive_version|byteorder|\.data/\w+",

@@ -10,8 +10,6 @@ from trompe_server.classifiers.fold import accelerate
 from trompe_server.classifiers.protocol import refuse_probabilities
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["Normalised", "broken", "check_contract", "describe_value", "prepared", "sample_images"]
-
 CONTRACT: Final = "input image float32 NCHW in [0, 1] with a dynamic batch, output logits (N, classes)"
 
 

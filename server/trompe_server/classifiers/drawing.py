@@ -5,8 +5,6 @@ from hashlib import blake2b
 import torch
 from torch import Tensor
 
-__all__ = ["generator_for", "seeded_generator"]
-
 
 def generator_for(images: Tensor, seed: int) -> torch.Generator:
     """A CPU generator seeded by every bit of the images and of ``seed`` (64 bits, signed).

@@ -10,8 +10,6 @@ from trompe_server.classifiers.protocol import WhiteBoxClassifier, Wrapper, resi
 from trompe_server.spec.checks import check_same_classes
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["ResizedClassifier", "as_ensemble", "resized"]
-
 
 @dataclass(frozen=True)
 class ResizedClassifier(Wrapper):

@@ -15,8 +15,6 @@ from trompe_server.classifiers.fold import accelerate
 from trompe_server.classifiers.network import NetworkClassifier
 from trompe_server.classifiers.protocol import check_classes
 
-__all__ = ["load_exported"]
-
 
 def load_exported(
     path: Path, *, name: str | None = None, classes: Sequence[str] | None = None, device: str = "cpu"

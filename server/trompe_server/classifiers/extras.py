@@ -7,8 +7,6 @@ import torch
 
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["import_extra"]
-
 
 def import_extra(module: str, *, extra: str) -> Any:
     """The module of a library that ``trompe[extra]`` installs.

@@ -16,8 +16,6 @@ from jaxtyping import Float
 from torch import Tensor, fx, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
-__all__ = ["Formatted", "accelerate", "fold_batch_norm"]
-
 TOLERANCE: Final = 1e-4
 """Largest allowed difference of a logit, relative to the largest logit."""
 CONVOLUTION: Final = torch.ops.aten.conv2d.default

@@ -7,8 +7,6 @@ from typing import Final
 from trompe_server.classifiers.extras import import_extra
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["WEIGHTS", "hub_file"]
-
 WEIGHTS: Final = "model.safetensors"
 REPOSITORY: Final = re.compile(r"\w[\w.-]*/\w[\w.-]*", re.ASCII)
 

@@ -13,8 +13,6 @@ from trompe_server.classifiers.hub import WEIGHTS, hub_file
 from trompe_server.classifiers.network import NetworkClassifier, prepared_classifier
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["huggingface_weights", "load_huggingface"]
-
 
 class _Logits(nn.Module):
     """A network of transformers that returns its logits alone."""

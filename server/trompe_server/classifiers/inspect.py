@@ -14,8 +14,6 @@ from trompe_server.classifiers.protocol import WhiteBoxClassifier
 from trompe_server.classifiers.registry import load_classifier
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["main"]
-
 
 def main(arguments: Sequence[str]) -> int:
     """Print the JSON line for the file or name in ``arguments``; return the exit code."""

@@ -11,8 +11,6 @@ from torch import Tensor, nn
 from trompe_server.classifiers.contract import prepared
 from trompe_server.classifiers.protocol import Images, Logits, check_classes, finite, fit_images, in_batches
 
-__all__ = ["NetworkClassifier", "prepared_classifier"]
-
 BATCH = 10
 
 

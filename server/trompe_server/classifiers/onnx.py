@@ -22,8 +22,6 @@ from trompe_server.classifiers.protocol import (
 )
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["OnnxClassifier", "load_onnx"]
-
 BATCH: Final = 10
 CONTRACT: Final = "input image float32 NCHW in [0, 1], output logits (N, classes)"
 

@@ -12,19 +12,6 @@ from torch.nn import functional as F
 
 from trompe_shared.errors import ClassifierError
 
-__all__ = [
-    "Classifier",
-    "ScoringClassifier",
-    "WhiteBoxClassifier",
-    "Wrapper",
-    "check_classes",
-    "finite",
-    "fit_images",
-    "in_batches",
-    "refuse_probabilities",
-    "resize",
-]
-
 HUGE: Final = 1e30
 """Replacement for an infinite logit."""
 

@@ -32,8 +32,6 @@ from trompe_server.classifiers.vision import load_torchvision, torchvision_weigh
 from trompe_shared.errors import ClassifierError
 from trompe_shared.local_files import LOOKED_UP
 
-__all__ = ["LOADERS", "classifier_file", "load_classifier"]
-
 LOADERS: Final[Mapping[str, Callable[..., Classifier]]] = {".pt2": load_exported, ".onnx": load_onnx}
 """By the ending of the file."""
 

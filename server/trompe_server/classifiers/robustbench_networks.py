@@ -13,8 +13,6 @@ from trompe_server.classifiers.extras import import_extra
 from trompe_server.classifiers.network import NetworkClassifier, prepared_classifier
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["load_robustbench", "robustbench_weights"]
-
 DATASET = "imagenet"
 
 

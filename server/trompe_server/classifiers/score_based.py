@@ -23,8 +23,6 @@ from trompe_server.classifiers.drawing import generator_for
 from trompe_server.classifiers.protocol import Classifier, ScoringClassifier, Wrapper
 from trompe_shared.errors import ClassifierError, SpecError
 
-__all__ = ["ScoreBasedClassifier", "score_based"]
-
 
 @dataclass
 class ScoreBasedClassifier(Wrapper):

@@ -11,8 +11,6 @@ from trompe_server.classifiers.hub import WEIGHTS, hub_file
 from trompe_server.classifiers.network import NetworkClassifier, prepared_classifier
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["load_timm", "timm_weights"]
-
 
 def load_timm(
     model: str,

@@ -14,8 +14,6 @@ from torch import Tensor, nn
 
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["CLASSES", "IMAGE_SIZE", "WEIGHTS", "TinyNet", "load_tiny", "save_tiny"]
-
 CLASSES: Final = ("ball", "book", "bottle", "chair", "lamp", "mug", "table", "teapot")
 """Class names in the order of the logits."""
 IMAGE_SIZE: Final = (128, 128)

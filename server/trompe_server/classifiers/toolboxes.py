@@ -15,8 +15,6 @@ from trompe_server.classifiers.network import NetworkClassifier
 from trompe_server.classifiers.protocol import check_classes
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["from_art", "from_foolbox"]
-
 
 class _Rescaled(nn.Module):
     """A function of images in ``bounds`` as a network of images in [0, 1]."""

@@ -18,8 +18,6 @@ from trompe_server.classifiers.extras import import_extra
 from trompe_server.classifiers.network import NetworkClassifier, prepared_classifier
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["load_torchvision", "read_weights", "torchvision_weights"]
-
 
 class _LocalWeights:
     """An entry of torchvision's table of weights with tensors from a local file and other class names."""

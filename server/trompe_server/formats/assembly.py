@@ -15,17 +15,6 @@ from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Material, Object3D, encode_png, object_from_files
 from trompe_shared.wavefront import LARGEST, Part, Surface, obj_text
 
-__all__ = [
-    "DEFAULT_COLOUR",
-    "assemble",
-    "check_numbers",
-    "flat_picture",
-    "free_name",
-    "painted_flat",
-    "painted_object",
-    "safe_name",
-]
-
 DEFAULT_COLOUR: Final = tuple(linear_rgb(np.full(3, 204, np.uint8)).tolist())
 """Linear colour of surfaces without one: light grey."""
 

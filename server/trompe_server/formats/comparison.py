@@ -6,8 +6,6 @@ from trompe_server.formats.pictures import Pixels, shrink
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D
 
-__all__ = ["repainted"]
-
 
 def repainted(original: Object3D, painted: Object3D) -> dict[str, Pixels]:
     """The textures (H, W, 3) of ``painted``, by name, with colours different from ``original``.

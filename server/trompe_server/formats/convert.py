@@ -13,8 +13,6 @@ from trompe_server.formats.registry import read_object, repaint_file
 from trompe_shared.errors import TrompeError
 from trompe_shared.object3d import load_object
 
-__all__ = ["main"]
-
 
 def _read(file: str, name: str, max_texture: str, archive: str) -> dict[str, object]:
     imported = read_object(Path(file).read_bytes(), name=name, max_texture=int(max_texture) or None)

@@ -23,8 +23,6 @@ from trompe_server.formats.wavefront import complete, dissolved, shrunk
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D, object_from_files
 
-__all__ = ["read", "repaint", "unit"]
-
 CENTIMETRE: Final = 0.01
 """Metres of FBX's default unit."""
 TIMEOUT: Final = 60.0

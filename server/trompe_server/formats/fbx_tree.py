@@ -8,8 +8,6 @@ from typing import Final
 from trompe_server.formats.upload import base_name
 from trompe_shared.errors import ObjectError
 
-__all__ = ["MAGIC", "Node", "Tree", "parse_tree"]
-
 MAGIC: Final = b"Kaydara FBX Binary  \0\x1a\0"
 MAX_DEPTH: Final = 32
 WIDE: Final = 7500

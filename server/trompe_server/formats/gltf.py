@@ -29,8 +29,6 @@ from trompe_shared.object3d import Material as Maps
 from trompe_shared.object3d import Object3D, encode_png
 from trompe_shared.wavefront import Part
 
-__all__ = ["Model", "Slot", "load", "read"]
-
 Key = tuple[int, int]
 """(Number of a mesh, number of one of its primitives)."""
 KEPT: tuple[float, float] = (1.0, 0.5)

@@ -16,8 +16,6 @@ from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
 from trompe_shared.faults import faults_of
 
-__all__ = ["Container", "at", "open_container", "split_glb"]
-
 MAX_JSON: Final = 32 * 2**20
 GLB_MAGIC: Final = b"glTF"
 JSON_CHUNK: Final = 0x4E4F534A

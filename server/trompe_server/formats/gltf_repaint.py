@@ -26,8 +26,6 @@ from trompe_server.formats.unwrap import Unwrapped
 from trompe_server.formats.upload import Upload
 from trompe_shared.object3d import Object3D
 
-__all__ = ["glb", "repaint"]
-
 Json = dict[str, Any]
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 FLOAT, UNSIGNED_INT = 5126, 5125

@@ -7,8 +7,6 @@ from pydantic.alias_generators import to_camel
 
 from trompe_shared.wavefront import MAX_FACES
 
-__all__ = ["READ_EXTENSIONS", "Accessor", "Document", "Image", "Material", "Node", "Primitive", "TextureInfo"]
-
 READ_EXTENSIONS: Final = ("KHR_texture_transform", "KHR_mesh_quantization", "KHR_materials_", "KHR_lights_punctual")
 """Prefixes of extensions a file may require: supported, or about light and finish without effect here."""
 

@@ -14,8 +14,6 @@ from trompe_server.formats.unwrap import Unwrapped
 from trompe_shared.errors import ObjectError
 from trompe_shared.wavefront import MAX_FACES, Part
 
-__all__ = ["Matrix", "Shape", "instances", "placed", "read_shape"]
-
 Matrix = NDArray[np.float64]
 
 

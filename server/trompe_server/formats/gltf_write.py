@@ -12,8 +12,6 @@ from trompe_shared.object3d import Material, Object3D, encode_png, open_image
 from trompe_shared.opacity import CUTOFF, opacity_of
 from trompe_shared.wavefront import Part
 
-__all__ = ["PLAIN_ROUGHNESS", "write_glb"]
-
 PLAIN_ROUGHNESS: Final = 0.9
 """Roughness of materials without a map in SAILenv's renderers."""
 TRILINEAR: Final = {"magFilter": 9729, "minFilter": 9987, "wrapS": 10497, "wrapT": 10497}

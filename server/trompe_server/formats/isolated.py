@@ -11,8 +11,6 @@ from trompe_server.system.sandbox import run_limited
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D
 
-__all__ = ["MEMORY", "SECONDS", "Converted", "import_file", "repaint_limited"]
-
 MEMORY: Final = 4 * 2**30
 """Limit of the address space in bytes; 8192 x 8192 texels take 1.3 GiB."""
 SECONDS: Final = 180.0

@@ -12,19 +12,6 @@ from PIL import Image
 
 from trompe_shared.object3d import decode_alpha, decode_rgb, encode_png
 
-__all__ = [
-    "Pixels",
-    "cutout_alpha",
-    "decode",
-    "encode_srgb",
-    "linear_rgb",
-    "metallic_smoothness",
-    "scaled_normals",
-    "shrink",
-    "tinted",
-    "with_alpha_of",
-]
-
 Pixels = NDArray[np.uint8]
 
 _LEVELS: Final = np.arange(256) / 255

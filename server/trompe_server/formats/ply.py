@@ -22,8 +22,6 @@ from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Material, Object3D, encode_png
 from trompe_shared.wavefront import MAX_FACES, Part, Surface, smooth_normals
 
-__all__ = ["read", "repaint"]
-
 MATERIAL: Final = "surface"
 WHITE: Final = (1.0, 1.0, 1.0)
 MAX_HEADER: Final = 2**16

@@ -6,8 +6,6 @@ from contextlib import contextmanager
 
 from trompe_shared.errors import ObjectError
 
-__all__ = ["refusing"]
-
 
 @contextmanager
 def refusing(what: str, *, remedy: str) -> Iterator[None]:

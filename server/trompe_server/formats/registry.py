@@ -10,8 +10,6 @@ from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import MAX_ARCHIVE_BYTES, Object3D, unpack
 
-__all__ = ["FORMATS", "Exported", "Format", "Imported", "read_object", "repaint_file"]
-
 
 @dataclass(frozen=True)
 class Format:

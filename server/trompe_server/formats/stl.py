@@ -14,8 +14,6 @@ from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D
 from trompe_shared.wavefront import MAX_FACES, Surface, smooth_normals
 
-__all__ = ["looks_binary", "read", "repaint"]
-
 HEADER: Final = 84
 TRIANGLE: Final = 50
 """Bytes of a binary STL's header and of one triangle."""

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from trompe_server.formats.pictures import Pixels, encode_srgb
 from trompe_shared.errors import ObjectError
 
-__all__ = ["BAKED_SIDE", "Unwrapped", "bake", "unwrap"]
-
 BAKED_SIDE: Final = 512
 """Approximate side, in texels, of a generated texture."""
 MAX_UNWRAPPED: Final = 100_000

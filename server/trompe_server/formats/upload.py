@@ -8,8 +8,6 @@ from urllib.parse import unquote
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import pack_zip
 
-__all__ = ["Upload", "base_name"]
-
 
 @dataclass(frozen=True)
 class Upload:

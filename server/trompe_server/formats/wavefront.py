@@ -15,8 +15,6 @@ from trompe_shared.local_files import PICTURE_SUFFIXES
 from trompe_shared.object3d import Object3D, decode_alpha, decode_rgb, encode_png, object_from_files
 from trompe_shared.wavefront import Part, Surface, obj_text, parse_mtl, parse_surfaces
 
-__all__ = ["complete", "dissolved", "read", "repaint", "shrunk"]
-
 
 def read(upload: Upload, max_texture: int | None = None) -> Object3D:
     """Read an OBJ and the files beside it. Raises ``ObjectError``."""

@@ -10,8 +10,6 @@ from trompe_server.errors import AmbiguousError, NotFoundError
 from trompe_server.storage.folders import Folder
 from trompe_shared.api import BackgroundInfo, ClassifierInfo, ObjectInfo
 
-__all__ = ["Catalogue"]
-
 _INFO: Final = "info.json"
 _ID: Final = re.compile(r"[0-9a-f]{64}")
 

@@ -12,8 +12,6 @@ from trompe_server.errors import ServiceError
 from trompe_server.system.sandbox import start_limited
 from trompe_shared.errors import ClassifierError
 
-__all__ = ["Networks"]
-
 MODULE: Final = "trompe_server.library.classify"
 MEMORY: Final = 8 * 2**30
 """Bytes of address space; networks for ImageNet take less than half."""

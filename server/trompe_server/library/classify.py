@@ -22,8 +22,6 @@ from trompe_server.judging.metrics import softmax
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError, TrompeError
 from trompe_shared.object3d import Texture, decode_rgb
 
-__all__ = ["MOST_SIDE", "answer"]
-
 IDLE: Final = 600.0
 LOADED: Final = 2
 """Networks in memory."""

@@ -8,13 +8,6 @@ from trompe_server.system.sandbox import run_limited
 from trompe_shared.api import ClassifierInfo
 from trompe_shared.errors import ClassifierError
 
-__all__ = [
-    "Inspect",
-    "check_classes",
-    "inspect_classifier",
-    "named_classifier",
-]
-
 _SECONDS: Final = 300.0
 _MEMORY: Final = 8 * 2**30
 """Bytes of address space; networks for ImageNet take less than half."""

@@ -10,8 +10,6 @@ from typing import BinaryIO, Final
 
 from trompe_server.system.files import no_space
 
-__all__ = ["copy", "identity_of", "intake"]
-
 _PART: Final = 2**20
 
 

@@ -25,8 +25,6 @@ from trompe_shared.local_files import CLASSIFIER_SUFFIXES, LOOKED_UP
 from trompe_shared.object3d import decode_rgb
 from trompe_shared.shipped import shipped_objects
 
-__all__ = ["Library"]
-
 _UPLOAD: Final = "upload"
 """File of an object as uploaded, beside ``data.zip``."""
 

@@ -7,8 +7,6 @@ from trompe_shared.api import ClassifierInfo, ObjectInfo
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import ShippedObject, shipped_objects
 
-__all__ = ["list_shipped_classifiers", "list_shipped_objects"]
-
 
 @cache
 def list_shipped_objects() -> list[ObjectInfo]:

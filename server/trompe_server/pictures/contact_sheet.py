@@ -25,8 +25,6 @@ from trompe_server.pictures.layout import (
 )
 from trompe_shared.geometry import Camera, spherical
 
-__all__ = ["FRAME", "TILE", "Verdict", "contact_sheet", "extremes", "hardest_and_easiest", "representative"]
-
 TILE: Final = 168
 """Width of an image on the sheet, without its frame."""
 FRAME: Final = 4

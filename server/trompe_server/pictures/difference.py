@@ -8,8 +8,6 @@ from PIL import Image
 
 from trompe_server.pictures.layout import INK, Images, beside, captioned, framed, sheet, tile
 
-__all__ = ["AMPLIFIED", "amplified_difference", "difference_strip", "texture_sheet"]
-
 AMPLIFIED: Final = 10
 """Factor by which differences are amplified."""
 TILE: Final = 224

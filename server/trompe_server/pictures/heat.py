@@ -9,8 +9,6 @@ from PIL import Image
 
 from trompe_server.pictures.layout import CAPTION, GAP, INK, PAPER, Images, beside, line, stacked, swatch, text_width
 
-__all__ = ["OUTLINE", "heat_colours", "heat_legend", "heat_over"]
-
 OUTLINE: Final = (0, 255, 255)
 HEAT: Final = np.array(
     [

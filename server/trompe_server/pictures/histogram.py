@@ -19,8 +19,6 @@ from trompe_server.pictures.layout import (
     text_width,
 )
 
-__all__ = ["prediction_histogram"]
-
 BEFORE: Final = (0, 114, 178)
 AFTER: Final = (230, 159, 0)
 """Blue and orange of different lightness, safe for colour-blind readers (Okabe and Ito)."""

@@ -10,8 +10,6 @@ from PIL import Image
 from trompe_server.pictures.heat import OUTLINE, heat_legend, heat_over
 from trompe_server.pictures.layout import Images, captioned, sheet, tile
 
-__all__ = ["saliency_sheet"]
-
 TILE: Final = 336
 
 

@@ -11,8 +11,6 @@ from PIL import Image
 from trompe_server.pictures.heat import heat_legend, heat_over
 from trompe_server.pictures.layout import INK, Images, beside, captioned, framed, sheet, tile
 
-__all__ = ["heat_textures", "saliency_object_sheet", "saliency_texture_sheet"]
-
 TILE: Final = 336
 OBJECT_TILE: Final = 224
 TOP: Final = 0.005

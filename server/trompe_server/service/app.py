@@ -18,8 +18,6 @@ from trompe_server.api.services import Services
 from trompe_server.library.classification import Networks
 from trompe_server.pages import add_pages
 
-__all__ = ["create_app"]
-
 DESCRIPTION: Final = """Crafts adversarial 3D objects. Upload an object and a classifier (or use the shipped ones),
 submit a job, follow its events, fetch its result. Errors are problem details (RFC 9457);
 each response carries `X-Request-ID`. If the server has tokens, send `Authorization: Bearer trompe_...`."""

@@ -17,18 +17,6 @@ from trompe_shared.errors import TrompeError
 if TYPE_CHECKING:
     from trompe_server.renderers.discovery import RendererAddresses
 
-__all__ = [
-    "data_option",
-    "database_option",
-    "demo",
-    "doctor",
-    "for_people",
-    "migrate",
-    "serve",
-    "settings_of",
-    "worker",
-]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 

@@ -19,8 +19,6 @@ from typing import Final
 from trompe_server.settings import Settings
 from trompe_shared.errors import TrompeError
 
-__all__ = ["Finding", "check_all", "in_json", "in_words"]
-
 PATIENCE: Final = 60.0
 """Time limit of a check in a child process, seconds; a healthy machine takes a few."""
 MIN_FREE: Final = 2 * 2**30

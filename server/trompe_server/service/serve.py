@@ -25,8 +25,6 @@ from trompe_server.storage.folders import open_folder
 from trompe_server.storage.tokens import Tokens
 from trompe_server.system.files import exclusive
 
-__all__ = ["run_service"]
-
 BACKLOG: Final = 2048
 """Connections waiting to be accepted."""
 KEEP_ALIVE: Final = 75

@@ -13,8 +13,6 @@ from trompe_server.service.commands import data_option, database_option, for_peo
 from trompe_server.settings import Settings
 from trompe_server.storage.tokens import Right, Token, Tokens
 
-__all__ = ["token"]
-
 _json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 

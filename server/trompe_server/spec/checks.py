@@ -9,18 +9,6 @@ from typing import Protocol
 from trompe_shared.api import JobSpec
 from trompe_shared.errors import ClassifierError, SpecError
 
-__all__ = [
-    "Classes",
-    "check_gradients",
-    "check_keep",
-    "check_labels",
-    "check_mask_size",
-    "check_members",
-    "check_same_classes",
-    "check_target",
-    "check_top_k",
-]
-
 
 class Classes(Protocol):
     """Name and classes of a classifier."""

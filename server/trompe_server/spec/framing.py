@@ -8,8 +8,6 @@ from trompe_shared.geometry import framing_distance
 from trompe_shared.object3d import Object3D
 from trompe_shared.shipped import shipped_objects
 
-__all__ = ["Framing", "framing_of"]
-
 DEFAULT_ELEVATION: Final = (0.0, 50.0)
 ORIGIN: Final = (0.0, 0.0, 0.0)
 

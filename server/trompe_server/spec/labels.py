@@ -6,8 +6,6 @@ from difflib import get_close_matches
 from trompe_server.spec.checks import check_labels
 from trompe_shared.errors import LabelError
 
-__all__ = ["resolve_label", "resolve_labels"]
-
 
 def resolve_labels(
     label: str | int | Sequence[str | int], classes: Sequence[str] | None, n_classes: int, classifier: str

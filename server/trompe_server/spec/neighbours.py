@@ -7,8 +7,6 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from typing import Final, NamedTuple
 
-__all__ = ["neighbours"]
-
 WORD: Final = re.compile(r"[^\W\d_]{2,}")
 ASIDE: Final = re.compile(r"\(.*?\)|'s\b")
 """Remarks in brackets, and the ending of a possessive."""

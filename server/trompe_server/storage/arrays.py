@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["pack_arrays", "unpack_arrays"]
-
 
 def pack_arrays(arrays: Mapping[str, NDArray[Any]], *, compressed: bool = True) -> bytes:
     """Bytes of an .npz file, lossless and without pickles. Compression pays for images, not for noise."""

@@ -21,8 +21,6 @@ from sqlalchemy.sql.functions import FunctionElement
 
 from trompe_server.errors import ServiceError
 
-__all__ = ["DatabaseDownError", "clock", "connect", "patiently", "write"]
-
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")

@@ -14,8 +14,6 @@ from trompe_server.errors import ServiceError
 from trompe_server.system.files import no_space, write_whole
 from trompe_shared.errors import SpecError, TrompeError
 
-__all__ = ["Folder", "JobArtifacts", "LocalArtifacts", "RemoteArtifacts", "job_artifacts", "open_folder"]
-
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]{0,199}")
 _JOBS: Final = "jobs"
 

@@ -22,8 +22,6 @@ from trompe_server.errors import ConflictError, NotFoundError
 from trompe_server.storage.database import DatabaseDownError, clock, write
 from trompe_shared.errors import SpecError
 
-__all__ = ["Right", "Token", "Tokens", "hash_secret", "metadata"]
-
 logger = logging.getLogger(__name__)
 
 PREFIX: Final = "trompe_"

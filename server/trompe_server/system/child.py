@@ -12,8 +12,6 @@ import time
 from importlib.metadata import entry_points
 from typing import Final
 
-__all__ = ["main"]
-
 GRACE: Final = 5.0
 """Seconds from SIGTERM to a forced exit."""
 

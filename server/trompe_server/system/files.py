@@ -13,8 +13,6 @@ from filelock import FileLock, Timeout
 
 from trompe_server.errors import ServiceError
 
-__all__ = ["exclusive", "no_space", "write_whole"]
-
 _FULL: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 

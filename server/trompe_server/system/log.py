@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Final
 
-__all__ = ["about_job", "log_to_stderr"]
-
 CHATTY: Final = ("httpx", "PIL", "OpenGL", "botocore", "s3fs", "fsspec")
 _STANDARD: Final = set(vars(logging.makeLogRecord({}))) | {"message", "asctime", "job"}
 

@@ -7,8 +7,6 @@ texels that takes longer than the arithmetic.
 import ctypes
 from typing import Final
 
-__all__ = ["keep_freed_memory"]
-
 GIB: Final = 2**30
 
 ARENA_MAX: Final = (-8, 1)

@@ -20,8 +20,6 @@ from typing import IO, Any, Final
 
 from trompe_shared.errors import TrompeError
 
-__all__ = ["run_limited", "start_limited"]
-
 MAX_FILE: Final = 2**29
 """Largest file the process may write, in bytes; its standard output counts as a file."""
 MAX_ANSWER: Final = 2**22

@@ -8,8 +8,6 @@ for long take the cores from other processes. So they spin for about as long as 
 import os
 from typing import Final
 
-__all__ = ["prepare_threads"]
-
 SPINS: Final = 1000
 """Iterations that a thread of GNU's OpenMP spins before it sleeps: about 50 µs."""
 

@@ -2,8 +2,6 @@
 
 from importlib.metadata import version
 
-__all__ = ["versions"]
-
 
 def versions() -> dict[str, str]:
     """Versions by package."""
