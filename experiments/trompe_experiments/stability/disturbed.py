@@ -2,19 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from trompe_server.classifiers import WhiteBoxClassifier
-from trompe_server.classifiers.protocol import Images, Logits, Wrapper, fit_images, in_batches
+from trompe_server.classifiers.protocol import Images, Logits, Wrapper, predicted
 
 Network = Callable[[Float[Tensor, "n 3 H W"]], Float[Tensor, "n classes"]]
-
-BATCH: Final = 20
 
 
 @dataclass(frozen=True)
@@ -36,8 +32,7 @@ class ChangedClassifier(Wrapper):
     @torch.no_grad()
     def predict(self, images: Images) -> Logits:
         """See ``Classifier``."""
-        parts = [self.network(fit_images(batch, self.image_size)).numpy() for batch in in_batches(images, BATCH)]
-        return np.concatenate([np.zeros((0, self.n_classes), np.float32), *parts])
+        return predicted(self.network, images, self.image_size, self.n_classes)
 
 
 def bfloat16(classifier: WhiteBoxClassifier) -> ChangedClassifier:

@@ -1,16 +1,14 @@
 """The contract of a white-box network, and its check."""
 
-from typing import Any, Final
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from trompe_server.classifiers import protocol
 from trompe_server.classifiers.fold import accelerate
-from trompe_server.classifiers.protocol import refuse_probabilities
-from trompe_shared.errors import ClassifierError
-
-CONTRACT: Final = "input image float32 NCHW in [0, 1] with a dynamic batch, output logits (N, classes)"
 
 
 class Normalised(nn.Module):
@@ -31,9 +29,7 @@ class Normalised(nn.Module):
         return logits
 
 
-def broken(file: str, what: str) -> ClassifierError:
-    """The error for a network that breaks the contract."""
-    return ClassifierError(f"{file!r}: {what}. Expected: {CONTRACT}; export it so, with the normalisation inside.")
+broken = partial(protocol.broken, batch=" with a dynamic batch")
 
 
 def describe_value(value: Any) -> str:
@@ -58,7 +54,7 @@ def check_contract(network: nn.Module, sample: Float[Tensor, "2 3 H W"], file: s
         raise broken(file, f"its output for two images is {describe_value(logits)}")
     if not torch.isfinite(logits).all():
         raise broken(file, "its output is not finite")
-    refuse_probabilities(logits.detach().cpu().numpy(), file)
+    protocol.refuse_probabilities(logits.detach().cpu().numpy(), file)
     gradient = torch.autograd.grad(logits.max(), images, allow_unused=True)[0] if logits.requires_grad else None
     if gradient is None or not gradient.any():
         raise broken(file, "its output has no gradient in the image")

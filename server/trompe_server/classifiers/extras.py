@@ -1,6 +1,8 @@
-"""Import of libraries that come with an extra."""
+"""Libraries of networks that come with an extra."""
 
 import importlib
+from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import torch
@@ -26,3 +28,10 @@ def import_extra(module: str, *, extra: str) -> Any:
             f"torchvision is installed, but for another build of torch than {torch.__version__} ({error}). "
             "Install both from one index and for the same device, or give a .pt2 file."
         ) from error
+
+
+def check_known(model: str, known: Sequence[str], refusal: str) -> None:
+    """Raise ``ClassifierError`` with names similar to ``model`` unless it is among the ``known`` networks."""
+    if model not in known:
+        near = ", ".join(get_close_matches(model, known) or known[:5])
+        raise ClassifierError(f"{refusal} {model!r}; try one of {near}.")

@@ -1,7 +1,7 @@
 """Image classifiers of the Hugging Face hub by name: safetensors and settings, no code of the repository."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from trompe_server.classifiers.contract import Normalised
 from trompe_server.classifiers.extras import import_extra
 from trompe_server.classifiers.hub import WEIGHTS, hub_file
-from trompe_server.classifiers.network import NetworkClassifier, prepared_classifier
+from trompe_server.classifiers.network import NamedNetwork
 from trompe_shared.errors import ClassifierError
 
 
@@ -27,22 +27,13 @@ class _Logits(nn.Module):
         return logits
 
 
-def load_huggingface(
-    model: str,
-    *,
-    name: str | None = None,
-    classes: Sequence[str] | None = None,
-    weights: None = None,
-    device: str = "cpu",
-) -> NetworkClassifier:
-    """Load the image classifier in the repository ``model`` (ORG/MODEL) of the hub as a white box.
+def load_huggingface(model: str) -> NamedNetwork:
+    """The image classifier in the repository ``model`` (ORG/MODEL) of the hub.
 
     Image size and normalisation come from ``preprocessor_config.json``, class names from ``config.json``. Raises
     ``ClassifierError`` if transformers or a file is missing, and for a network that classifies no images.
     """
-    if weights is not None:
-        raise ClassifierError(f"hf:{model} has its own weights; leave out weights.")
-    settings = json.loads(hub_file(model, "preprocessor_config.json", extra="hf").read_text("utf-8"))
+    settings = _settings(model)
     folder = hub_file(model, "config.json", extra="hf").parent
     huggingface_weights(model)
     transformers = import_extra("transformers", extra="hf")
@@ -56,14 +47,25 @@ def load_huggingface(
             "repository of transformers' image classifiers with safetensors, or a .pt2 file."
         ) from error
     labels = network.config.id2label
-    names = classes or [labels[index] for index in range(len(labels))]
     whole = Normalised(_Logits(network), mean=_statistic(settings, "mean", 0.0), std=_statistic(settings, "std", 1.0))
-    return prepared_classifier(whole, _image_size(settings, model), name or model, names, device=device)
+    return NamedNetwork(whole, _image_size(settings, model), [labels[index] for index in range(len(labels))])
 
 
 def huggingface_weights(model: str) -> Path:
     """The file with the weights of the repository ``model``. Raises ``ClassifierError``."""
     return hub_file(model, WEIGHTS, extra="hf")
+
+
+def _settings(model: str) -> Mapping[str, Any]:
+    """How images become the network's input. Raises ``ClassifierError``."""
+    name = "preprocessor_config.json"
+    try:
+        settings = json.loads(hub_file(model, name, extra="hf").read_bytes())
+    except ValueError as error:
+        raise ClassifierError(f"The {name} of {model!r} is not JSON ({error}); give a .pt2 file.") from error
+    if not isinstance(settings, dict):
+        raise ClassifierError(f"The {name} of {model!r} has no settings by name; give a .pt2 file.")
+    return settings
 
 
 def _statistic(settings: Mapping[str, Any], which: str, default: float) -> tuple[float, ...]:

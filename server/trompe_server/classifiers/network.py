@@ -2,16 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from trompe_server.classifiers.contract import prepared
-from trompe_server.classifiers.protocol import Images, Logits, check_classes, finite, fit_images, in_batches
+from trompe_server.classifiers.protocol import Images, Logits, predicted
 
-BATCH = 10
+
+class NamedNetwork(NamedTuple):
+    """A network of a library: its normalisation inside, the size (H, W) of its images, its class names, if known."""
+
+    network: nn.Module
+    image_size: tuple[int, int]
+    classes: Sequence[str] | None
 
 
 @dataclass(frozen=True)
@@ -38,21 +43,6 @@ class NetworkClassifier:
         """The same logits without a gradient."""
         return self.logits(images)
 
-    @torch.no_grad()
     def predict(self, images: Images) -> Logits:
         """Logits (N, n_classes), all finite, of uint8 images (N, H, W, 3) of any size."""
-        chunks = [np.zeros((0, self.n_classes), np.float32)]
-        for batch in in_batches(images, BATCH):
-            chunks.append(finite(self.logits(fit_images(batch, self.image_size))).numpy())
-        return np.concatenate(chunks)
-
-
-def prepared_classifier(
-    network: nn.Module, size: tuple[int, int], name: str, classes: Sequence[str] | None, *, device: str
-) -> NetworkClassifier:
-    """The network, normalisation inside, as a classifier of images of ``size`` (H, W), faster if torch can export it.
-
-    Raises ``ClassifierError`` if it breaks the contract, or has another number of classes.
-    """
-    fast, n_classes = prepared(network, size, name, device=device)
-    return NetworkClassifier(name, fast, size, n_classes, check_classes(classes, n_classes, name), device)
+        return predicted(self.scores, images, self.image_size, self.n_classes)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -12,18 +12,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from trompe_server.classifiers.protocol import (
+    BATCH,
     Images,
     Logits,
+    broken,
     check_classes,
-    finite,
-    fit_images,
-    in_batches,
+    predicted,
     refuse_probabilities,
 )
 from trompe_shared.errors import ClassifierError
-
-BATCH: Final = 10
-CONTRACT: Final = "input image float32 NCHW in [0, 1], output logits (N, classes)"
 
 
 @dataclass(frozen=True)
@@ -39,10 +36,7 @@ class OnnxClassifier:
 
     def predict(self, images: Images) -> Logits:
         """Logits (N, n_classes), all finite, of uint8 images (N, H, W, 3) of any size."""
-        chunks = [np.zeros((0, self.n_classes), np.float32)]
-        for batch in in_batches(images, self.fixed_batch or BATCH):
-            chunks.append(finite(self.scores(fit_images(batch, self.image_size))).numpy())
-        return np.concatenate(chunks)
+        return predicted(self.scores, images, self.image_size, self.n_classes, batch=self.fixed_batch or BATCH)
 
     def scores(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
         """Logits of sRGB images in [0, 1] of size ``image_size``, on the images' device; no gradient."""
@@ -65,19 +59,15 @@ def load_onnx(
     try:
         logits = _run(session, noise, fixed_batch)
     except Exception as error:
-        raise _broken(path.name, f"it does not run on one image ({str(error)[:300]})") from error
+        raise broken(path.name, f"it does not run on one image ({str(error)[:300]})") from error
     if logits.ndim != 2 or logits.dtype != np.float32 or len(logits) != 1:
-        raise _broken(path.name, f"its output for one image is {logits.dtype} {logits.shape}")
+        raise broken(path.name, f"its output for one image is {logits.dtype} {logits.shape}")
     if not np.isfinite(logits).all():
-        raise _broken(path.name, "its output is not finite")
+        raise broken(path.name, "its output is not finite")
     refuse_probabilities(logits, path.name)
     n_classes = logits.shape[1]
     names = check_classes(classes, n_classes, path.name)
     return OnnxClassifier(name or path.stem, session, size, n_classes, fixed_batch, names)
-
-
-def _broken(file: str, what: str) -> ClassifierError:
-    return ClassifierError(f"{file!r}: {what}. Expected: {CONTRACT}; export it so, with the normalisation inside.")
 
 
 def _providers(device: str) -> list[str | tuple[str, dict[str, str]]]:
@@ -102,22 +92,21 @@ def _session(path: Path, device: str) -> Any:
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:
-        raise _broken(path.name, f"onnxruntime cannot read it ({str(error)[:300]})") from error
+        raise broken(path.name, f"onnxruntime cannot read it ({str(error)[:300]})") from error
 
 
 def _input(session: Any, file: str) -> tuple[int | None, tuple[int, int]]:
     """The batch size, if fixed, and (H, W) of the only input. Raises ``ClassifierError``."""
     inputs = session.get_inputs()
     if len(inputs) != 1 or len(session.get_outputs()) != 1:
-        raise _broken(file, f"it has {len(inputs)} inputs and {len(session.get_outputs())} outputs")
+        raise broken(file, f"it has {len(inputs)} inputs and {len(session.get_outputs())} outputs")
     shape, kind = inputs[0].shape, inputs[0].type
     if len(shape) != 4 or shape[1] != 3 or kind != "tensor(float)":
-        raise _broken(file, f"its input is {kind} {shape}")
+        raise broken(file, f"its input is {kind} {shape}")
     batch, _, height, width = shape
     if not (isinstance(height, int) and isinstance(width, int)):
-        raise _broken(
-            file,
-            f"its input {shape} has no height and width: fix them with onnxruntime.tools.make_dynamic_shape_fixed",
+        raise broken(
+            file, f"its input {shape} has no height and width: fix them with onnxruntime.tools.make_dynamic_shape_fixed"
         )
     return batch if isinstance(batch, int) else None, (height, width)
 

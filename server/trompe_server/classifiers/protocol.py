@@ -1,6 +1,6 @@
 """Interfaces of classifiers, and the conversion of images to their input."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -12,6 +12,8 @@ from torch.nn import functional as F
 
 from trompe_shared.errors import ClassifierError
 
+BATCH: Final = 10
+"""Images of one call of a network."""
 HUGE: Final = 1e30
 """Replacement for an infinite logit."""
 
@@ -79,14 +81,22 @@ def fit_images(images: Images, size: tuple[int, int]) -> Float[Tensor, "n 3 H W"
     return resize(batch, size)
 
 
-def in_batches(images: Images, count: int) -> Iterator[Images]:
-    """Batches of at most ``count`` images. Raises ``ClassifierError`` unless they are (N, H, W, 3) uint8."""
+def predicted(
+    logits: Callable[[Tensor], Tensor], images: Images, size: tuple[int, int], n_classes: int, *, batch: int = BATCH
+) -> Logits:
+    """Logits (N, n_classes), all finite, of images of any size, by a network of images of ``size`` (H, W).
+
+    Raises ``ClassifierError`` unless the images are (N, H, W, 3) uint8.
+    """
     if images.ndim != 4 or images.shape[3] != 3 or images.dtype != np.uint8:
         raise ClassifierError(
             f"Images of shape {images.shape} and type {images.dtype} cannot be classified; "
             "pass (N, H, W, 3) uint8, sRGB."
         )
-    return (images[start : start + count] for start in range(0, len(images), count))
+    chunks = [np.zeros((0, n_classes), np.float32)]
+    for start in range(0, len(images), batch):
+        chunks.append(finite(logits(fit_images(images[start : start + batch], size))).numpy())
+    return np.concatenate(chunks)
 
 
 def finite(logits: Float[Tensor, "n classes"]) -> Float[Tensor, "n classes"]:
@@ -104,6 +114,14 @@ def check_classes(classes: Sequence[str] | None, n_classes: int, file: str) -> t
             "pass one name for each, in order."
         )
     return tuple(classes)
+
+
+def broken(file: str, what: str, *, batch: str = "") -> ClassifierError:
+    """The error for a network that breaks the contract. ``batch``: what it says of the batch."""
+    return ClassifierError(
+        f"{file!r}: {what}. Expected: input image float32 NCHW in [0, 1]{batch}, output logits (N, classes); export it "
+        "so, with the normalisation inside."
+    )
 
 
 def refuse_probabilities(outputs: NDArray[np.float32], file: str) -> None:

@@ -16,15 +16,16 @@ reference                                classifier
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 
+from trompe_server.classifiers.contract import prepared
 from trompe_server.classifiers.exported import load_exported
 from trompe_server.classifiers.huggingface import huggingface_weights, load_huggingface
-from trompe_server.classifiers.network import NetworkClassifier
+from trompe_server.classifiers.network import NamedNetwork, NetworkClassifier
 from trompe_server.classifiers.onnx import load_onnx
-from trompe_server.classifiers.protocol import Classifier
+from trompe_server.classifiers.protocol import Classifier, check_classes
 from trompe_server.classifiers.robustbench_networks import load_robustbench, robustbench_weights
 from trompe_server.classifiers.timm_networks import load_timm, timm_weights
 from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, WEIGHTS, load_tiny
@@ -35,18 +36,36 @@ from trompe_shared.local_files import LOOKED_UP
 LOADERS: Final[Mapping[str, Callable[..., Classifier]]] = {".pt2": load_exported, ".onnx": load_onnx}
 """By the ending of the file."""
 
-ZOOS: Final[Mapping[str, tuple[Callable[..., NetworkClassifier], Callable[[str], Path]]]] = {
-    "torchvision:": (load_torchvision, torchvision_weights),
-    "timm:": (load_timm, timm_weights),
-    "robustbench:": (load_robustbench, robustbench_weights),
-    "hf:": (load_huggingface, huggingface_weights),
+
+class _Zoo(NamedTuple):
+    """Networks of a library: loader by name, file of weights by name, whether other weights and classes fit in."""
+
+    load: Callable[..., NamedNetwork]
+    weights: Callable[[str], Path]
+    open: bool = False
+
+
+ZOOS: Final[Mapping[str, _Zoo]] = {
+    "torchvision:": _Zoo(load_torchvision, torchvision_weights, open=True),
+    "timm:": _Zoo(load_timm, timm_weights, open=True),
+    "robustbench:": _Zoo(load_robustbench, robustbench_weights),
+    "hf:": _Zoo(load_huggingface, huggingface_weights),
 }
-"""Loader of a network by name, and its file of weights, by the prefix of the reference."""
+"""By the prefix of the reference."""
 
 KNOWN: Final = (
     "'tiny' (the shipped network), a .pt2 file (torch.export.save), an .onnx file (scores only), or a network by name "
     f"({', '.join(ZOOS)})"
 )
+
+
+class _Options(NamedTuple):
+    """See ``load_classifier``."""
+
+    name: str | None
+    classes: Sequence[str] | None
+    weights: str | Path | None
+    device: str
 
 
 def load_classifier(
@@ -67,15 +86,13 @@ def load_classifier(
     """
     _check_device(device)
     reference = str(path_or_name)
+    options = _Options(name, classes, weights, device)
     if reference.startswith(LOOKED_UP):
-        load, _, model = _zoo(reference)
-        return load(model, name=name, classes=classes, weights=weights, device=device)
+        return _by_name(reference, options)
     if reference != "tiny" and re.fullmatch(r"[a-z]\w*", reference, re.ASCII):
-        return _by_bare_name(reference, name=name, classes=classes, weights=weights, device=device)
+        return _by_bare_name(reference, options)
     if weights is not None:
-        raise ClassifierError(
-            f"{reference!r} has its own weights. Pass weights only with torchvision:NAME or timm:NAME."
-        )
+        raise _own_weights(reference)
     if reference == "tiny":
         return NetworkClassifier("tiny", load_tiny().to(device), IMAGE_SIZE, len(CLASSES), tuple(CLASSES), device)
     return _from_file(Path(path_or_name), name, classes, device)
@@ -86,24 +103,39 @@ def classifier_file(reference: str) -> Path:
     if reference == "tiny":
         return WEIGHTS
     if reference.startswith(LOOKED_UP):
-        _, weights, model = _zoo(reference)
-        return weights(model)
+        zoo, model = _zoo(reference)
+        return zoo.weights(model)
     return Path(reference) if reference.endswith(tuple(LOADERS)) else torchvision_weights(reference)
 
 
-def _zoo(reference: str) -> tuple[Callable[..., NetworkClassifier], Callable[[str], Path], str]:
-    """(Loader, file of weights, name of the network) of a network by name."""
+def _zoo(reference: str) -> tuple[_Zoo, str]:
+    """The library of a network by name, and its name there."""
     prefix = next(prefix for prefix in ZOOS if reference.startswith(prefix))
-    return *ZOOS[prefix], reference.removeprefix(prefix)
+    return ZOOS[prefix], reference.removeprefix(prefix)
 
 
-def _by_bare_name(
-    model: str, *, name: str | None, classes: Sequence[str] | None, weights: str | Path | None, device: str
-) -> Classifier:
+def _by_name(reference: str, options: _Options) -> NetworkClassifier:
+    zoo, model = _zoo(reference)
+    if options.weights is not None and not zoo.open:
+        raise _own_weights(reference)
+    given = {"classes": options.classes, "weights": options.weights} if zoo.open else {}
+    found, name = zoo.load(model, **given), options.name or model
+    network, n_classes = prepared(found.network, found.image_size, name, device=options.device)
+    classes = check_classes(options.classes or found.classes, n_classes, name)
+    return NetworkClassifier(name, network, found.image_size, n_classes, classes, options.device)
+
+
+def _by_bare_name(model: str, options: _Options) -> NetworkClassifier:
     try:
-        return load_torchvision(model, name=name, classes=classes, weights=weights, device=device)
+        return _by_name(f"torchvision:{model}", options)
     except ClassifierError as error:
         raise ClassifierError(f"{model!r} was taken for a torchvision network: {error} Or give {KNOWN}.") from error
+
+
+def _own_weights(reference: str) -> ClassifierError:
+    return ClassifierError(
+        f"{reference!r} has its own weights: leave out weights, which torchvision:NAME and timm:NAME take."
+    )
 
 
 def _from_file(path: Path, name: str | None, classes: Sequence[str] | None, device: str) -> Classifier:

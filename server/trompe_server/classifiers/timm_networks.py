@@ -1,39 +1,31 @@
 """timm's networks by name, with the image size, normalisation and class names of their weights."""
 
-import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from trompe_server.classifiers.contract import Normalised
-from trompe_server.classifiers.extras import import_extra
+from trompe_server.classifiers.extras import check_known, import_extra
 from trompe_server.classifiers.hub import WEIGHTS, hub_file
-from trompe_server.classifiers.network import NetworkClassifier, prepared_classifier
+from trompe_server.classifiers.network import NamedNetwork
 from trompe_shared.errors import ClassifierError
 
 
-def load_timm(
-    model: str,
-    *,
-    name: str | None = None,
-    classes: Sequence[str] | None = None,
-    weights: str | Path | None = None,
-    device: str = "cpu",
-) -> NetworkClassifier:
-    """Load timm's network ``model`` (``vit_base_patch16_224``, or with the tag of its weights) as a white box.
+def load_timm(model: str, *, classes: Sequence[str] | None = None, weights: str | Path | None = None) -> NamedNetwork:
+    """timm's network ``model`` (``vit_base_patch16_224``, or with the tag of its weights).
 
     weights: file of a state dict (safetensors, or tensors of ``torch.save``); default: the weights of timm's hub.
 
     Raises ``ClassifierError`` if timm, the network or the weights are missing or do not fit together.
     """
-    timm = _timm()
+    timm = _timm(model)
     path = timm_weights(model) if weights is None else Path(weights)
     if not path.is_file():
         raise ClassifierError(f"There is no file {str(path)!r} with weights of {model!r}; check the path.")
     known = {} if classes is None else {"num_classes": len(classes)}
     try:
         overlay = {"file": str(path), "custom_load": False}
-        network = timm.create_model(_known(timm, model), pretrained=True, pretrained_cfg_overlay=overlay, **known)
+        network = timm.create_model(model, pretrained=True, pretrained_cfg_overlay=overlay, **known)
     except Exception as error:  # what a file contains decides its kind
         raise ClassifierError(
             f"The weights in {path.name!r} do not fit timm's {model!r} ({type(error).__name__}: {str(error)[:300]}). "
@@ -41,29 +33,23 @@ def load_timm(
         ) from error
     config = timm.data.resolve_model_data_config(network)
     whole = Normalised(network, mean=config["mean"], std=config["std"])
-    names = classes or _imagenet(timm, network)
-    return prepared_classifier(whole, config["input_size"][1:], name or model, names, device=device)
+    return NamedNetwork(whole, config["input_size"][1:], _imagenet(timm, network))
 
 
 def timm_weights(model: str) -> Path:
     """The file with the weights of ``model`` from timm's hub. Raises ``ClassifierError``."""
-    timm = _timm()
-    config = timm.get_pretrained_cfg(_known(timm, model))
+    config = _timm(model).get_pretrained_cfg(model)
     if config is None or not config.hf_hub_id:
         raise ClassifierError(f"timm has no weights of {model!r} on its hub; give a file with a state dict as weights.")
     return hub_file(config.hf_hub_id, WEIGHTS, extra="timm")
 
 
-def _timm() -> Any:
-    return import_extra("timm", extra="timm")
-
-
-def _known(timm: Any, model: str) -> str:
-    """``model`` if timm has it. Raises ``ClassifierError`` with similar names."""
-    if timm.is_model(model):
-        return model
-    near = ", ".join(difflib.get_close_matches(model, timm.list_models())) or "vit_base_patch16_224"
-    raise ClassifierError(f"timm has no network {model!r}; try one of {near}.")
+def _timm(model: str) -> Any:
+    """timm, which must have ``model``. Raises ``ClassifierError``."""
+    timm = import_extra("timm", extra="timm")
+    if not timm.is_model(model):
+        check_known(model, timm.list_models(), "timm has no network")
+    return timm
 
 
 def _imagenet(timm: Any, network: Any) -> list[str] | None:

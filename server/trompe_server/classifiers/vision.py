@@ -4,7 +4,6 @@ Nothing is downloaded: weights come from torch's cache or from a file and must i
 that no layer keeps random weights.
 """
 
-import difflib
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -14,8 +13,8 @@ import torch
 from torch import nn
 
 from trompe_server.classifiers.contract import Normalised
-from trompe_server.classifiers.extras import import_extra
-from trompe_server.classifiers.network import NetworkClassifier, prepared_classifier
+from trompe_server.classifiers.extras import check_known, import_extra
+from trompe_server.classifiers.network import NamedNetwork
 from trompe_shared.errors import ClassifierError
 
 
@@ -37,14 +36,9 @@ class _LocalWeights:
 
 
 def load_torchvision(
-    model: str,
-    *,
-    name: str | None = None,
-    classes: Sequence[str] | None = None,
-    weights: str | Path | None = None,
-    device: str = "cpu",
-) -> NetworkClassifier:
-    """Load torchvision's classification network ``model`` as a white-box classifier.
+    model: str, *, classes: Sequence[str] | None = None, weights: str | Path | None = None
+) -> NamedNetwork:
+    """torchvision's classification network ``model``.
 
     weights: name of torchvision's weights in torch's cache (``"IMAGENET1K_V1"``; by default torchvision's default), or
         a file with a state dict.
@@ -59,7 +53,7 @@ def load_torchvision(
     (side,) = transforms.crop_size
     network = _built(models, model, entry, path, names)
     whole = Normalised(network, mean=tuple(transforms.mean), std=tuple(transforms.std))
-    return prepared_classifier(whole, (side, side), name or model, names, device=device)
+    return NamedNetwork(whole, (side, side), names)
 
 
 def torchvision_weights(model: str) -> Path:
@@ -73,10 +67,7 @@ def _torchvision() -> Any:
 
 def _find_weights(models: Any, model: str, weights: str | Path | None) -> tuple[Any, Path]:
     """(entry of torchvision's table, file). Raises ``ClassifierError``."""
-    known = models.list_models(module=models)
-    if model not in known:
-        near = ", ".join(difflib.get_close_matches(model, known)) or ", ".join(known[:5])
-        raise ClassifierError(f"torchvision has no classification network {model!r}; try one of {near}.")
+    check_known(model, models.list_models(module=models), "torchvision has no classification network")
     table = models.get_model_weights(model)
     cache = Path(torch.hub.get_dir()) / "checkpoints"
     if weights is None or weights in table.__members__:
