@@ -24,11 +24,7 @@ REQUEST_ID: Final = "X-Request-ID"
 RETRY_AFTER: Final = 5
 """Seconds until a retry, if a part of the service is down."""
 
-_STATUS: Final[dict[type[TrompeError], int]] = {
-    NotFoundError: 404,
-    ConflictError: 409,
-    ServiceError: 503,
-}
+_STATUS: Final[dict[type[TrompeError], int]] = {NotFoundError: 404, ConflictError: 409, ServiceError: 503}
 
 _EXAMPLE: Final = {
     "type": "urn:trompe:unknown-label",

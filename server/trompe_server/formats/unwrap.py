@@ -35,9 +35,7 @@ class Unwrapped:
     uvs: NDArray[np.float32]
 
 
-def unwrap(
-    meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int32]]],
-) -> tuple[list[Unwrapped], tuple[int, int]]:
+def unwrap(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int32]]]) -> tuple[list[Unwrapped], tuple[int, int]]:
     """Lay out meshes (vertices (V, 3), faces (F, 3)) in one texture of size (H, W); deterministic.
 
     Raises ``ObjectError`` if xatlas is missing or the meshes are too large for it.
@@ -99,10 +97,7 @@ def bake(meshes: Sequence[tuple[Unwrapped, NDArray[np.float64]]], *, size: tuple
 
 
 def _fill(
-    triangle: NDArray[np.float64],
-    values: NDArray[np.float64],
-    colours: NDArray[np.float64],
-    covered: NDArray[np.bool_],
+    triangle: NDArray[np.float64], values: NDArray[np.float64], colours: NDArray[np.float64], covered: NDArray[np.bool_]
 ) -> None:
     """Interpolate ``values`` (3, 3) over the texels with centres in ``triangle`` (3, 2), within a tolerance."""
     height, width = covered.shape

@@ -9,12 +9,7 @@ from typing import BinaryIO, Final
 
 from trompe_server.formats import import_file
 from trompe_server.library.catalogue import Catalogue
-from trompe_server.library.inspection import (
-    Inspect,
-    check_classes,
-    inspect_classifier,
-    named_classifier,
-)
+from trompe_server.library.inspection import Inspect, check_classes, inspect_classifier, named_classifier
 from trompe_server.library.intake import copy, identity_of, intake
 from trompe_server.library.shipped import list_shipped_classifiers, list_shipped_objects
 from trompe_server.storage.folders import Folder, LocalArtifacts

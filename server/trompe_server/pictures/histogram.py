@@ -77,8 +77,5 @@ def _legend(before: Mapping[str, int], after: Mapping[str, int]) -> Image.Image:
     parts = []
     for word, counts, colour in (("before", before, BEFORE), ("after", after, AFTER)):
         text = f"{word} ({sum(counts.values())} views)"
-        parts += [
-            swatch(colour),
-            line(text, text_width(text, size=CAPTION) + 2 * GAP, colour=INK),
-        ]
+        parts += [swatch(colour), line(text, text_width(text, size=CAPTION) + 2 * GAP, colour=INK)]
     return beside(parts)

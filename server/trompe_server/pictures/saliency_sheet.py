@@ -14,12 +14,7 @@ TILE: Final = 336
 
 
 def saliency_sheet(
-    images: Images,
-    saliency: Float[np.ndarray, "n H W"],
-    *,
-    tau: float | None,
-    title: str,
-    columns: int = 3,
+    images: Images, saliency: Float[np.ndarray, "n H W"], *, tau: float | None, title: str, columns: int = 3
 ) -> Image.Image:
     """Target images (N, H, W, 3) with their saliency in [0, 1] as heat; pixels at or above ``tau`` are outlined."""
     cards = [_card(image, heat, tau) for image, heat in zip(images, saliency, strict=True)]

@@ -1,7 +1,5 @@
 """``trompe doctor``: checks of the machine, each with a remedy."""
 
-import errno
-import http.client
 import json
 import os
 import secrets
@@ -11,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -61,11 +60,7 @@ class Finding:
 
 
 class _CheckError(Exception):
-    """A failed check with its remedy."""
-
-    def __init__(self, words: str, remedy: str) -> None:
-        super().__init__(words)
-        self.words, self.remedy = words, remedy
+    """Words and remedy of a failed check."""
 
 
 def check_all(settings: Settings) -> Iterator[Finding]:
@@ -95,19 +90,26 @@ def in_json(findings: Sequence[Finding]) -> str:
 
 def _finding(what: str, check: Callable[[], str]) -> Finding:
     try:
-        return Finding(what, ok=True, words=check())
+        return Finding(what, True, check())
     except _CheckError as error:
-        return Finding(what, ok=False, words=error.words, remedy=error.remedy)
+        return Finding(what, False, *error.args)
+
+
+@contextmanager
+def _or(remedy: str, *kinds: type[Exception], words: str) -> Iterator[None]:
+    """Errors of these kinds within the block are a failed check."""
+    try:
+        yield
+    except kinds as error:
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise _CheckError(f"{words} ({reason}).", remedy) from error
 
 
 def _check_folder(folder: Path, *, min_free: int = MIN_FREE) -> str:
-    try:
+    with _or("Choose another folder with --data or TROMPE_DATA.", OSError, words=f"{folder} cannot be written"):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             free = shutil.disk_usage(folder).free
-    except OSError as error:
-        remedy = "Choose another folder with --data or TROMPE_DATA."
-        raise _CheckError(f"{folder} cannot be written ({error}).", remedy) from error
     if free < min_free:
         raise _CheckError(
             f"only {free / 2**30:.1f} GiB free in {folder}; {min_free / 2**30:.0f} GiB recommended.",
@@ -120,7 +122,8 @@ def _check_store(settings: Settings) -> str:
     from trompe_server.storage.folders import open_folder
 
     name, data = f"doctor-{secrets.token_hex(8)}", b"content"
-    try:
+    remedy = "Check the URL and the access rights (--store, TROMPE_STORE, credentials of the storage's own tools)."
+    with _or(remedy, Exception, words=f"{settings.store_url} does not store a file"):  # fsspec raises any kind
         folder = open_folder(settings.store_url)
         folder.write(name, data)
         try:
@@ -128,11 +131,6 @@ def _check_store(settings: Settings) -> str:
                 raise OSError("reads back other bytes than written")
         finally:
             folder.delete(name)
-    except Exception as error:  # fsspec's file systems raise any kind
-        raise _CheckError(
-            f"{settings.store_url} does not store a file ({error}).",
-            "Check the URL and the access rights (--store, TROMPE_STORE, credentials of the storage's own tools).",
-        ) from error
     return f"{settings.store_url} stores a file"
 
 
@@ -142,7 +140,8 @@ def _check_database(settings: Settings) -> str:
 
     from trompe_server.queue.store import JobStore
 
-    try:
+    remedy = "Start the database or correct its URL (--database, TROMPE_DATABASE). Without tables: trompe migrate"
+    with _or(remedy, TrompeError, sa.exc.SQLAlchemyError, words="the jobs cannot be read"):
         store = JobStore(settings.database_url, silence=settings.silence)
         path = store.engine.url.database if store.engine.dialect.name == "sqlite" else None
         if path is not None and not Path(path).exists():
@@ -150,84 +149,65 @@ def _check_database(settings: Settings) -> str:
         try:
             jobs = ", ".join(f"{count} {state.value}" for state, count in store.counts().items() if count) or "none"
             alive = sum(worker.alive for worker in store.workers())
-            return f"{store.engine.url!r} answers; jobs: {jobs}; attack workers alive: {alive}"
         finally:
             store.close()
-    except (TrompeError, sa.exc.SQLAlchemyError) as error:
-        raise _CheckError(
-            f"the jobs cannot be read ({str(error).splitlines()[0]}).",
-            "Start the database or correct its URL (--database, TROMPE_DATABASE). Without tables: trompe migrate",
-        ) from error
+    return f"{store.engine.url!r} answers; jobs: {jobs}; attack workers alive: {alive}"
 
 
 def _check_torch(device: str) -> str:
-    words = _child(
-        _TORCH,
-        device,
-        failure=f"torch does not compute on {device}",
-        remedy=(
-            "pip install 'trompe[server]'; for a GPU, torch in the build for your driver (https://pytorch.org). "
-            "Or compute on the CPU: --device cpu."
-        ),
+    remedy = (
+        "pip install 'trompe[server]'; for a GPU, torch in the build for your driver (https://pytorch.org). "
+        "Or compute on the CPU: --device cpu."
     )
+    words = _child(_TORCH, device, failure=f"torch does not compute on {device}", remedy=remedy)
     return f"{words}, computes on {device}, {len(os.sched_getaffinity(0))} cores"
 
 
 def _check_renderer(code: str = _RENDERER, *, engine: Sequence[str] = ()) -> str:
-    remedy = "Install EGL and Mesa (Debian and Ubuntu: apt install libegl1 libgl1 libgl1-mesa-dri)."
-    if engine:
-        remedy = (
-            f"Start it to see the cause: trompe render {' '.join(engine)}. docs/engines.md has each engine's needs."
-        )
+    remedy = (
+        f"Start it to see the cause: trompe render {' '.join(engine)}. docs/engines.md has each engine's needs."
+        if engine
+        else "Install EGL and Mesa (Debian and Ubuntu: apt install libegl1 libgl1 libgl1-mesa-dri)."
+    )
     return _child(code, *engine, failure="no image can be rendered", remedy=remedy)
 
 
 def _child(code: str, *arguments: str, failure: str, remedy: str) -> str:
     """Output of ``code`` in a child process: a broken driver may kill the process."""
     command = [sys.executable, "-W", "ignore", "-c", code, *arguments]
-    try:
+    with _or(remedy, subprocess.TimeoutExpired, ChildProcessError, words=failure):
         done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
-    except subprocess.TimeoutExpired as error:
-        raise _CheckError(f"{failure}: no answer in {PATIENCE:.0f} s.", remedy) from error
-    if done.returncode != 0:
-        last = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
-        raise _CheckError(f"{failure} ({last}).", remedy)
+        if done.returncode != 0:
+            raise ChildProcessError((done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1])
     return done.stdout.strip()
 
 
 def _check_shipped() -> str:
     from trompe_server.library import Library
 
-    try:
-        with tempfile.TemporaryDirectory() as empty:
-            library = Library(Path(empty))
-            names = [info.name for info in library.objects()] + [info.name for info in library.classifiers()]
-            return ", ".join(names)
-    except (ImportError, OSError, TrompeError) as error:
-        remedy = "Install trompe again: pip install --force-reinstall 'trompe[server]'"
-        raise _CheckError(f"the shipped objects cannot be read ({error}).", remedy) from error
+    remedy = "Install trompe again: pip install --force-reinstall 'trompe[server]'"
+    with (
+        _or(remedy, ImportError, OSError, TrompeError, words="the shipped objects cannot be read"),
+        tempfile.TemporaryDirectory() as empty,
+    ):
+        library = Library(Path(empty))
+        return ", ".join(info.name for info in (*library.objects(), *library.classifiers()))
 
 
 def _check_port(port: int) -> str:
     """The port is free, or a ``trompe serve`` listens on it."""
-    try:
-        with socket.create_server(("127.0.0.1", port)):
-            return "free for `trompe serve`"
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE and _is_ours(port):
-            return "`trompe serve` is running"
-        raise _CheckError(
-            f"`trompe serve` cannot listen on it ({error.strerror}).",
-            "Stop the program that uses it, or choose another port: trompe serve --port PORT (0: a free one).",
-        ) from error
+    if _is_ours(port):
+        return "`trompe serve` is running"
+    remedy = "Stop the program that uses it, or choose another port: trompe serve --port PORT (0: a free one)."
+    with _or(remedy, OSError, words="`trompe serve` cannot listen on it"), socket.create_server(("127.0.0.1", port)):
+        return "free for `trompe serve`"
 
 
 def _is_ours(port: int) -> bool:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    import httpx
+
     try:
-        connection.request("GET", "/healthz")
-        return bool(json.load(connection.getresponse()) == {"status": "ok"})
-    except (OSError, ValueError, http.client.HTTPException):
+        answer = httpx.get(f"http://127.0.0.1:{port}/healthz", timeout=5, trust_env=False)
+        return bool(answer.json() == {"status": "ok"})
+    except (httpx.HTTPError, ValueError):
         return False
-    finally:
-        connection.close()

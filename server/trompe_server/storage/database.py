@@ -100,11 +100,7 @@ def write(engine: sa.Engine) -> Iterator[sa.Connection]:
         yield connection
 
 
-def patiently(
-    action: Callable[[], T],
-    *,
-    waits: tuple[float, float] = RETRY_WAITS,
-) -> T:
+def patiently(action: Callable[[], T], *, waits: tuple[float, float] = RETRY_WAITS) -> T:
     """Call ``action`` until the database can be reached.
 
     ``action`` must be idempotent: its answer can be lost after the database has committed it.
