@@ -1,24 +1,21 @@
 """Commands of this package for ``trompe``: serve, worker, migrate, demo, doctor."""
 
-import functools
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from typing import TYPE_CHECKING
 
 import click
+from pydantic import ValidationError
 
 from trompe_server.service.doctor import check_all, in_json, in_words
 from trompe_server.settings import Settings
 from trompe_server.system.log import log_to_stderr
-from trompe_shared.errors import TrompeError
+from trompe_shared.errors import SpecError
+from trompe_shared.faults import faults_of
 
 if TYPE_CHECKING:
     from trompe_server.renderers.discovery import RendererAddresses
-
-P = ParamSpec("P")
-R = TypeVar("R")
 
 data_option = click.option(
     "--data", type=click.Path(path_type=Path, file_okay=False), help="Folder of data (or TROMPE_DATA)."
@@ -62,25 +59,17 @@ _executor = click.option(
 )
 
 
-def for_people(command: Callable[P, R]) -> Callable[P, R]:
-    """Print errors as one sentence instead of a traceback."""
-
-    @functools.wraps(command)
-    def run(*args: P.args, **kwargs: P.kwargs) -> R:
-        try:
-            return command(*args, **kwargs)
-        except TrompeError as error:
-            raise click.ClickException(str(error)) from error
-
-    return run
-
-
 def settings_of(data: Path | None, **others: object) -> Settings:
-    """Settings from the environment, overridden by the given options."""
-    given = {"data": data and data.absolute(), **others}
-    return Settings.model_validate(
-        Settings().model_dump() | {k: value for k, value in given.items() if value is not None}
-    )
+    """Settings from the environment, overridden by the given options. Raises ``SpecError``."""
+    options = {"data": data and data.absolute(), **others}
+    given = {name: value for name, value in options.items() if value is not None}
+    try:
+        return Settings.model_validate(Settings().model_dump() | given)
+    except ValidationError as error:
+        wrong = "; ".join(f"{fault} (TROMPE_{fault.place.partition('.')[0].upper()})" for fault in faults_of(error))
+        raise SpecError(
+            f"Invalid settings: {wrong}. Correct the option, or the variable of the environment."
+        ) from error
 
 
 def _announce(line: str) -> None:
@@ -110,7 +99,6 @@ def _announce(line: str) -> None:
 @data_option
 @database_option
 @_store
-@for_people
 def serve(
     host: str,
     port: int,
@@ -141,7 +129,6 @@ def serve(
 @_device
 @_workers
 @_executor
-@for_people
 def worker(data: Path | None, listed: tuple[str, ...], names: tuple[str, ...], **options: str | int | None) -> None:
     """Run the jobs of a database, without the API: in processes of this machine, or on a Ray cluster.
 
@@ -159,7 +146,6 @@ def worker(data: Path | None, listed: tuple[str, ...], names: tuple[str, ...], *
 @click.command()
 @data_option
 @database_option
-@for_people
 def migrate(data: Path | None, database: str | None) -> None:
     """Create or upgrade the tables in the database."""
     from trompe_server.service.dispatch import prepare_data

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from trompe_server.service.commands import data_option, database_option, for_people, settings_of
+from trompe_server.service.commands import data_option, database_option, settings_of
 from trompe_server.settings import Settings
 from trompe_server.storage.tokens import Right, Token, Tokens
 
@@ -37,7 +37,6 @@ def token() -> None:
 )
 @_json
 @_where
-@for_people
 def create(name: str, right: str, as_json: bool, data: Path | None, database: str | None) -> None:
     """Create a token called NAME. Its secret is printed once and not stored."""
     with _tokens(settings_of(data, database=database)) as tokens:
@@ -52,7 +51,6 @@ def create(name: str, right: str, as_json: bool, data: Path | None, database: st
 @token.command("list")
 @_json
 @_where
-@for_people
 def show(as_json: bool, data: Path | None, database: str | None) -> None:
     """List all tokens, revoked ones included."""
     with _tokens(settings_of(data, database=database)) as tokens:
@@ -70,7 +68,6 @@ def show(as_json: bool, data: Path | None, database: str | None) -> None:
 @token.command()
 @click.argument("name")
 @_where
-@for_people
 def revoke(name: str, data: Path | None, database: str | None) -> None:
     """Revoke the token NAME; running servers refuse it within a second."""
     with _tokens(settings_of(data, database=database)) as tokens:

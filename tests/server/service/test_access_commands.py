@@ -6,17 +6,17 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from trompe_client.cli import main
 from trompe_server.errors import ServiceError
 from trompe_server.queue.store import JobStore
 from trompe_server.service import serve as serving
-from trompe_server.service.token_command import token
 from trompe_server.settings import Settings
 from trompe_server.storage.tokens import Right, Tokens, hash_secret
 
 
 def run(data: Path, *words: str) -> tuple[int, str]:
     """Exit status and standard output of ``trompe token`` with these words."""
-    result = CliRunner().invoke(token, [*words, "--data", str(data)])
+    result = CliRunner().invoke(main, ["token", *words, "--data", str(data)])
     return result.exit_code, result.stdout if result.exit_code == 0 else result.output
 
 
@@ -51,7 +51,7 @@ def test_tokens_are_listed_with_what_became_of_them(tmp_path: Path) -> None:
     ("words", "status", "reason"),
     [
         (["create", "ann"], 1, "name 'ann' is in use"),
-        (["create", "a b"], 1, "not a valid token name"),
+        (["create", "a b"], 2, "not a valid token name"),
         (["create", "eve", "--right", "admin"], 2, "is not one of"),
         (["revoke", "eve"], 1, "no token 'eve'"),
     ],

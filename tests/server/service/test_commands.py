@@ -6,12 +6,13 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from trompe_client.cli import main
 from trompe_server.service import commands
 from trompe_server.settings import Settings
 
 
 def run(command: click.Command, *arguments: str) -> tuple[int, str]:
-    result = CliRunner().invoke(command, arguments)
+    result = CliRunner().invoke(main, [str(command.name), *arguments])
     return result.exit_code, result.output
 
 
@@ -66,6 +67,17 @@ def test_worker_refuses_a_renderer_that_is_no_address(tmp_path: Path, address: s
     status, words = run(commands.worker, "--data", str(tmp_path), "--renderer", address)
     assert status == 2
     assert "is not HOST:PORT" in words
+
+
+def test_wrong_settings_are_named_with_their_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    status, words = run(commands.serve, "--data", str(tmp_path), "--executor", "dask")
+    assert status == 2
+    assert "executor: String should match" in words
+    monkeypatch.setenv("TROMPE_WORKERS", "many")
+    status, words = run(commands.migrate, "--data", str(tmp_path))
+    assert status == 2
+    assert "workers: Input should be a valid integer" in words
+    assert "(TROMPE_WORKERS)" in words
 
 
 def test_the_data_folder_is_set_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
