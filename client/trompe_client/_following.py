@@ -44,21 +44,18 @@ class Followed:
 async def wait(port: Port, job: Followed, *, timeout: float | None, show: Callable[[Event], None]) -> None:
     """Follow a job to its end. Raises ``JobFailed``, ``JobCancelled``, ``WaitTimeout``, ``ServerUnreachable``."""
     deadline = None if timeout is None else time.monotonic() + timeout
-    async with aclosing(_follow(port, job, deadline)) as events:
+    async with aclosing(follow(port, job, deadline)) as events:
         async for event in events:
             show(event)
     while not (await refresh_patiently(port, job, deadline)).state.final:
         await port.sleep(PAUSE)
-    _raise_unless_done(job)
+    error = failure(job.status)
+    if error is not None:
+        raise error
 
 
-def follow(port: Port, job: Followed) -> AsyncGenerator[Event, None]:
-    """All events of a job, as they happen."""
-    return _follow(port, job, None)
-
-
-async def _follow(port: Port, job: Followed, deadline: float | None) -> AsyncGenerator[Event, None]:
-    """Events until the final one; each connection resumes after the last event seen."""
+async def follow(port: Port, job: Followed, deadline: float | None = None) -> AsyncGenerator[Event, None]:
+    """Events as they happen, until the final one; each connection resumes after the last event seen."""
     last: int | None = None
     over = False
     while True:
@@ -108,12 +105,6 @@ async def refresh_patiently(port: Port, job: Followed, deadline: float | None = 
 def _check_time(job: Followed, deadline: float | None) -> None:
     if deadline is not None and time.monotonic() > deadline:
         raise WaitTimeout(f"Job {job.id} is still {job.state.value}; it continues.", job=job.status)
-
-
-def _raise_unless_done(job: Followed) -> None:
-    error = failure(job.status)
-    if error is not None:
-        raise error
 
 
 def failure(job: Job) -> JobFailed | JobCancelled | None:

@@ -1,29 +1,16 @@
 """Requests with retries, and operations of several requests. Coroutines over a ``Port``."""
 
-from collections.abc import AsyncGenerator, Callable, Mapping
-from typing import Any, Protocol, TypeVar
+from collections.abc import AsyncGenerator, Callable
+from typing import Any, TypeVar
 
 from trompe_client import _core
 from trompe_client._core import JobFilter, Request
 from trompe_client._errors import ClientError
-from trompe_client._plan import Upload
+from trompe_client._plan import Plan, R, Upload
 from trompe_client._port import Answer, Port
-from trompe_shared.api import Job, JobRequest, JudgementRequest
+from trompe_shared.api import Job
 
 T = TypeVar("T")
-R = TypeVar("R", bound=JobRequest | JudgementRequest, covariant=True)
-
-
-class Plan(Protocol[R]):
-    """A request whose files are not yet on the server."""
-
-    def uploads(self) -> list[Upload]:
-        """Files to send before it."""
-        ...
-
-    def request(self, ids: Mapping[Upload, str]) -> R:
-        """The request with ids in place of files."""
-        ...
 
 
 async def send(port: Port, request: Request[T]) -> T:

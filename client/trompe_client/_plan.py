@@ -4,10 +4,10 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Generic, Self, TypeVar
 
 from pydantic import ValidationError
 
@@ -34,6 +34,7 @@ from trompe_shared.local_files import (
 
 StoredKind = type[ObjectInfo | ClassifierInfo | BackgroundInfo]
 Source = str | Path
+R = TypeVar("R", JobRequest, JudgementRequest)
 
 
 @dataclass(frozen=True)
@@ -61,43 +62,35 @@ class Upload:
 
 
 @dataclass(frozen=True)
-class AttackPlan:
-    """A job by keyword, with an ``Upload`` in place of each file."""
+class Plan(Generic[R]):
+    """A request by keyword, with an ``Upload`` in place of each file; ``make`` checks it."""
 
     options: Mapping[str, Any]
+    make: Callable[..., R]
 
     def uploads(self) -> list[Upload]:
-        """Files to send before the job, each once."""
-        return _uploads(self.options)
+        """Files to send before the request, each once."""
+        found = (each for value in self.options.values() for each in _items(value) if isinstance(each, Upload))
+        return list(dict.fromkeys(found))
 
-    def request(self, ids: Mapping[Upload, str]) -> JobRequest:
-        """The job with ids in place of files; a file without an id keeps its name. Raises ``SpecError``."""
-        fields = _with_ids(self.options, ids)
-        object = fields.pop("object")
-        try:
-            return JobRequest.model_validate({"object": object, **in_parts(fields)})
-        except ValidationError as error:
-            raise SpecError(f"Invalid options: {'; '.join(map(_by_keyword, faults_of(error)))}.") from error
+    def request(self, ids: Mapping[Upload, str]) -> R:
+        """The request with ids in place of files; a file without an id keeps its name. Raises ``SpecError``."""
+        return self.make(**_with_ids(self.options, ids))
 
-
-@dataclass(frozen=True)
-class JudgementPlan:
-    """A judgement by keyword, with an ``Upload`` in place of each file."""
-
-    options: Mapping[str, Any]
-
-    def uploads(self) -> list[Upload]:
-        """Files to send before the judgement, each once."""
-        return _uploads(self.options)
-
-    def request(self, ids: Mapping[Upload, str]) -> JudgementRequest:
-        """The judgement with ids in place of files; a file without an id keeps its name. Raises ``SpecError``."""
-        return JudgementRequest.of(**_with_ids(self.options, ids))
+    def checked(self) -> Self:
+        """The plan itself. Raises ``SpecError`` for invalid options."""
+        self.request({})
+        return self
 
 
-def _uploads(options: Mapping[str, Any]) -> list[Upload]:
-    found = (each for value in options.values() for each in _items(value) if isinstance(each, Upload))
-    return list(dict.fromkeys(found))
+AttackPlan = Plan[JobRequest]
+
+
+def _job_request(*, object: str, **options: Any) -> JobRequest:
+    try:
+        return JobRequest.model_validate({"object": object, **in_parts(options)})
+    except ValidationError as error:
+        raise SpecError(f"Invalid options: {'; '.join(map(_by_keyword, faults_of(error)))}.") from error
 
 
 def _with_ids(value: Any, ids: Mapping[Upload, str]) -> Any:
@@ -145,12 +138,10 @@ def plan_attack(object: Source, *, read: Read = source_of, **options: Any) -> At
         else:
             several = option.repeated and isinstance(value, str | Path)
             planned[keyword] = _read_all([value] if several else value, partial(read, option.file))
-    plan = AttackPlan(planned)
-    plan.request({})
-    return plan
+    return Plan(planned, _job_request).checked()
 
 
-def plan_judgement(before: Source, after: Source, **options: Any) -> JudgementPlan:
+def plan_judgement(before: Source, after: Source, **options: Any) -> Plan[JudgementRequest]:
     """Read the files of a judgement and check its options (``JudgementRequest``).
 
     Raises ``ObjectError``, ``ClassifierError`` or ``SpecError``.
@@ -158,9 +149,7 @@ def plan_judgement(before: Source, after: Source, **options: Any) -> JudgementPl
     planned = options | {"before": object_source(before), "after": object_source(after)}
     if "networks" in options:
         planned["networks"] = [classifier_source(each) for each in options["networks"]]
-    plan = JudgementPlan(planned)
-    plan.request({})
-    return plan
+    return Plan(planned, JudgementRequest.of).checked()
 
 
 def _read_all(value: Any, read: Callable[[Source], Upload | str]) -> Any:
@@ -188,17 +177,12 @@ def object_source(source: Source) -> Upload | str:
     return object_upload(path) if is_path or (path.is_dir() and models_in(path)) else str(source)
 
 
-def object_upload(path: Path) -> Upload:
+def object_upload(path: Path, *, name: str | None = None) -> Upload:
     """A zip, a model file (an .obj or .gltf with the files beside it), or a folder with one.
 
-    Raises ``ObjectError``.
+    name: to store it under; default: the file's. Raises ``ObjectError``.
     """
-    return Upload(*model_file(path))
-
-
-def named_object_upload(path: Path, name: str | None) -> Upload:
-    """An object to store under ``name``, or under the file's name."""
-    return replace(object_upload(path), form={"name": name} if name else {})
+    return Upload(*model_file(path), form={"name": name} if name else {})
 
 
 def classifier_source(source: Source) -> Upload | str:
