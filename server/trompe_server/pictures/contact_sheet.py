@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 
 from trompe_server.pictures.layout import (
     CAPTION,
@@ -16,7 +16,6 @@ from trompe_server.pictures.layout import (
     Images,
     beside,
     captioned,
-    framed,
     line,
     sheet,
     shortened,
@@ -108,6 +107,6 @@ def contact_sheet(
 def _judged(image: Images, verdict: Verdict) -> Image.Image:
     """One framed image; below it the first name of the class, shortened, and the confidence."""
     colour = GREEN if verdict.correct else RED
-    picture = framed(tile(image, TILE), colour, thickness=FRAME)
+    picture = ImageOps.expand(tile(image, TILE), FRAME, colour)
     name = shortened(verdict.label.split(",")[0], TILE - CONFIDENCE, size=CAPTION)
     return captioned(picture, f"{name} {verdict.confidence:.0%}", colour=colour)

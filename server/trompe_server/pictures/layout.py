@@ -86,13 +86,6 @@ def tile(image: Images, width: int) -> Image.Image:
     )
 
 
-def framed(picture: Image.Image, colour: Colour, *, thickness: int) -> Image.Image:
-    """The picture with a frame of ``thickness`` on each side."""
-    frame = Image.new("RGB", (picture.width + 2 * thickness, picture.height + 2 * thickness), colour)
-    frame.paste(picture, (thickness, thickness))
-    return frame
-
-
 def captioned(picture: Image.Image, text: str, *, colour: Colour = INK) -> Image.Image:
     """The picture with one centred line of text below, shortened to its width."""
     return stacked([picture, line(text, picture.width, colour=colour, align="centre")], gap=0)

@@ -3,9 +3,9 @@
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float
-from numpy.typing import NDArray
+from jaxtyping import Float
 from PIL import Image
+from scipy.ndimage import binary_erosion
 
 from trompe_server.pictures.heat import OUTLINE, heat_legend, heat_over
 from trompe_server.pictures.layout import Images, captioned, sheet, tile
@@ -29,13 +29,5 @@ def _card(image: Images, saliency: Float[np.ndarray, "H W"], tau: float | None) 
     mask = saliency >= tau
     large = np.array(Image.fromarray(mask).resize(painted.size, Image.Resampling.NEAREST))
     outlined = np.array(painted)
-    outlined[_outline(large)] = OUTLINE
+    outlined[large & ~binary_erosion(large)] = OUTLINE  # its pixels with a neighbour outside
     return captioned(Image.fromarray(outlined), f"{mask.mean():.1%} of pixels at or above {tau:g}")
-
-
-def _outline(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Pixels of the mask with a neighbour outside it."""
-    padded = np.pad(mask, 1)
-    inside = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
-    outline: NDArray[np.bool_] = mask & ~inside
-    return outline

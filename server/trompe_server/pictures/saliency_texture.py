@@ -6,10 +6,10 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 
 from trompe_server.pictures.heat import heat_legend, heat_over
-from trompe_server.pictures.layout import INK, Images, beside, captioned, framed, sheet, tile
+from trompe_server.pictures.layout import INK, Images, beside, captioned, sheet, tile
 
 TILE: Final = 336
 OBJECT_TILE: Final = 224
@@ -76,4 +76,4 @@ def _texels_with_half(score: Float[np.ndarray, "H W"]) -> int:
 
 
 def _framed(image: Images, width: int) -> Image.Image:
-    return framed(tile(image, width), INK, thickness=1)
+    return ImageOps.expand(tile(image, width), 1, INK)
