@@ -17,7 +17,7 @@ from trompe_server.storage.folders import JobArtifacts
 
 PART: Final = 256 * 2**10
 REMEMBERED: Final = 10_000
-_RANGE: Final = re.compile(r"bytes=(\d*)-(\d*)")
+_RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 _PACKED: Final = frozenset({".gif", ".jpg", ".npz", ".png", ".webp", ".zip"})
 """Suffixes of compressed files."""
 

@@ -1,5 +1,6 @@
 """Routes for jobs: submit, list, read, cancel, retry, follow, download, delete."""
 
+import re
 from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Annotated, Any, Final
@@ -126,8 +127,8 @@ def follow_job(
 ) -> EventSourceResponse:
     """Events of a job from the first, or after ``Last-Event-ID``, to the last."""
     store.get(job)
-    known = last_event_id is not None and last_event_id.isascii() and last_event_id.isdecimal()
-    return follow(store, job, after=min(int(last_event_id or 0), 2**31 - 1) if known else 0)
+    seen = re.fullmatch(r"\d+", last_event_id or "", re.ASCII)
+    return follow(store, job, after=min(int(seen[0][:10]), 2**31 - 1) if seen else 0)
 
 
 @router.get("/{job}/result", response_model=Result, responses=examples.found(examples.RESULT) | examples.PART_ANSWERS)

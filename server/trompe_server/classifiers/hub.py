@@ -21,7 +21,7 @@ def hub_file(repository: str, name: str, *, extra: str) -> Path:
     hub = import_extra("huggingface_hub", extra=extra)
     try:
         return Path(hub.hf_hub_download(repository, name))
-    except OSError as error:
+    except (OSError, ValueError) as error:  # a ValueError for names that the hub forbids
         raise ClassifierError(
             f"{name!r} of {repository!r} is neither in the cache of the Hugging Face hub nor can be downloaded "
             f"({str(error).strip().splitlines()[0][:200]}). Check the name and the network; only safetensors are read."

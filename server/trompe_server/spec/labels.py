@@ -2,9 +2,13 @@
 
 from collections.abc import Sequence
 from difflib import get_close_matches
+from typing import Final
 
 from trompe_server.spec.checks import check_labels
 from trompe_shared.errors import LabelError
+
+MOST_DIGITS: Final = 18
+"""Digits of an index; Python refuses to convert thousands."""
 
 
 def resolve_labels(
@@ -28,7 +32,7 @@ def resolve_label(label: str | int, classes: Sequence[str] | None, n_classes: in
     range, and for a name of no class or of several.
     """
     if isinstance(label, int) or label.strip().isdecimal():
-        return _checked_index(int(label), n_classes, classifier)
+        return _checked_index(str(label).strip(), n_classes, classifier)
     if classes is None:
         raise LabelError(
             f"{classifier!r} has no class names to find {label!r} in; give an index in 0..{n_classes - 1}."
@@ -41,10 +45,12 @@ def resolve_label(label: str | int, classes: Sequence[str] | None, n_classes: in
     return fits[0]
 
 
-def _checked_index(index: int, n_classes: int, classifier: str) -> int:
-    if not 0 <= index < n_classes:
-        raise LabelError(f"{index} is not a class of {classifier!r}; its indices are 0..{n_classes - 1}.")
-    return index
+def _checked_index(digits: str, n_classes: int, classifier: str) -> int:
+    if len(digits) > MOST_DIGITS or not 0 <= int(digits) < n_classes:
+        raise LabelError(
+            f"{digits[:MOST_DIGITS]} is not a class of {classifier!r}; its indices are 0..{n_classes - 1}."
+        )
+    return int(digits)
 
 
 def _synonyms(name: str) -> list[str]:

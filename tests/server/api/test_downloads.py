@@ -98,6 +98,7 @@ def test_a_file_of_a_job_that_goes_on_is_hashed_anew_each_time(stocked: Api) -> 
         ("bytes=0-1,4-5", 200, TEN),
         ("bytes=-", 200, TEN),
         ("bytes=a-b", 200, TEN),
+        (f"bytes=0-{'9' * 5000}", 200, TEN),
         ("lines=1-2", 200, TEN),
     ],
 )

@@ -130,6 +130,8 @@ def test_names_and_weights_that_are_nowhere_are_errors(timm: Any, hub: Callable[
         load_classifier("timm:resnet18")
     with pytest.raises(ClassifierError, match="expected ORG/MODEL"):
         load_classifier("hf:../secret")
+    with pytest.raises(ClassifierError, match=r"'org/a--b' is neither in the cache.*Check the name"):
+        load_classifier("hf:org/a--b")
     with pytest.raises(ClassifierError, match="leave out weights"):
         load_classifier("hf:org/model", weights="x.pth")
 
