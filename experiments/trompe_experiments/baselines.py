@@ -37,22 +37,11 @@ def baselines_chart(rows: Sequence[JudgedRow]) -> Drawing:
 def baselines_markdown(rows: Sequence[JudgedRow]) -> str:
     """A line for each method: means over the objects that are recognised in some view."""
     head = ["method", "A_drop", "at half size", "JPEG 30", "CIEDE2000", "seconds"]
-    return (
-        markdown_table(
-            head, [[method, *_means(own)] for method, own in grouped(rows, lambda r: r.case).items()], align="lrrrrr"
-        )
-        + "\n"
-    )
+    lines = [[method, *_means(own)] for method, own in grouped(rows, lambda row: row.case).items()]
+    return markdown_table(head, lines, align="lrrrrr") + "\n"
 
 
 def _means(rows: Sequence[JudgedRow]) -> list[str]:
-    drops = [figure_words(average(getattr(row, name) for row in rows)) for name in _DROPS]
-    return [
-        f"**{drops[0]}**",
-        *drops[1:],
-        *(figure_words(average(getattr(row, n) for row in rows), f) for n, f in _REST),
-    ]
-
-
-_DROPS = ("a_drop", "half_size_drop", "jpeg_drop")
-_REST = (("delta_e", ".1f"), ("seconds", ".0f"))
+    columns = {"a_drop": ".2f", "half_size_drop": ".2f", "jpeg_drop": ".2f", "delta_e": ".1f", "seconds": ".0f"}
+    drop, *others = (figure_words(average(getattr(row, name) for row in rows), form) for name, form in columns.items())
+    return [f"**{drop}**", *others]

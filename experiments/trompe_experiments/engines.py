@@ -1,6 +1,6 @@
 """Renderers side by side: how well the surrogate agrees with each, and what the paint keeps in it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 from trompe_experiments.markdown import figure_words, markdown_table
@@ -46,7 +46,7 @@ def engines_markdown(rows: Sequence[ResultRow]) -> str:
             f"{epsilon:g}",
             str(len(some)),
             figure_words(average(row.disagreement for row in some), ".1%"),
-            figure_words(max(_known(row.margin_error for row in some), default=None), ".3f"),
+            figure_words(max((row.margin_error for row in some if row.margin_error is not None), default=None), ".3f"),
             f"**{figure_words(average(row.judged_drop for row in some))}**",
         ]
         for (engine, epsilon), some in grouped(rows, lambda row: (row.renderers, row.epsilon)).items()
@@ -56,7 +56,3 @@ def engines_markdown(rows: Sequence[ResultRow]) -> str:
 
 def _what(row: ResultRow) -> str:
     return f"{row.object}, ε {row.epsilon:g}"
-
-
-def _known(values: Iterable[float | None]) -> list[float]:
-    return [value for value in values if value is not None]

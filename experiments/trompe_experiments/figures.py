@@ -8,7 +8,7 @@ from trompe_experiments.baselines import baselines_chart, baselines_markdown
 from trompe_experiments.between import between_chart, between_markdown
 from trompe_experiments.engines import engines_chart, engines_markdown
 from trompe_experiments.histograms import prediction_histograms
-from trompe_experiments.judged import JudgedRow, read_judgements
+from trompe_experiments.judged import JUDGEMENTS, JudgedRow
 from trompe_experiments.paper import paper_means_markdown, table_one_chart, table_one_markdown
 from trompe_experiments.pareto import pareto_markdown, speed_accuracy_chart
 from trompe_experiments.scatter import texels_scatter
@@ -56,9 +56,9 @@ def read_data(folder: Path) -> Data:
     rows = read_table(folder / RESULTS, ResultRow)
     if not rows:
         raise SpecError(f"{str(folder / RESULTS)!r} has no rows yet; `trompe experiment run` writes them as jobs end.")
-    path = folder / PREDICTIONS
-    predictions = tuple(read_table(path, PredictionRow)) if path.exists() else ()
-    return Data(folder, tuple(rows), predictions, tuple(read_judgements(folder)))
+    predictions = read_table(folder / PREDICTIONS, PredictionRow, optional=True)
+    judgements = read_table(folder / JUDGEMENTS, JudgedRow, optional=True)
+    return Data(folder, tuple(rows), tuple(predictions), tuple(judgements))
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ def judge_all(
     for a judgement without figures.
     """
     path = folder / JUDGEMENTS
-    known = {(row.object, row.case): row for row in read_judgements(folder)}
+    known = {(row.object, row.case): row for row in read_table(path, JudgedRow, optional=True)}
     rows: list[JudgedRow] = []
     for name, own in grouped(plan.rows, lambda row: row.object).items():
         for place, after in _judged(own, folder):
@@ -94,12 +94,6 @@ def judge_all(
             rows.append(row)
             write_table(path, rows, JudgedRow)
     return rows
-
-
-def read_judgements(folder: Path) -> list[JudgedRow]:
-    """The rows of a folder; none without the table."""
-    path = folder / JUDGEMENTS
-    return read_table(path, JudgedRow) if path.exists() else []
 
 
 def noised(obj: Object3D, epsilon: float, *, seed: int) -> Object3D:

@@ -6,7 +6,6 @@ their jobs are not run again.
 """
 
 import time
-from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -32,6 +31,7 @@ from trompe_experiments.table import (
     write_table,
 )
 from trompe_shared.api import Job, JobState, Result
+from trompe_shared.comparison import grouped
 from trompe_shared.errors import SpecError
 
 PAUSE: Final = 1.0
@@ -204,9 +204,7 @@ class _Tables:
     def of(cls, wanted: Collection[str], folder: Path) -> "_Tables":
         """The tables in ``folder``, if any. Raises ``SpecError`` for unreadable ones, and for rows that the new tables
         would lose: of jobs not ``wanted`` and without a folder."""
-        if not (folder / RESULTS).exists():
-            return cls({}, {})
-        table = {row.key: row for row in read_table(folder / RESULTS, ResultRow)}
+        table = {row.key: row for row in read_table(folder / RESULTS, ResultRow, optional=True)}
         rows = {key: row for key, row in table.items() if not (folder / "jobs" / key).exists()}
         lost = [row for key, row in rows.items() if key not in wanted]
         if lost:
@@ -215,11 +213,8 @@ class _Tables:
                 f"such as {lost[0].object}, {lost[0].configuration}, and would lose them: choose another --out, or "
                 "move the table."
             )
-        predictions = defaultdict(list)
-        if (folder / PREDICTIONS).exists():
-            for each in read_table(folder / PREDICTIONS, PredictionRow):
-                predictions[each.key].append(each)
-        return cls(rows, predictions)
+        predictions = read_table(folder / PREDICTIONS, PredictionRow, optional=True) if rows else []
+        return cls(rows, grouped(predictions, lambda each: each.key))
 
     def finished(self, key: str) -> Finished | None:
         """A job by its row."""

@@ -269,12 +269,14 @@ def _cell(value: object) -> object:
     return f"{value:.6g}" if isinstance(value, float) else value
 
 
-def read_table(path: Path, kind: type[R]) -> list[R]:
-    """The rows of a CSV file. Raises ``SpecError`` for a file without rows of ``kind``."""
+def read_table(path: Path, kind: type[R], *, optional: bool = False) -> list[R]:
+    """The rows of a CSV file; none for a missing ``optional`` one. Raises ``SpecError``."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             return [kind.model_validate(_filled(row, kind)) for row in csv.DictReader(file)]
     except FileNotFoundError as error:
+        if optional:
+            return []
         raise SpecError(f"No table {str(path)!r}; `trompe experiment run` writes it.") from error
     except (ValidationError, csv.Error, UnicodeDecodeError) as error:
         told = " ".join(str(error).splitlines()[:3])

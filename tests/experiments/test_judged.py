@@ -12,7 +12,8 @@ from tests.experiments.test_run import FakeService, Silent
 from trompe_experiments import Experiment, Plan, load_experiment, plan_experiment, run_experiment
 from trompe_experiments.baselines import baselines_markdown
 from trompe_experiments.figures import read_data
-from trompe_experiments.judged import NOISE, NOTHING, JudgedRow, judge_all, noised, read_judgements
+from trompe_experiments.judged import JUDGEMENTS, NOISE, NOTHING, JudgedRow, judge_all, noised
+from trompe_experiments.table import read_table
 from trompe_server.api.examples import MANIFEST
 from trompe_shared.api import Job, JudgementRequest, Manifest
 from trompe_shared.object3d import load_object
@@ -76,7 +77,7 @@ def test_each_object_is_judged_as_it_is_with_noise_and_painted(plan: Plan, tmp_p
 def test_rows_are_kept_and_made_into_a_table_and_a_chart(plan: Plan, tmp_path: Path) -> None:
     first = judged(plan, JudgingService(), tmp_path)
     again = JudgingService()
-    assert judged(plan, again, tmp_path) == read_judgements(tmp_path)
+    assert judged(plan, again, tmp_path) == read_table(tmp_path / JUDGEMENTS, JudgedRow)
     assert again.judged == []
     table = baselines_markdown(first).splitlines()
     assert table[0] == "| method | A_drop | at half size | JPEG 30 | CIEDE2000 | seconds |"

@@ -52,16 +52,14 @@ class Behaviour:
             return True
         if self.target is None:
             return False
-        overrated = self.surrogate is not None and self.surrogate - self.target > TRUSTED_GAP
-        return overrated or _much_less(self.held_out, reference.held_out if reference else None)
+        if self.surrogate is not None and self.surrogate - self.target > TRUSTED_GAP:
+            return True
+        usual = reference.held_out if reference else None
+        return self.held_out is not None and usual is not None and self.held_out < FINE * usual
 
     def unnoticed(self, reference: "Behaviour | None") -> bool:
         """Whether it is broken and most of its jobs did not warn although they could have."""
         return self.broken(reference) and self.noticed < 0.5 and not self.unforeseen
-
-
-def _much_less(value: float | None, reference: float | None) -> bool:
-    return value is not None and reference is not None and value < FINE * reference
 
 
 def behaviours(rows: Sequence[ResultRow]) -> list[Behaviour]:
