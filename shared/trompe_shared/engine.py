@@ -5,7 +5,10 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Final
 
+from pydantic import TypeAdapter, ValidationError
+
 from trompe_shared.errors import ProtocolError
+from trompe_shared.faults import faults_of
 
 __all__ = ["DEFAULT_ENGINE", "EngineInfo"]
 
@@ -30,7 +33,7 @@ class EngineInfo:
     def __str__(self) -> str:
         return f"{self.name} {self.version}".strip() + (f" ({self.settings})" if self.settings else "")
 
-    def named(self, among: "Iterable[EngineInfo]") -> str:
+    def named(self, among: Iterable["EngineInfo"]) -> str:
         """The name alone if no other engine ``among`` these has it, else the whole identity."""
         return str(self) if any(each.name == self.name and each != self for each in among) else self.name
 
@@ -42,6 +45,7 @@ class EngineInfo:
     def from_text(cls, text: str) -> "EngineInfo":
         """Inverse of ``to_text``. Raises ``ProtocolError`` for any other text."""
         try:
-            return cls(**json.loads(text))
-        except (ValueError, TypeError) as error:
-            raise ProtocolError(f"{text!r} is not the identity of an engine ({error}).") from error
+            return TypeAdapter(cls).validate_json(text, strict=True)
+        except ValidationError as error:
+            faults = "; ".join(map(str, faults_of(error)))
+            raise ProtocolError(f"{text!r} is not the identity of an engine ({faults}).") from error

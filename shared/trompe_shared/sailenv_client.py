@@ -121,6 +121,8 @@ class SailenvTarget:
     def _connection(self, size: Size) -> "_Connection":
         if size not in self._connections:
             self._connections[size] = _Connection(self._host, self._port, size, self._timeout)
+            if self._aborted:
+                raise RendererLostError("it was aborted.")
             self._connections[size].register()
             found = self._connections[size].engine
             self._engine = self._engine or found
@@ -163,7 +165,10 @@ class _Connection:
         self._size = size
         self._told: dict[tuple[str, Any], Mapping[str, Any]] = {}
         self._shown: tuple[int, Object3D] | None = None
-        self._socket = socket.create_connection((host, port), timeout=min(timeout, CONNECT_TIMEOUT))
+        try:
+            self._socket = socket.create_connection((host, port), timeout=min(timeout, CONNECT_TIMEOUT))
+        except UnicodeError as error:  # of a host name with an empty or too long label
+            raise OSError(error) from error
         self._socket.settimeout(timeout)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._extended = False

@@ -245,6 +245,23 @@ def running_server(listener: Any = None, **limits: Any) -> Iterator[Server]:
         thread.join(timeout=240)
 
 
+def test_an_agent_for_whom_there_is_no_thread_is_let_go_and_the_next_one_is_served(
+    wire: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = threading.Thread.start
+
+    def start_but_the_first(thread: threading.Thread) -> None:
+        if thread.name == "agent-0":
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", start_but_the_first)
+    with running_server(agents=1) as server:
+        with socket.create_connection(server.address, timeout=240) as connection:
+            assert is_closed(connection)
+        assert wire(server.address).agent == 1
+
+
 @pytest.fixture
 def broken(wire: Connect) -> Iterator[Wire]:
     """An agent of a server whose renderer fails."""

@@ -1,7 +1,6 @@
 """``trompe render --check``: the findings line by line."""
 
 import contextlib
-import re
 from collections.abc import Mapping
 
 import click
@@ -24,10 +23,10 @@ def check_engine(name: str, settings: Mapping[str, str]) -> bool:
 
 def check_at(address: str) -> bool:
     """Check the renderer at HOST:PORT likewise. Raises ``RendererError`` if there is none."""
-    found = re.fullmatch(r"(.+):(\d{1,5})", address)
-    if found is None:
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
         raise RendererError(f"--check {address}: expected HOST:PORT of a running renderer, or nothing for --engine.")
-    with contextlib.closing(SailenvTarget(found[1].strip("[]"), int(found[2]))) as target:
+    with contextlib.closing(SailenvTarget(host.strip("[]"), int(port))) as target:
         return _report(target.render, target.engine)
 
 

@@ -1,6 +1,6 @@
 """The commands that upload, spawn, move and repaint objects."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -104,7 +104,7 @@ class ObjectCommands:
     def despawn_object(self, *, instance: int) -> tuple[()]:
         self._spawned_object(instance)
         del self._spawned[instance]
-        self._cache.textures.hold(self, self._texture_size())
+        self._cache.textures.hold(self, _texture_size(item.model for item in self._spawned.values()))
         return ()
 
     def move_object(self, *, instance: int, position: Vector, rotation: Vector) -> tuple[()]:
@@ -117,22 +117,17 @@ class ObjectCommands:
         painted = self._spawned_object(instance)
         pictures = {name: np.frombuffer(data, np.uint8).reshape(h, w, 3) for name, (h, w, data) in textures}
         model = repainted(painted.model, pictures)
-        self._admit(model)
+        self._admit(model, instead_of=instance)
         self._spawned[instance] = replace(painted, model=model)
         return ()
 
-    def _admit(self, model: HashedModel) -> None:
-        """Raise ``RendererError`` if the textures of ``model`` and of all spawned objects exceed the limit."""
-        size, limit = self._texture_size(model), self._limits.textures
+    def _admit(self, model: HashedModel, *, instead_of: int | None = None) -> None:
+        """Raise ``RendererError`` if the textures of ``model`` and of all other spawned objects exceed the limit."""
+        others = (item.model for number, item in self._spawned.items() if number != instead_of)
+        size, limit = _texture_size([model, *others]), self._limits.textures
         if size > limit:
             raise RendererError(f"The spawned objects' textures take more than {limit // MIB} MiB. Despawn some first.")
         self._cache.textures.hold(self, size)
-
-    def _texture_size(self, *more: HashedModel) -> int:
-        """Bytes of the textures of all spawned objects and of ``more``."""
-        models = [*more, *(item.model for item in self._spawned.values())]
-        sizes = {id(texture): texture.nbytes for each in models for texture in each.obj.textures.values()}
-        return sum(sizes.values())
 
     def get_spawnable_objects_names(self) -> tuple[Sequence[str]]:
         return (list(shipped_objects()),)
@@ -144,6 +139,12 @@ class ObjectCommands:
         if instance not in self._spawned:
             raise RendererError(f"No object {instance} is spawned; there are {sorted(self._spawned)}.")
         return self._spawned[instance]
+
+
+def _texture_size(models: Iterable[HashedModel]) -> int:
+    """Bytes of the textures of all models; one that several share counts once."""
+    sizes = {id(texture): texture.nbytes for each in models for texture in each.obj.textures.values()}
+    return sum(sizes.values())
 
 
 def _checked_pose(position: Vector, degrees: Vector) -> Pose:

@@ -46,7 +46,7 @@ class Server:
                 break
             try:
                 self._accept(number)
-            except OSError as error:  # no file descriptor left, or the agent is gone already
+            except (OSError, RuntimeError) as error:  # no file descriptor or thread left, or the agent is gone already
                 log.warning("agent %d: cannot be accepted: %s", number, error)
                 time.sleep(RETRY_PAUSE)
         self._finish()
@@ -65,7 +65,12 @@ class Server:
         link = Link(connection, self._shared.requests, self._limits)
         thread = threading.Thread(target=self._serve, args=(link, number), daemon=True, name=f"agent-{number}")
         self._agents[number] = link, thread
-        thread.start()
+        try:
+            thread.start()
+        except RuntimeError:
+            del self._agents[number]
+            link.close()
+            raise
 
     def _finish(self) -> None:
         self._shared.stopping.set()

@@ -14,7 +14,7 @@ import pytest
 from tests.served import reserved_port, wait_until
 from tests.small_models import OBJ
 from trompe_server.renderers import SailenvTarget, local_renderer
-from trompe_shared.errors import RendererError
+from trompe_shared.errors import RendererError, RendererLostError
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, encode_png, object_from_files
 from trompe_shared.sailenv import COMMANDS, REGISTER, decode_request, encode_frame
@@ -82,6 +82,25 @@ def pretend(frame: list[bytes], *, instance: str = "1") -> Callable[[socket.sock
 def test_where_nothing_listens_the_error_says_how_to_start_a_renderer() -> None:
     with reserved_port() as port:
         assert f"trompe render --host 127.0.0.1 --port {port}" in render(("127.0.0.1", port))
+
+
+def test_an_address_that_is_none_is_an_error_like_any_other() -> None:
+    assert "There is no renderer at a..b:80" in render(("a..b", 80))
+    assert engine_at("a..b", 80, timeout=1.0) is None
+
+
+def test_an_aborted_target_renders_no_more_even_if_it_connects_just_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    connect = socket.create_connection
+
+    def connect_late(address: tuple[str, int], timeout: float) -> socket.socket:
+        target.abort()
+        return connect(address, timeout)
+
+    monkeypatch.setattr(socket, "create_connection", connect_late)
+    with listening(pretend(frame(encode_png(np.zeros((8, 8, 3), np.uint8))))) as address:
+        target = SailenvTarget(*address)
+        with closing(target), pytest.raises(RendererLostError, match="aborted"):
+            target.render(triangle(), [VIEW], size=(8, 8))
 
 
 def test_a_renderer_that_stays_silent_is_given_up() -> None:
