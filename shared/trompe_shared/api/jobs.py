@@ -160,7 +160,7 @@ FileKind = Literal["classifier", "background", "mask"]
 @dataclass(frozen=True)
 class _Spelling:
     flag: str
-    metavar: str
+    metavar: str | None
     keyword: str
     file: FileKind | None
     in_form: bool
@@ -171,7 +171,7 @@ def _option(
     help: str = "",
     *,
     flag: str = "",
-    metavar: str = "",
+    metavar: str | None = None,
     keyword: str = "",
     file: FileKind | None = None,
     in_form: bool = False,
@@ -472,53 +472,24 @@ PARTS: Final[Mapping[str, type[_Part]]] = {
 }
 
 
-@dataclass(frozen=True)
 class Option:
-    """A field of a part, and its spelling: keyword of the SDK and of result columns, flag of the command line."""
+    """A field of a part, and its spelling.
 
-    part: str
-    field: str
-    info: FieldInfo
+    keyword: name in the SDK, in experiments and in tables. flag: of the command line. metavar: placeholder of the value
+    in help texts. file: kind of the files that values may name. in_form: whether the page's form has it; the others are
+    for the SDK, the command line and REST. type: of a value, without constraints and without ``None``. repeated:
+    whether it can be given several times. help: one phrase.
+    """
 
-    @property
-    def keyword(self) -> str:
-        """Name in the SDK, in experiments and in tables."""
-        return self._spelling.keyword or self.field
-
-    @property
-    def flag(self) -> str:
-        """Flag of the command line."""
-        return self._spelling.flag or f"--{self.field.replace('_', '-')}"
-
-    @property
-    def metavar(self) -> str | None:
-        """Placeholder of the value in help texts."""
-        return self._spelling.metavar or None
-
-    @property
-    def file(self) -> FileKind | None:
-        """Kind of the files that values may name."""
-        return self._spelling.file
-
-    @property
-    def in_form(self) -> bool:
-        """Whether the page's form has it; the others are for the SDK, the command line and REST."""
-        return self._spelling.in_form
-
-    @property
-    def type(self) -> Any:
-        """Type of a value, without constraints and without ``None``."""
-        return _plain(self.info.annotation)
-
-    @property
-    def repeated(self) -> bool:
-        """Whether it can be given several times."""
-        return get_origin(self.type) in {list, dict} or self.type is ViewRanges
-
-    @property
-    def help(self) -> str:
-        """One phrase."""
-        return self.info.description or ""
+    def __init__(self, part: str, field: str, info: FieldInfo) -> None:
+        spelling = next(each for each in info.metadata if isinstance(each, _Spelling))
+        self.part, self.field, self.info = part, field, info
+        self.keyword = spelling.keyword or field
+        self.flag = spelling.flag or f"--{field.replace('_', '-')}"
+        self.metavar, self.file, self.in_form = spelling.metavar, spelling.file, spelling.in_form
+        self.type = _plain(info.annotation)
+        self.repeated = get_origin(self.type) in {list, dict} or self.type is ViewRanges
+        self.help = info.description or ""
 
     @property
     def default(self) -> Any:
@@ -528,10 +499,6 @@ class Option:
     def of(self, spec: JobSpec) -> Any:
         """The option's value in a job."""
         return getattr(getattr(spec, self.part), self.field)
-
-    @property
-    def _spelling(self) -> _Spelling:
-        return next(each for each in self.info.metadata if isinstance(each, _Spelling))
 
 
 def _plain(annotation: Any) -> Any:
@@ -543,12 +510,11 @@ def _plain(annotation: Any) -> Any:
     return _plain(given[0]) if len(given) == 1 else Union[given]  # noqa: UP007
 
 
-def _all_options() -> dict[str, Option]:
-    options = [Option(part, name, info) for part, model in PARTS.items() for name, info in model.model_fields.items()]
-    return {option.keyword: option for option in options}
-
-
-OPTIONS: Final[Mapping[str, Option]] = _all_options()
+OPTIONS: Final[Mapping[str, Option]] = {
+    option.keyword: option
+    for part, model in PARTS.items()
+    for option in (Option(part, name, info) for name, info in model.model_fields.items())
+}
 """All options by keyword."""
 
 
