@@ -4,6 +4,7 @@ import io
 import json
 import socket
 from collections.abc import Mapping
+from gzip import decompress
 from typing import Any
 
 import numpy as np
@@ -125,11 +126,12 @@ class Wire:
     def load(self, scenario: Mapping[str, Any]) -> tuple[str, ...]:
         """LOAD_SCENARIO: one id for each of its objects."""
         self.send("load_scenario", scenario=scenario)
-        return COMMANDS["load_scenario"].decode_reply(self.read, count=len(scenario["objects"]))
+        return tuple(COMMANDS["load_scenario"].decode_reply(self.read)[0] for _ in scenario["objects"])
 
     def views(self, flags: int) -> tuple[dict[str, bytes], float]:
         self.send("frame", flags=flags)
-        return decode_frame(self.read, flags=flags, compressed=self.gzip)
+        views, delta_time = decode_frame(self.read, flags=flags)
+        return {name: decompress(view) if self.gzip else view for name, view in views.items()}, delta_time
 
     def picture(self) -> Picture:
         """The main view as sent, (H, W, 3) uint8."""

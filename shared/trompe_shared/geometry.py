@@ -18,7 +18,6 @@ __all__ = [
     "Camera",
     "Light",
     "View",
-    "direction_to_angles",
     "euler_to_matrix",
     "framing_distance",
     "light_travel_direction",
@@ -143,18 +142,6 @@ def unity_to_opengl_rotation(degrees: Matrix) -> Matrix:
 def light_travel_direction(light: Light) -> Matrix:
     """Unit vector (3,) of the light's travel, for SAILenv's SET_LIGHT_DIRECTION."""
     return -spherical(light.azimuth, light.elevation)
-
-
-def direction_to_angles(direction: Matrix) -> tuple[float, float]:
-    """(azimuth, elevation), degrees, of the origin of a light that travels along ``direction`` (3,).
-
-    Raises ``ValueError`` for a zero or non-finite vector.
-    """
-    norm = float(np.linalg.norm(direction))
-    if not np.isfinite(norm) or norm < 1e-12:
-        raise ValueError(f"a light direction must be a finite vector of non-zero length, got {direction!r}")
-    x, y, z = -np.asarray(direction, dtype=np.float64) / norm
-    return float(np.degrees(np.arctan2(x, z))), float(np.degrees(np.arcsin(np.clip(y, -1.0, 1.0))))
 
 
 def framing_distance(radius: float) -> float:

@@ -12,7 +12,6 @@ import codecs
 import gzip
 import json
 import struct
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -48,7 +47,6 @@ MAX_FILE: Final = 256 * 2**20
 MAX_VIEW: Final = 256 * 2**20
 _MAX_TEXTURES: Final = 256
 MAX_LIST: Final = 4096
-_GZIP_WINDOW: Final = 31  # zlib's word for gzip data
 MAX_SIDE: Final = 4096
 """Largest width or height of an image, pixels."""
 MAX_VIEWS: Final = 256
@@ -318,15 +316,14 @@ class Command:
             return encode_status(reason)
         return b"".join(kind.pack(value) for kind, value in zip(self.reply, self.refused or (), strict=True))
 
-    def decode_reply(self, read: Reader, *, count: int = 1) -> tuple[Any, ...]:
-        """The values of an answer. Raises ``RendererError`` with the server's reason for a refusal by status.
+    def decode_reply(self, read: Reader) -> tuple[Any, ...]:
+        """The values of an answer; one value of a ``repeated`` answer.
 
-        ``count`` is the number of values of a ``repeated`` command.
+        Raises ``RendererError`` with the server's reason for a refusal by status.
         """
         if self.status:
             take_status(read, self.name)
-        kinds = self.reply * count if self.repeated else self.reply
-        return tuple(kind.take(read) for kind in kinds)
+        return tuple(kind.take(read) for kind in self.reply)
 
 
 @dataclass(frozen=True)
@@ -454,22 +451,12 @@ def encode_frame(views: Sequence[bytes], *, delta_time: float, compress: bool) -
     return [*pieces[:-1], b"".join(pieces[-1:]) + _FLOAT.pack(delta_time)]
 
 
-def decode_frame(read: Reader, *, flags: int, compressed: bool) -> tuple[dict[str, bytes], float]:
-    """Read FRAME's reply: uncompressed payloads by view name, and the delta time in seconds."""
-    views = {name: _take_view(read, compressed) for name in views_of(flags)}
+def decode_frame(read: Reader, *, flags: int) -> tuple[dict[str, bytes], float]:
+    """Read FRAME's reply: payloads by view name, as sent, and the delta time in seconds."""
+    views = {name: read(_within(_INT.take(read), MAX_VIEW, "view")) for name in views_of(flags)}
     return views, _FLOAT.take(read)
 
 
 def views_of(flags: int) -> Iterator[str]:
     """Names of the views in ``flags``, in the order of the reply."""
     return (name for name, bit in VIEW_FLAGS.items() if flags & bit)
-
-
-def _take_view(read: Reader, compressed: bool) -> bytes:
-    payload = read(_within(_INT.take(read), MAX_VIEW, "view"))
-    if not compressed:
-        return payload
-    try:
-        return zlib.decompressobj(_GZIP_WINDOW).decompress(payload, MAX_VIEW)
-    except zlib.error as error:
-        raise ProtocolError(f"A view of {len(payload)} bytes is not gzip data ({error}).") from error

@@ -266,7 +266,7 @@ class _Connection:
             self.ask(command, **values)
         flags = VIEW_FLAGS["main"]
         self._socket.sendall(COMMANDS["frame"].encode_request(flags=flags))
-        views, delta_time = decode_frame(self._read, flags=flags, compressed=False)
+        views, delta_time = decode_frame(self._read, flags=flags)
         if math.isnan(delta_time):
             raise RendererError(f"it could not render a view. {self._reason()}")
         return _picture(views["main"], self._size)[:, ::-1]

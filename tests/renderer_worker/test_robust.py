@@ -162,7 +162,7 @@ def test_a_stopped_worker_finishes_its_reply(
     wait_until(lambda: not unread(agent), pause=0.0)
     for _ in range(3):  # Ctrl-C and a supervisor may both send it
         own_worker.process.send_signal(number)
-    assert decode_frame(agent.read, flags=1, compressed=False)[0] == expected
+    assert decode_frame(agent.read, flags=1)[0] == expected
     assert own_worker.process.wait(120) == status
     assert idle.socket.recv(1) == b""
     with pytest.raises(ConnectionRefusedError):

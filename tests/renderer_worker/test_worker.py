@@ -352,7 +352,7 @@ def test_a_large_frame_waits_until_there_is_memory_for_it_and_a_small_one_does_n
             agent.socket.recv(1)
         memory.give_back(1)
         agent.socket.settimeout(240)
-        decode_frame(agent.read, flags=ALL_VIEWS, compressed=False)
+        decode_frame(agent.read, flags=ALL_VIEWS)
         agent.views(ALL_VIEWS)  # the reservation has ended
 
 
