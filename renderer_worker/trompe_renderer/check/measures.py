@@ -40,9 +40,9 @@ def border(picture: Picture) -> NDArray[np.float64]:
     return np.asarray(np.median(frame, axis=0))
 
 
-def blob(picture: Picture, background: NDArray[np.float64]) -> Blob | None:
-    """The object, by its contrast with ``background`` (3,); ``None`` if there is none. Edges count by their share."""
-    contrast = np.abs(picture - background).max(axis=-1)
+def blob(picture: Picture) -> Blob | None:
+    """The object, by its contrast with the border; ``None`` if there is none. Edges count by their share."""
+    contrast = np.abs(picture - border(picture)).max(axis=-1)
     strongest = float(np.percentile(contrast, 98))
     mask = contrast > strongest / 2
     if strongest < FAINT or not mask.any():

@@ -139,7 +139,7 @@ def _difference(fault: str, one: Picture, other: Picture, well: str) -> Findings
 
 
 def _noise(one: Picture, other: Picture) -> str:
-    there = blob(one, border(one))
+    there = blob(one)
     mask = np.ones(one.shape[:2], bool) if there is None else there.mask
     return f"a noise of {np.std((one.astype(float) - other)[mask]) / np.sqrt(2):.1f} levels of 255"
 
@@ -147,7 +147,7 @@ def _noise(one: Picture, other: Picture) -> str:
 def channels(look: _Look, _: EngineInfo) -> Findings:
     """An orange ball beside the middle."""
     picture = look.raw(ORANGE, FRONT)
-    there = blob(picture, border(picture))
+    there = blob(picture)
     if there is None:
         yield Finding("fault", "invisible", "The picture of a ball near the origin shows nothing.")
         return
@@ -180,8 +180,7 @@ def objects(look: _Look, _: EngineInfo) -> Findings:
     """The orange ball, and a white one somewhere else."""
     masks = []
     for obj in (ORANGE, BESIDE):
-        picture = look.raw(obj, FRONT)
-        there = blob(picture, border(picture))
+        there = blob(look.raw(obj, FRONT))
         masks.append(np.zeros(SQUARE, bool) if there is None else there.mask)
     before, now = masks
     kept = (before & now).sum() / max(int(before.sum()), 1)
@@ -226,7 +225,7 @@ def orientation(look: _Look, _: EngineInfo) -> Findings:
 
 def _faces(look: _Look, view: View) -> Seen:
     picture = look.at(CUBE, view)
-    there = blob(picture, border(picture))
+    there = blob(picture)
     return {} if there is None else positions(picture, there.mask)
 
 
@@ -268,7 +267,7 @@ QUARTERED: Final = plate(0.3, QUARTERS.repeat(16, axis=0).repeat(16, axis=1))
 def texture(look: _Look, _: EngineInfo) -> Findings:
     """A square with four colours."""
     picture = look.at(QUARTERED)
-    if blob(picture, border(picture)) is None:
+    if blob(picture) is None:
         yield Finding("fault", "invisible", "A square at the origin, seen from the front, is missing.")
         return
     middle, off = SQUARE[0] // 2, round(_pixels(0.15, SQUARE))
@@ -311,8 +310,8 @@ def lens(look: _Look, _: EngineInfo) -> Findings:
         return
     shots = {name: shot for name, shot in black.items() if shot}
     square = shots["square"]
-    look.scale = (square.across, square.down)
-    yield from _field_of_view((square.down + white.down) / 2)
+    look.scale = square.spread
+    yield from _field_of_view((square.spread[1] + white.spread[1]) / 2)
     yield from _aspect(shots)
     x, y = np.mean([square.centre, white.centre], axis=0)
     ways = [(x, "right" if x > 0 else "left"), (y, "down" if y > 0 else "up")]
@@ -322,19 +321,11 @@ def lens(look: _Look, _: EngineInfo) -> Findings:
         yield Finding("ok", "centre", f"off by {np.hypot(x, y):.2f} pixels.")
 
 
-def _ellipse(look: _Look, view: View, size: Size) -> "_Ellipse | None":
-    picture = look.at(DISC, view, size=size)
-    shape = blob(picture, border(picture))
-    return None if shape is None else _Ellipse(shape, size)
-
-
-class _Ellipse:
-    """A disc's picture: its size over the expected one, and the rest of its ``Blob``."""
-
-    def __init__(self, shape: Blob, size: Size) -> None:
-        expected = _pixels(RADIUS, size) / 2
-        self.across, self.down = shape.spread[0] / expected, shape.spread[1] / expected
-        self.centre, self.shear = shape.centre, shape.shear
+def _ellipse(look: _Look, view: View, size: Size) -> Blob | None:
+    """The disc, with its spread over the expected one."""
+    shape = blob(look.at(DISC, view, size=size))
+    expected = _pixels(RADIUS, size) / 2
+    return shape and replace(shape, spread=(shape.spread[0] / expected, shape.spread[1] / expected))
 
 
 def _field_of_view(size: float) -> Findings:
@@ -347,15 +338,15 @@ def _field_of_view(size: float) -> Findings:
         yield Finding("ok", "field of view", f"{found:.1f} degrees.")
 
 
-def _aspect(shots: Mapping[str, _Ellipse]) -> Findings:
-    down = shots["square"].down
+def _aspect(shots: Mapping[str, Blob]) -> Findings:
+    square = shots["square"].spread[1]
     sheared = [name for name, shot in shots.items() if abs(shot.shear) > 0.05]
     if sheared:
         yield Finding("fault", "sheared", f"The rows of {' and '.join(sheared)} pictures lean.")
     wrong = [
-        f"{shot.across / down:.2f} x {shot.down / down:.2f} in a {name} picture"
-        for name, shot in shots.items()
-        if name not in sheared and max(abs(shot.across / shot.down - 1), abs(shot.down / down - 1)) > RATIO
+        f"{across / square:.2f} x {down / square:.2f} in a {name} picture"
+        for name, (across, down) in ((name, shot.spread) for name, shot in shots.items() if name not in sheared)
+        if max(abs(across / down - 1), abs(down / square - 1)) > RATIO
     ]
     if wrong:
         yield Finding("fault", "aspect", f"A disc is stretched, width x height, {', '.join(wrong)}.")
@@ -471,7 +462,7 @@ GREY: Final = plate(0.25, plain(110, 110, 110))
 def repaint(look: _Look, _: EngineInfo) -> Findings:
     """A slightly brighter paint on the same object."""
     old = look.at(GREY)
-    there = blob(old, border(old))
+    there = blob(old)
     if there is None:
         yield Finding("fault", "invisible", "A grey square at the origin is missing.")
         return
