@@ -144,6 +144,11 @@ class ContentCache(Generic[T]):
         self._entries.move_to_end(key)
         return self._entries[key][0]
 
+    def take(self, wanted: Callable[[T], bool]) -> T | None:
+        """Remove and return the value unused for longest among those ``wanted``; ``None`` without one."""
+        found = next((key for key, (value, _) in self._entries.items() if wanted(value)), None)
+        return None if found is None else self._entries.pop(found)[0]
+
     def trim(self) -> None:
         """Keep to the limits. Call it when no picture is being drawn."""
         size = sum(count for _, count in self._entries.values())

@@ -1,21 +1,18 @@
 """Meshes and textures in GPU memory, found by content. For the OpenGL thread only."""
 
-from collections import OrderedDict
 from typing import Any, Final
 
 import numpy as np
 
 from trompe_renderer.engines.pyrender.blending import BlendedPrimitive
 from trompe_renderer.engines.pyrender.platform import ANISOTROPY, GL, pyrender
-from trompe_renderer.engines.surfaces import PLAIN_ROUGHNESS, Pixels, TextureImage, Use
+from trompe_renderer.engines.surfaces import PLAIN_ROUGHNESS, ContentCache, Pixels, TextureImage, Use
 from trompe_renderer.world.model import HashedModel
 from trompe_shared.object3d import Material, Part
 
 __all__ = ["GpuCache"]
 
 MAX_SHAPES: Final = 32  # twice the need of the furnished room
-MAX_TEXTURES: Final = 256
-MAX_TEXTURE_BYTES: Final = 512 * 2**20
 OLD: Final = 64
 """A texture unused for so many pictures may be overwritten by another of its size."""
 _MATERIAL_TEXTURES: Final[dict[Use, str]] = {
@@ -34,7 +31,7 @@ class GpuCache:
     def __init__(self, *, anisotropy: int = 1) -> None:
         self._anisotropy = anisotropy
         self._shapes: list[_GpuMesh] = []
-        self._textures: OrderedDict[str, _GpuTexture] = OrderedDict()
+        self._textures: ContentCache[_GpuTexture] = ContentCache(lambda texture: texture.delete())
         self._pictures = 0
 
     def mesh(self, model: HashedModel) -> Any:
@@ -55,11 +52,7 @@ class GpuCache:
         for shape in self._shapes[:-MAX_SHAPES]:
             shape.delete()
         del self._shapes[:-MAX_SHAPES]
-        size = sum(texture.nbytes for texture in self._textures.values())
-        while size > MAX_TEXTURE_BYTES or len(self._textures) > MAX_TEXTURES:
-            _, texture = self._textures.popitem(last=False)
-            size -= texture.nbytes
-            texture.delete()
+        self._textures.trim()
 
     def _shape(self, model: HashedModel) -> "_GpuMesh":
         """A shape with the model's textures, or one unused in this picture; the most recently used comes last."""
@@ -72,23 +65,17 @@ class GpuCache:
         if name is None:
             return None
         image = TextureImage(use, name, model)
-        key = image.key
-        if key not in self._textures:
-            pixels = image.pixels()
-            self._textures[key] = self._repainted(pixels) or _GpuTexture(pixels, self._anisotropy)
-        self._textures.move_to_end(key)
-        self._textures[key].drawn = self._pictures
-        return self._textures[key]
+        texture = self._textures.get(image.key, lambda: self._uploaded(image.pixels()))
+        texture.drawn = self._pictures
+        return texture
 
-    def _repainted(self, pixels: Pixels) -> "_GpuTexture | None":
-        """An old texture, overwritten with ``pixels``: takes half the time of a new one."""
-        for key, texture in self._textures.items():
-            if self._pictures - texture.drawn < OLD:
-                return None  # the rest is younger
-            if texture.shape == pixels.shape:
-                texture.repaint(pixels)
-                return self._textures.pop(key)
-        return None
+    def _uploaded(self, pixels: Pixels) -> "tuple[_GpuTexture, int]":
+        """A texture and its size. To overwrite an old one takes half the time of a new one."""
+        old = self._textures.take(lambda each: self._pictures - each.drawn >= OLD and each.shape == pixels.shape)
+        if old is None:
+            return _GpuTexture(pixels, self._anisotropy), pixels.nbytes
+        old.repaint(pixels)
+        return old, pixels.nbytes
 
 
 class _GpuMesh:
@@ -115,7 +102,7 @@ class _GpuTexture(pyrender.Texture):  # type: ignore[misc]
 
     def __init__(self, pixels: Pixels, anisotropy: int) -> None:
         super().__init__()
-        self.shape, self.nbytes = pixels.shape, pixels.nbytes
+        self.shape = pixels.shape
         self.drawn = 0  # the number of the picture
         self._format = {2: GL.GL_RG, 3: GL.GL_RGB, 4: GL.GL_RGBA}[pixels.shape[2]]
         self._texid = GL.glGenTextures(1)
