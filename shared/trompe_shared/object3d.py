@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from posixpath import commonpath
 from typing import Final
 
 import numpy as np
@@ -245,7 +246,7 @@ def unpack(data: bytes) -> dict[str, bytes]:
     members = [info for info in named if not info.is_dir() and "__MACOSX" not in info.filename]
     _check_size(members, len(data))
     paths = [_checked_path(info) for info in members]
-    common = _common_folder(paths)
+    common = len(PurePosixPath(commonpath([path.parent for path in paths] or [PurePosixPath()])).parts)
     names = ["/".join(path.parts[common:]) for path in paths]
     if len(set(names)) < len(names):
         raise ObjectError("The archive holds two files of one name; zip the folder again.")
@@ -283,13 +284,6 @@ def _checked_path(info: zipfile.ZipInfo) -> PurePosixPath:
     if stat.S_ISLNK(info.external_attr >> 16):
         raise ObjectError(f"The archive holds the link {info.filename[:80]!r}; put the file itself there.")
     return path
-
-
-def _common_folder(paths: list[PurePosixPath]) -> int:
-    """Number of leading folders common to all ``paths``."""
-    folders = [path.parts[:-1] for path in paths]
-    shortest = min(folders, key=len, default=())
-    return next((k for k, part in enumerate(shortest) if any(f[k] != part for f in folders)), len(shortest))
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:

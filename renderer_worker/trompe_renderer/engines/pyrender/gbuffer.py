@@ -66,7 +66,7 @@ class GBufferPass:
     def __init__(self) -> None:
         self._program = Program(_VERTEX, _FRAGMENT)
         self._size = (0, 0)
-        self._names: tuple[int, int, int] | None = None
+        self._names: tuple[int, ...] = ()
 
     def draw(self, calls: Iterable[DrawCall], *, width: int, height: int) -> GBuffer:
         """Draw ``calls`` through the camera in their matrices."""
@@ -81,9 +81,9 @@ class GBufferPass:
 
     def _prepare(self, size: tuple[int, int]) -> None:
         """Clear a framebuffer of this size and set the OpenGL state of the pass."""
-        if self._names is None or size != self._size:
+        if size != self._size:
             self._resize(size)
-        GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._names[0] if self._names else 0)
+        GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._names[0])
         GL.glViewport(0, 0, *size)
         for feature in (GL.GL_BLEND, GL.GL_MULTISAMPLE, GL.GL_POLYGON_OFFSET_FILL):
             GL.glDisable(feature)
@@ -97,10 +97,10 @@ class GBufferPass:
         GL.glClear(GL.GL_COLOR_BUFFER_BIT | GL.GL_DEPTH_BUFFER_BIT)
 
     def _resize(self, size: tuple[int, int]) -> None:
-        if self._names is not None:
-            GL.glDeleteFramebuffers(1, [self._names[0]])
+        if self._names:
+            GL.glDeleteFramebuffers(1, self._names[:1])
             GL.glDeleteRenderbuffers(2, self._names[1:])
-            self._names = None
+        self._names, self._size = (), (0, 0)
         color = renderbuffer(GL.GL_RGBA32F, size)
         depth = renderbuffer(GL.GL_DEPTH_COMPONENT32F, size)
         self._names, self._size = (framebuffer(color, depth), color, depth), size
