@@ -18,8 +18,6 @@ from trompe_renderer.options import Options
 from trompe_shared.engine import DEFAULT_ENGINE
 from trompe_shared.errors import RendererError
 
-__all__ = ["render"]
-
 BACKLOG: Final = 64
 """Connections that wait until the worker accepts them."""
 _M_TRIM_THRESHOLD: Final = -1

@@ -3,8 +3,6 @@
 import re
 from typing import Final
 
-__all__ = ["COLOURS", "colour_of"]
-
 COLOURS: Final = {"white": (255, 255, 255), "black": (0, 0, 0)}
 
 

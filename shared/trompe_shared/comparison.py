@@ -13,8 +13,6 @@ from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 from typing import Any, Generic, TypeVar
 
-__all__ = ["Job", "Mean", "average", "charged", "differing_options", "grouped", "means_of", "pareto_front"]
-
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 

@@ -10,8 +10,6 @@ from pydantic import TypeAdapter, ValidationError
 from trompe_shared.errors import ProtocolError
 from trompe_shared.faults import faults_of
 
-__all__ = ["DEFAULT_ENGINE", "EngineInfo"]
-
 DEFAULT_ENGINE: Final = "pyrender"
 """The engine of a renderer worker that is not told one."""
 

@@ -5,8 +5,6 @@ from typing import Any, Final, NamedTuple
 
 from pydantic import ValidationError
 
-__all__ = ["Fault", "faults_of"]
-
 OWN_WORDS: Final = "Value error, "
 """Pydantic's prefix for messages of our own validators."""
 

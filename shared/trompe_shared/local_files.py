@@ -8,17 +8,6 @@ from typing import Final
 
 from trompe_shared.errors import ClassifierError, ObjectError
 
-__all__ = [
-    "CLASSIFIER_SUFFIXES",
-    "LOOKED_UP",
-    "MODEL_SUFFIXES",
-    "PICTURE_SUFFIXES",
-    "SPLIT_SUFFIXES",
-    "classes_beside",
-    "model_file",
-    "models_in",
-]
-
 CLASSIFIER_SUFFIXES: Final = (".pt2", ".onnx")
 LOOKED_UP: Final = ("torchvision:", "timm:", "robustbench:", "hf:")
 """Prefixes of networks by name, whatever their suffix."""

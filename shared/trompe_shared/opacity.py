@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from trompe_shared.object3d import Object3D, decode_alpha
 
-__all__ = ["CUTOFF", "INVISIBLE", "opacity_of", "strongest"]
-
 CUTOFF: Final = 0.5
 """Fragments with less alpha (in [0, 1]) are not drawn."""
 

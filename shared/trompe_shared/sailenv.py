@@ -20,27 +20,6 @@ from typing import Any, Final, Protocol
 from trompe_shared.errors import ProtocolError, RendererError
 from trompe_shared.object3d import MAX_TEXTURE_SIDE
 
-__all__ = [
-    "COMMANDS",
-    "EXTENSIONS",
-    "LIGHT_NOT_FOUND",
-    "MAIN_LIGHT",
-    "MAX_SIDE",
-    "MAX_VIEWS",
-    "REGISTER",
-    "RIM_LIGHT",
-    "VIEW_FLAGS",
-    "Command",
-    "DecodedCommand",
-    "Reader",
-    "decode_frame",
-    "decode_request",
-    "encode_frame",
-    "encode_status",
-    "take_status",
-    "views_of",
-]
-
 MAX_TEXT: Final = 64 * 2**10
 MAX_JSON: Final = 2**20
 MAX_FILE: Final = 256 * 2**20

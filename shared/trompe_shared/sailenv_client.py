@@ -25,8 +25,6 @@ from trompe_shared.sailenv import (
     take_status,
 )
 
-__all__ = ["SailenvTarget", "engine_at"]
-
 Size = tuple[int, int]
 Images = NDArray[np.uint8]
 

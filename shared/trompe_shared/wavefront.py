@@ -15,19 +15,6 @@ from numpy.typing import NDArray
 
 from trompe_shared.errors import ObjectError
 
-__all__ = [
-    "LARGEST",
-    "MAX_FACES",
-    "Part",
-    "Surface",
-    "dissolve",
-    "obj_text",
-    "parse_mtl",
-    "parse_obj",
-    "parse_surfaces",
-    "smooth_normals",
-]
-
 MAX_FACES: Final = 2_000_000
 LARGEST: Final = 1e6
 """Largest coordinate (metres) and texture coordinate."""

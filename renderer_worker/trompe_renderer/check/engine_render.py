@@ -13,8 +13,6 @@ from trompe_renderer.world.validation import unit_color
 from trompe_shared.geometry import View, light_travel_direction
 from trompe_shared.object3d import Object3D
 
-__all__ = ["EngineRender"]
-
 
 class EngineRender:
     """A ``Render`` over an engine. As in a worker, a repaint changes ``obj.textures`` and not ``obj.files``."""

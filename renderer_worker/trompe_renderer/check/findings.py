@@ -4,8 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
-__all__ = ["FINAL", "REMEDIES", "Finding"]
-
 REMEDIES: Final[Mapping[str, str]] = {
     "not repeatable": "Reset what one picture leaves to the next (jitter, exposure, history), or declare "
     "EngineInfo(deterministic=False) and draw the noise from noise_seed(world).",

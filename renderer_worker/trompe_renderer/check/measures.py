@@ -11,8 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-__all__ = ["Blob", "blob", "border", "level", "median", "patterns", "positions"]
-
 FAINT: Final = 8.0
 """Smallest difference, in levels, between an object and its background."""
 

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from trompe_shared.object3d import Object3D, encode_png, object_from_files
 from trompe_shared.wavefront import Part, obj_text
 
-__all__ = ["FACES", "RINGS", "TEXTURE", "ball", "chart", "cube", "disc", "plain", "plate"]
-
 TEXTURE: Final = "paint.png"
 """The only texture of all probes but the cube."""
 FACES: Final[Mapping[str, tuple[tuple[int, int, int], tuple[int, int, int]]]] = {

@@ -16,8 +16,6 @@ from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View, spherical
 from trompe_shared.object3d import Object3D
 from trompe_shared.sailenv_client import SAILENV
 
-__all__ = ["Render", "check"]
-
 SQUARE: Final = (96, 96)
 LENS: Final = {"square": (160, 160), "wide": (161, 215), "tall": (213, 160)}
 """Pictures by which the lens is measured; some sides are odd."""

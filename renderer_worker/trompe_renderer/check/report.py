@@ -12,8 +12,6 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError
 from trompe_shared.sailenv_client import SailenvTarget
 
-__all__ = ["check_at", "check_engine"]
-
 
 def check_engine(name: str, settings: Mapping[str, str]) -> bool:
     """Check an engine in this process, print what is found and return whether there is no fault."""

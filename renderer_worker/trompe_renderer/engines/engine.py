@@ -11,8 +11,6 @@ from trompe_renderer.world.snapshot import Snapshot
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError
 
-__all__ = ["Engine", "GBuffer", "LabellingEngine", "draw", "noise_seed"]
-
 
 @dataclass(frozen=True)
 class GBuffer:

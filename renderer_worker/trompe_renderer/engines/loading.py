@@ -13,8 +13,6 @@ from trompe_renderer.engines.engine import Engine
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError
 
-__all__ = ["ENGINES", "engine_maker"]
-
 ENGINES: Final[Mapping[str, tuple[str, str]]] = {
     "pyrender": ("PyrenderEngine", "pip install 'trompe[renderer]'"),
     "three": ("ThreeEngine", "pip install 'trompe[three]'"),

@@ -27,8 +27,6 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import FIELD_OF_VIEW
 from trompe_shared.opacity import CUTOFF
 
-__all__ = ["MitsubaEngine", "MitsubaOptions"]
-
 NEAR: Final = 1e-3
 FAR: Final = 1e5
 MAX_RAYS: Final = 2**23

@@ -24,8 +24,6 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError
 from trompe_shared.geometry import FIELD_OF_VIEW
 
-__all__ = ["Panda3dEngine", "Panda3dOptions"]
-
 CONFIGURATION: Final = """
 coordinate-system yup-right
 window-type offscreen

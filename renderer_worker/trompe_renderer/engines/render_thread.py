@@ -20,8 +20,6 @@ from trompe_renderer.world.snapshot import Snapshot
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import TrompeError
 
-__all__ = ["FairQueue", "RenderThread"]
-
 TURN_LIMIT: Final = 120.0
 """Seconds after which a picture, and the engine with it, counts as hung."""
 

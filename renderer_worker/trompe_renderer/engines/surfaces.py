@@ -16,25 +16,6 @@ from trompe_shared.geometry import FIELD_OF_VIEW
 from trompe_shared.object3d import Material, Part, decode_rgb, open_image
 from trompe_shared.opacity import opacity_of
 
-__all__ = [
-    "PLAIN_ROUGHNESS",
-    "ContentCache",
-    "Pixels",
-    "Surface",
-    "TextureImage",
-    "Use",
-    "background_pixels",
-    "clipping_planes",
-    "composited",
-    "encoded_light",
-    "linear_light",
-    "rgba_of",
-    "sphere_around",
-    "surfaces_of",
-    "towards",
-    "without_backs",
-]
-
 NEAR: Final = 0.005
 FAR: Final = 1000.0
 """Clipping planes, metres, for all but tiny and huge objects."""

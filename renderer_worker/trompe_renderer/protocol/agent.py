@@ -36,8 +36,6 @@ from trompe_shared.sailenv import (
     views_of,
 )
 
-__all__ = ["MAX_REASON", "Agent", "Shared"]
-
 DIALECT_WAIT: Final = 0.3
 """Seconds of silence after a short SPAWN_OBJECT that tell the short dialect from the long one."""
 LONG_ONLY: Final = {"spawn_view_frustum", "load_scenario", "move_object"}

@@ -13,8 +13,6 @@ from trompe_renderer.engines.engine import GBuffer
 from trompe_renderer.world.snapshot import Snapshot
 from trompe_shared.object3d import encode_png
 
-__all__ = ["flat_view", "instance_color", "label_views", "main_view"]
-
 _SCATTER: Final = 3_635_633
 """An odd factor: multiplication modulo 2^24 maps numbers to distinct colours, far apart for neighbours."""
 

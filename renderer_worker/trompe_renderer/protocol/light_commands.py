@@ -12,8 +12,6 @@ from trompe_renderer.world.validation import WHITE, Ints, Vector, checked_color,
 from trompe_shared.errors import RendererError
 from trompe_shared.sailenv import LIGHT_NOT_FOUND
 
-__all__ = ["LightCommands"]
-
 
 def _checked_direction(value: Vector) -> Vector:
     direction = checked_vector(value, "direction")

@@ -8,8 +8,6 @@ from weakref import WeakKeyDictionary
 
 from trompe_shared.errors import RendererError
 
-__all__ = ["Limits", "MemoryBudget", "StorageQuota"]
-
 MIB = 2**20
 
 

@@ -12,8 +12,6 @@ from typing import Final
 from trompe_renderer.protocol.limits import MIB, Limits, MemoryBudget
 from trompe_shared.errors import ProtocolError
 
-__all__ = ["Link"]
-
 _KEEPALIVE: Final = (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 6))
 """Detects a vanished machine within two minutes."""
 

@@ -17,8 +17,6 @@ from trompe_renderer.world.validation import Vector, checked_vector
 from trompe_shared.errors import RendererError
 from trompe_shared.shipped import shipped_objects
 
-__all__ = ["ObjectCommands"]
-
 FILE_PREFIX: Final = "file:"
 MAX_SPAWNED: Final = 64
 

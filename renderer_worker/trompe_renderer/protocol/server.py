@@ -17,8 +17,6 @@ from trompe_renderer.protocol.limits import Limits
 from trompe_renderer.protocol.link import Link
 from trompe_shared.errors import ProtocolError
 
-__all__ = ["Server"]
-
 RETRY_PAUSE: Final = 0.5
 """Seconds until the next try when no agent could be accepted."""
 

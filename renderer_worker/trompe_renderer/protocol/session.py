@@ -23,8 +23,6 @@ from trompe_shared.errors import RendererError, TrompeError
 from trompe_shared.geometry import FIELD_OF_VIEW, unity_to_opengl_rotation
 from trompe_shared.sailenv import EXTENSIONS
 
-__all__ = ["Session"]
-
 FRUSTUM_NEAR: Final = 0.3
 FRUSTUM_FAR: Final = 15.0
 """Metres; the values in SAILenv's git client."""

@@ -14,8 +14,6 @@ from trompe_renderer.protocol.limits import Limits, StorageQuota
 from trompe_renderer.world.model import HashedModel, model_of, repainted
 from trompe_shared.object3d import decode_rgb, object_from_files, unpacked_size, unzip
 
-__all__ = ["ModelCache"]
-
 
 class ModelCache:
     """The models read last, shared by all agents, and the agents' storage quotas."""

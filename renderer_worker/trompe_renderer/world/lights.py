@@ -6,8 +6,6 @@ from typing import Literal
 from trompe_renderer.world.validation import WHITE, Ints, Vector, checked_vector
 from trompe_shared.geometry import Light, light_travel_direction
 
-__all__ = ["WorldLight"]
-
 
 @dataclass(frozen=True)
 class WorldLight:

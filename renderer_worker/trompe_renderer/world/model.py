@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D
 
-__all__ = ["HashedModel", "content_key", "model_of", "repainted"]
-
 Texture = NDArray[np.uint8]
 
 

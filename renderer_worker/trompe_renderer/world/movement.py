@@ -15,18 +15,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from trompe_renderer.world.validation import checked_number, checked_vector, described
 from trompe_shared.errors import RendererError
 
-__all__ = [
-    "NO_WALLS",
-    "Bounce",
-    "Motion",
-    "Pose",
-    "Waypoints",
-    "frustum_walls",
-    "motion_of",
-    "room_walls",
-    "rotation_of",
-]
-
 MAX_BOUNCES: Final = 64
 """Bounces in one step; the rest of the step is not travelled."""
 

@@ -10,8 +10,6 @@ from trompe_renderer.world.movement import Motion, Pose, Walls
 from trompe_renderer.world.snapshot import Instance
 from trompe_renderer.world.validation import Vector
 
-__all__ = ["ObjectRequest", "WorldObject"]
-
 
 @dataclass(frozen=True)
 class ObjectRequest:

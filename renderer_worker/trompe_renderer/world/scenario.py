@@ -9,8 +9,6 @@ from trompe_renderer.world.objects import ObjectRequest
 from trompe_renderer.world.validation import checked_number, described
 from trompe_shared.errors import RendererError
 
-__all__ = ["Scenario", "read_scenario"]
-
 
 @dataclass(frozen=True)
 class Scenario:

@@ -23,17 +23,6 @@ from trompe_shared.object3d import load_object
 from trompe_shared.sailenv import MAIN_LIGHT, RIM_LIGHT
 from trompe_shared.shipped import shipped_objects
 
-__all__ = [
-    "CATEGORIES",
-    "OBJECT_VIEW",
-    "SCENES",
-    "UPLOADED",
-    "SceneSetup",
-    "WorldObject",
-    "scene_named",
-    "shipped_model",
-]
-
 OBJECT_VIEW: Final = "object_view/scene"
 ROOM: Final = "room_01/scene"
 SCENES: Final = (OBJECT_VIEW, ROOM)

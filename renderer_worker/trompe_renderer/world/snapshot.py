@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from trompe_renderer.world.lights import WorldLight
 from trompe_renderer.world.model import HashedModel
 
-__all__ = ["Background", "Color", "Instance", "Matrix", "Sky", "Snapshot"]
-
 Matrix = NDArray[np.float64]
 Color = tuple[float, float, float]
 

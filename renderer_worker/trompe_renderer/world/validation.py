@@ -6,8 +6,6 @@ from typing import Final
 
 from trompe_shared.errors import RendererError
 
-__all__ = ["WHITE", "Ints", "Vector", "checked_color", "checked_number", "checked_vector", "described", "unit_color"]
-
 Vector = tuple[float, float, float]
 Ints = tuple[int, int, int]
 

@@ -10,8 +10,6 @@ from trompe_shared.colours import colour_of
 from trompe_shared.errors import SpecError
 from trompe_shared.faults import faults_of
 
-__all__ = ["JOB_RESULT", "JudgementRequest", "JudgementSpec"]
-
 JOB_RESULT: Final = "job:"
 """Begins the name of a job's result, as ``job:8f14e45fceea167a``."""
 

@@ -33,8 +33,6 @@ from trompe_shared.errors import RendererError
 from trompe_shared.geometry import FIELD_OF_VIEW
 from trompe_shared.opacity import CUTOFF
 
-__all__ = ["CyclesEngine", "CyclesOptions"]
-
 SCRIPT: Final = Path(__file__).parent / "blender.py"
 REMEDY: Final = (
     "Install Blender's module there, pip install bpy; or in an environment of its own, "

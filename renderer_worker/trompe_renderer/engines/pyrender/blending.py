@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from trompe_renderer.engines.pyrender.platform import GL, pyrender
 from trompe_renderer.world.snapshot import Matrix
 
-__all__ = ["BlendedPrimitive", "back_to_front"]
-
 PIECES: Final = 64
 """Draws that surfaces nested in each other are split into."""
 

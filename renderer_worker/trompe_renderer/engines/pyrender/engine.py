@@ -19,8 +19,6 @@ from trompe_renderer.world.validation import unit_color
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import FIELD_OF_VIEW
 
-__all__ = ["PyrenderEngine"]
-
 MAX_LIGHTS: Final = 2
 """Lights of each kind."""
 

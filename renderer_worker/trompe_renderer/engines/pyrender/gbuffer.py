@@ -16,8 +16,6 @@ from trompe_renderer.engines.pyrender.shaders import Program, framebuffer, rende
 from trompe_renderer.world.snapshot import Matrix
 from trompe_shared.opacity import CUTOFF, INVISIBLE
 
-__all__ = ["DrawCall", "GBufferPass"]
-
 _VERTEX: Final = """
 layout(location = 0) in vec3 position;
 layout(location = 2) in vec2 place;

@@ -10,8 +10,6 @@ from trompe_renderer.engines.surfaces import PLAIN_ROUGHNESS, ContentCache, Pixe
 from trompe_renderer.world.model import HashedModel
 from trompe_shared.object3d import Material, Part
 
-__all__ = ["GpuCache"]
-
 MAX_SHAPES: Final = 32  # twice the need of the furnished room
 OLD: Final = 64
 """A texture unused for so many pictures may be overwritten by another of its size."""

@@ -5,8 +5,6 @@ from typing import Annotated
 
 from click import IntRange
 
-__all__ = ["PyrenderOptions"]
-
 
 @dataclass(frozen=True)
 class PyrenderOptions:

@@ -22,8 +22,6 @@ from trompe_renderer.world.snapshot import Background, Matrix, Sky
 from trompe_shared.errors import RendererError
 from trompe_shared.opacity import CUTOFF
 
-__all__ = ["ObjectRenderer"]
-
 SLOPE_BIAS: Final = 5.0
 """Twice the reach of the shader's filter, 2.5 texels: OpenGL takes the slope of the steeper axis only."""
 CONSTANT_BIAS: Final = 8.0

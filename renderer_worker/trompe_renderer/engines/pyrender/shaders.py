@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from trompe_renderer.engines.pyrender.platform import GL
 from trompe_shared.errors import RendererError
 
-__all__ = ["Program", "framebuffer", "renderbuffer"]
-
 
 class Program:
     """A vertex and a fragment shader. Raises ``RendererError`` if the driver rejects them."""

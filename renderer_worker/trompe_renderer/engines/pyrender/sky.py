@@ -8,8 +8,6 @@ from trompe_renderer.engines.pyrender.platform import GL
 from trompe_renderer.engines.pyrender.shaders import Program
 from trompe_renderer.world.snapshot import Matrix
 
-__all__ = ["SkyPass"]
-
 _VERTEX: Final = """
 out vec2 place;
 void main() {

@@ -33,8 +33,6 @@ from trompe_shared.geometry import FIELD_OF_VIEW
 from trompe_shared.opacity import CUTOFF
 from trompe_shared.three import FOLDER, LIGHTS, THREE
 
-__all__ = ["ThreeEngine", "ThreeOptions"]
-
 SCRIPTS: Final = {"page.js": Path(__file__).parent, THREE: FOLDER, LIGHTS: FOLDER}
 """Folders of the scripts by name."""
 ORIGIN: Final = "http://three.invalid"
