@@ -14,7 +14,8 @@ LOOKED_UP: Final = ("torchvision:", "timm:", "robustbench:", "hf:")
 SPLIT_SUFFIXES: Final = {".obj", ".gltf"}
 """Models with textures and materials in files beside them."""
 MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, ".glb", ".fbx", ".ply", ".stl"}
-PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
+PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".gif"}
+"""Of the formats of textures (``object3d.IMAGE_FORMATS``)."""
 
 
 def model_file(path: Path) -> tuple[str, bytes | Path]:
