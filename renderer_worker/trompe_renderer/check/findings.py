@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, Literal
 
 REMEDIES: Final[Mapping[str, str]] = {
@@ -58,3 +59,6 @@ class Finding:
     def __str__(self) -> str:
         word, remedy = ("ok", "") if self.level == "ok" else (self.level.upper(), REMEDIES.get(self.name, ""))
         return f"{word:<8} {self.name}: {self.seen} {remedy}".rstrip()
+
+
+ok, warning, fault = (partial(Finding, level) for level in ("ok", "warning", "fault"))

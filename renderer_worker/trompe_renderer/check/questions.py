@@ -8,7 +8,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_renderer.check.findings import FINAL, Finding
+from trompe_renderer.check.findings import FINAL, Finding, fault, ok, warning
 from trompe_renderer.check.measures import Blob, blob, border, level, median, patterns, positions
 from trompe_renderer.check.probes import COLOURS, FACES, RINGS, TEXTURE, ball, chart, cube, disc, plain, plate
 from trompe_shared.engine import EngineInfo
@@ -60,7 +60,7 @@ def check(render: Render, info: EngineInfo) -> Findings:
         for finding in question(look, info):
             yield finding
             if finding.name in FINAL:
-                yield Finding("warning", "stopped", "Other questions need this one answered; check again afterwards.")
+                yield warning("stopped", "Other questions need this one answered; check again afterwards.")
                 return
 
 
@@ -113,27 +113,23 @@ def repeats(look: _Look, info: EngineInfo) -> Findings:
         yield from _difference("not repeatable", look.first, again, "equal requests give equal bytes")
         return
     if info == SAILENV:
-        yield Finding("ok", "repeats", f"equal requests differ by {_noise(look.first, again)}; no promise was made.")
+        yield ok("repeats", f"equal requests differ by {_noise(look.first, again)}; no promise was made.")
         return
     yield from _difference("noise not numbered", look.first, again, "equal noise numbers give equal bytes")
     other = look.raw(ORANGE, replace(FRONT, noise=1))
     if np.array_equal(look.first, other):
-        yield Finding("fault", "noise number ignored", "Noise numbers 0 and 1 give equal pictures.")
+        yield fault("noise number ignored", "Noise numbers 0 and 1 give equal pictures.")
     else:
-        yield Finding("ok", "noise", f"{_noise(look.first, other)} on the object.")
+        yield ok("noise", f"{_noise(look.first, other)} on the object.")
 
 
-def _difference(fault: str, one: Picture, other: Picture, well: str) -> Findings:
+def _difference(name: str, one: Picture, other: Picture, well: str) -> Findings:
     changed = int((one != other).any(axis=-1).sum())
     if changed:
         most = int(np.abs(one.astype(int) - other).max())
-        yield Finding(
-            "fault",
-            fault,
-            f"Two equal requests differ in {changed} pixel{'s' * (changed > 1)}, by up to {most} levels.",
-        )
+        yield fault(name, f"Two equal requests differ in {changed} pixel{'s' * (changed > 1)}, by up to {most} levels.")
     else:
-        yield Finding("ok", "repeats", f"{well}.")
+        yield ok("repeats", f"{well}.")
 
 
 def _noise(one: Picture, other: Picture) -> str:
@@ -147,18 +143,18 @@ def channels(look: _Look, _: EngineInfo) -> Findings:
     picture = look.raw(ORANGE, FRONT)
     there = blob(picture)
     if there is None:
-        yield Finding("fault", "invisible", "The picture of a ball near the origin shows nothing.")
+        yield fault("invisible", "The picture of a ball near the origin shows nothing.")
         return
     colour = median(picture, there.mask)
     if np.ptp(colour) < 0.15 * colour.max():
-        yield Finding("fault", "untextured", f"An orange ball appears grey: {colour.round()}.")
+        yield fault("untextured", f"An orange ball appears grey: {colour.round()}.")
         return
     look.channels = [int(k) for k in np.argsort(-colour, kind="stable")]
     order = "".join("RGB"[look.channels.index(k)] for k in range(3))
     if order == "RGB":
-        yield Finding("ok", "channels", "red, green, blue.")
+        yield ok("channels", "red, green, blue.")
     else:
-        yield Finding("fault", "channel order", f"The channels come as {order}.")
+        yield fault("channel order", f"The channels come as {order}.")
 
 
 def background(look: _Look, _: EngineInfo) -> Findings:
@@ -168,10 +164,7 @@ def background(look: _Look, _: EngineInfo) -> Findings:
         got = border(look.at(ORANGE, replace(FRONT, background=asked)))
         if (off := float(np.abs(got - asked).max())) > worst:
             worst, told = off, f"{asked} comes as {tuple(got.round().astype(int).tolist())}"
-    if worst > 1:
-        yield Finding("fault", "background", f"A background of {told}.")
-    else:
-        yield Finding("ok", "background", f"{told}.")
+    yield fault("background", f"A background of {told}.") if worst > 1 else ok("background", f"{told}.")
 
 
 def objects(look: _Look, _: EngineInfo) -> Findings:
@@ -183,14 +176,15 @@ def objects(look: _Look, _: EngineInfo) -> Findings:
     before, now = masks
     kept = (before & now).sum() / max(int(before.sum()), 1)
     if kept < 0.5:
-        yield Finding("ok", "objects", "nothing is left of an earlier request.")
+        yield ok("objects", "nothing is left of an earlier request.")
     elif (now & ~before).sum() < 0.5 * before.sum():
-        yield Finding("fault", "stale object", "A new object of the same name looks like the one before it.")
+        yield fault("stale object", "A new object of the same name looks like the one before it.")
     else:
-        yield Finding("fault", "stale scene", "The object of an earlier request is still in the picture.")
+        yield fault("stale scene", "The object of an earlier request is still in the picture.")
 
 
-CUBE: Final = cube(0.25)
+HALF: Final = 0.25
+CUBE: Final = cube(HALF)
 CUBE_VIEWS: Final = (
     _lit(replace(LIGHT, azimuth=35, elevation=25), Camera(1.1, 35, 25)),
     _lit(replace(LIGHT, azimuth=210, elevation=-35), Camera(1.2, 210, -35, roll=25.0, centre=(0.08, 0.1, 0.05))),
@@ -208,17 +202,17 @@ def orientation(look: _Look, _: EngineInfo) -> Findings:
     found = next((flips for flips in FLIPS if _distance(seen, _expected(first, flips)) < 6), None)
     if found is None:
         there = _named(_expected(first))
-        yield Finding("fault", "axes", f"From azimuth 35, elevation 25 one sees {_named(seen)}, not {there}.")
+        yield fault("axes", f"From azimuth 35, elevation 25 one sees {_named(seen)}, not {there}.")
         return
     look.flips = found
     if found[0] < 0:
-        yield Finding("fault", "upside down", "Top and bottom are exchanged.")
+        yield fault("upside down", "Top and bottom are exchanged.")
     if found[1] < 0:
-        yield Finding("fault", "mirrored", "Left and right are exchanged.")
+        yield fault("mirrored", "Left and right are exchanged.")
     if _distance(_faces(look, second), _expected(second)) > 8:
-        yield Finding("fault", "camera", "A rolled camera that looks past the origin sees the object elsewhere.")
+        yield fault("camera", "A rolled camera that looks past the origin sees the object elsewhere.")
     elif look.flips == (1, 1):
-        yield Finding("ok", "orientation", "upright, not mirrored, from where the camera is.")
+        yield ok("orientation", "upright, not mirrored, from where the camera is.")
 
 
 def _faces(look: _Look, view: View) -> Seen:
@@ -227,16 +221,16 @@ def _faces(look: _Look, view: View) -> Seen:
     return {} if there is None else positions(picture, there.mask)
 
 
-def _expected(view: View, flips: tuple[int, int] = FLIPS[0], half: float = 0.25) -> Seen:
+def _expected(view: View, flips: tuple[int, int] = FLIPS[0]) -> Seen:
     """Middle, in pixels from the picture's, of each visible face of the cube, by its colour's pattern."""
     matrix, grid = view.camera.world_to_camera(), np.linspace(-0.9, 0.9, 7)
     a, b = (each.reshape(-1, 1) for each in np.meshgrid(grid, grid))
     found = {}
     for name, (normal, up) in FACES.items():
         n, v = np.array(normal), np.array(up)
-        if n @ (view.camera.position() - half * n) <= 0:
+        if n @ (view.camera.position() - HALF * n) <= 0:
             continue
-        x, y, z = matrix[:3, :3] @ (half * (n + a * np.cross(v, n) + b * v)).T + matrix[:3, 3:]
+        x, y, z = matrix[:3, :3] @ (HALF * (n + a * np.cross(v, n) + b * v)).T + matrix[:3, 3:]
         right, down = _pixels(1.0, SQUARE) * np.array([(x / -z).mean(), (y / z).mean()])
         found[int(patterns(np.array(COLOURS[name])))] = (flips[1] * float(right), flips[0] * float(down))
     return found
@@ -266,7 +260,7 @@ def texture(look: _Look, _: EngineInfo) -> Findings:
     """A square with four colours."""
     picture = look.at(QUARTERED)
     if blob(picture) is None:
-        yield Finding("fault", "invisible", "A square at the origin, seen from the front, is missing.")
+        yield fault("invisible", "A square at the origin, seen from the front, is missing.")
         return
     middle, off = SQUARE[0] // 2, round(_pixels(0.15, SQUARE))
     spots = [
@@ -287,10 +281,10 @@ def texture(look: _Look, _: EngineInfo) -> Findings:
         "u flipped": "The texture's left column appears at the right.",
         "texture turned": "The quarters of the texture are not where they belong.",
     }
-    for fault in found:
-        yield Finding("fault", fault, said[fault])
+    for name in found:
+        yield fault(name, said[name])
     if not found:
-        yield Finding("ok", "texture", "its lower left corner is u = 0, v = 0.")
+        yield ok("texture", "its lower left corner is u = 0, v = 0.")
 
 
 RADIUS: Final = 0.28
@@ -304,7 +298,7 @@ def lens(look: _Look, _: EngineInfo) -> Findings:
     black = {name: _ellipse(look, FRONT, size) for name, size in LENS.items()}
     white = _ellipse(look, replace(FRONT, background=(255, 255, 255)), LENS["square"])
     if white is None or None in black.values():
-        yield Finding("fault", "invisible", "A disc at the origin is missing in some of the pictures.")
+        yield fault("invisible", "A disc at the origin is missing in some of the pictures.")
         return
     shots = {name: shot for name, shot in black.items() if shot}
     square = shots["square"]
@@ -314,9 +308,9 @@ def lens(look: _Look, _: EngineInfo) -> Findings:
     x, y = np.mean([square.centre, white.centre], axis=0)
     ways = [(x, "right" if x > 0 else "left"), (y, "down" if y > 0 else "up")]
     if off := [f"{abs(pixels):.2f} pixels too far {way}" for pixels, way in ways if abs(pixels) > SHIFT]:
-        yield Finding("fault", "shifted", f"The picture lies {' and '.join(off)}.")
+        yield fault("shifted", f"The picture lies {' and '.join(off)}.")
     else:
-        yield Finding("ok", "centre", f"off by {np.hypot(x, y):.2f} pixels.")
+        yield ok("centre", f"off by {np.hypot(x, y):.2f} pixels.")
 
 
 def _ellipse(look: _Look, view: View, size: Size) -> Blob | None:
@@ -329,27 +323,25 @@ def _ellipse(look: _Look, view: View, size: Size) -> Blob | None:
 def _field_of_view(size: float) -> Findings:
     found = 2 * float(np.degrees(np.arctan(np.tan(np.radians(FIELD_OF_VIEW / 2)) / size)))
     if abs(found - FIELD_OF_VIEW) > ANGLE:
-        yield Finding(
-            "fault", "field of view", f"The vertical field of view is {found:.1f} degrees, not {FIELD_OF_VIEW:g}."
-        )
+        yield fault("field of view", f"The vertical field of view is {found:.1f} degrees, not {FIELD_OF_VIEW:g}.")
     else:
-        yield Finding("ok", "field of view", f"{found:.1f} degrees.")
+        yield ok("field of view", f"{found:.1f} degrees.")
 
 
 def _aspect(shots: Mapping[str, Blob]) -> Findings:
     square = shots["square"].spread[1]
     sheared = [name for name, shot in shots.items() if abs(shot.shear) > 0.05]
     if sheared:
-        yield Finding("fault", "sheared", f"The rows of {' and '.join(sheared)} pictures lean.")
+        yield fault("sheared", f"The rows of {' and '.join(sheared)} pictures lean.")
     wrong = [
         f"{across / square:.2f} x {down / square:.2f} in a {name} picture"
         for name, (across, down) in ((name, shot.spread) for name, shot in shots.items() if name not in sheared)
         if max(abs(across / down - 1), abs(down / square - 1)) > RATIO
     ]
     if wrong:
-        yield Finding("fault", "aspect", f"A disc is stretched, width x height, {', '.join(wrong)}.")
+        yield fault("aspect", f"A disc is stretched, width x height, {', '.join(wrong)}.")
     elif not sheared:
-        yield Finding("ok", "aspect", "pixels are square in square, wide and tall pictures.")
+        yield ok("aspect", "pixels are square in square, wide and tall pictures.")
 
 
 def gamma(look: _Look, info: EngineInfo) -> Findings:
@@ -363,14 +355,14 @@ def gamma(look: _Look, info: EngineInfo) -> Findings:
     decoded = 0 if same < (DIMMED + weaker) / 2 else 2 if same > TWICE else 1
     encoding = slope / 2.2 ** (decoded - 1)
     if decoded == 0 and encoding > EXPONENTS[1]:
-        yield Finding("warning", "light on encoded colours", "Light multiplies encoded colours.")
+        yield warning("light on encoded colours", "Light multiplies encoded colours.")
         return
     if decoded != 1:
-        yield Finding("fault", "texture decoded twice" if decoded else "texture not decoded", told)
+        yield fault("texture decoded twice" if decoded else "texture not decoded", told)
     if not EXPONENTS[0] <= encoding <= EXPONENTS[1]:
-        yield Finding("fault", "gamma twice" if encoding < 1 else "gamma missing", told)
+        yield fault("gamma twice" if encoding < 1 else "gamma missing", told)
     elif decoded == 1:
-        yield Finding("ok", "gamma", f"greys keep their order and distance (exponent {slope:.2f}).")
+        yield ok("gamma", f"greys keep their order and distance (exponent {slope:.2f}).")
 
 
 def _rings(look: _Look, picture: Picture) -> list[float]:
@@ -397,10 +389,10 @@ def light(look: _Look, _: EngineInfo) -> Findings:
     inside = np.hypot(x, y) < 0.95
     normals = np.stack([x, y, np.sqrt(np.clip(1 - x**2 - y**2, 0, None))], axis=-1)[inside]
     if level(soft, inside) < 20:
-        yield Finding("fault", "ambient missing", "A white ball in ambient light alone is dark.")
+        yield fault("ambient missing", "A white ball in ambient light alone is dark.")
     hard = [look.at(BALL, _lit(SUN, side)) for side in SIDES]
     if max(float(np.percentile(picture[inside], 95)) for picture in hard) < 20:
-        yield Finding("fault", "light missing", "A white ball in directional light alone is dark.")
+        yield fault("light missing", "A white ball in directional light alone is dark.")
         return
     guesses = [_brightest(normals, picture[inside].mean(axis=1)) for picture in hard]
     yield from _direction(guesses)
@@ -433,13 +425,13 @@ def _direction(guesses: Sequence[NDArray[np.float64]]) -> Findings:
     )
     said = f"Light from {asked} seems to come from {places} (cameras at azimuth 0 and 110)."
     if off <= TOLERANCE:
-        yield Finding("ok", "light", f"comes from where it should, to {off:.0f} degrees.")
+        yield ok("light", f"comes from where it should, to {off:.0f} degrees.")
     elif _angle(*guesses) < TOLERANCE:
-        yield Finding("fault", "light follows camera", said)
+        yield fault("light follows camera", said)
     elif max(_angle(each, -true) for each in world) <= TOLERANCE:
-        yield Finding("fault", "light reversed", said)
+        yield fault("light reversed", said)
     else:
-        yield Finding("fault", "light direction", said)
+        yield fault("light direction", said)
 
 
 def _colour(look: _Look, white: Picture, inside: NDArray[np.bool_]) -> Findings:
@@ -449,9 +441,9 @@ def _colour(look: _Look, white: Picture, inside: NDArray[np.bool_]) -> Findings:
     before, after = median(white, bright) + 1, median(weak, bright) + 1
     if after[0] > 0.9 * before[0]:
         look.dims = False
-        yield Finding("fault", "light intensity", "0.15 of the light's intensity looks as bright as 1.")
+        yield fault("light intensity", "0.15 of the light's intensity looks as bright as 1.")
     if after[1] / after[0] > 0.85 * before[1] / before[0]:
-        yield Finding("fault", "light colour", "A red light looks white.")
+        yield fault("light colour", "A red light looks white.")
 
 
 GREY: Final = plate(0.25, plain(110, 110, 110))
@@ -462,16 +454,16 @@ def repaint(look: _Look, _: EngineInfo) -> Findings:
     old = look.at(GREY)
     there = blob(old)
     if there is None:
-        yield Finding("fault", "invisible", "A grey square at the origin is missing.")
+        yield fault("invisible", "A grey square at the origin is missing.")
         return
     painted = GREY.with_textures({TEXTURE: plain(140, 140, 140)})
     first, second = (level(look.at(painted), there.mask) - level(old, there.mask) for _ in range(2))
     if first > 4:
-        yield Finding("ok", "repaint", f"a texture 30 levels brighter shows, by {first:.0f}.")
+        yield ok("repaint", f"a texture 30 levels brighter shows, by {first:.0f}.")
     elif second > 4:
-        yield Finding("fault", "late texture", "A new texture shows in the second picture only.")
+        yield fault("late texture", "A new texture shows in the second picture only.")
     else:
-        yield Finding("fault", "frozen texture", "A new texture on the same mesh does not show.")
+        yield fault("frozen texture", "A new texture on the same mesh does not show.")
 
 
 def once_more(look: _Look, info: EngineInfo) -> Findings:
@@ -484,10 +476,7 @@ def speed(look: _Look, _: EngineInfo) -> Findings:
     """The time of all pictures so far."""
     seconds = float(np.median(look.seconds))
     told = f"{seconds:.2g} s a picture, the median of {len(look.seconds)} small ones."
-    if seconds > SLOW:
-        yield Finding("warning", "slow", told)
-    else:
-        yield Finding("ok", "speed", told)
+    yield warning("slow", told) if seconds > SLOW else ok("speed", told)
 
 
 QUESTIONS: Final[tuple[Callable[[_Look, EngineInfo], Findings], ...]] = (
