@@ -245,10 +245,6 @@ _JSON: Final = _ClientText(MAX_JSON)
 _SERVER_TEXT: Final = _ServerText()
 
 
-def _nothing() -> Mapping[str, FieldCodec]:
-    return MappingProxyType({})
-
-
 @dataclass(frozen=True)
 class Command:
     """One row of the protocol.
@@ -263,11 +259,11 @@ class Command:
 
     code: int | None
     name: str
-    request: Mapping[str, FieldCodec] = field(default_factory=_nothing)
+    request: Mapping[str, FieldCodec] = field(default_factory=dict)
     reply: tuple[FieldCodec, ...] = ()
     status: bool = False
     refused: tuple[Any, ...] | None = None
-    tail: Mapping[str, FieldCodec] = field(default_factory=_nothing)
+    tail: Mapping[str, FieldCodec] = field(default_factory=dict)
     repeated: bool = False
 
     def encode_request(self, **values: Any) -> bytes:
@@ -278,10 +274,9 @@ class Command:
             raise ProtocolError(f"{self.name} takes {sorted(kinds)}, got {sorted(values)}.")
         return head + b"".join(kind.pack(values[name]) for name, kind in kinds.items())
 
-    def decode_fields(self, read: Reader, *, long: bool = False) -> dict[str, Any]:
-        """The fields after the code byte, by name; with ``long`` also those of ``tail``."""
-        kinds = dict(self.request) | (dict(self.tail) if long else {})
-        return {name: kind.take(read) for name, kind in kinds.items()}
+    def decode_fields(self, read: Reader) -> dict[str, Any]:
+        """The fields of ``request`` by name."""
+        return {name: kind.take(read) for name, kind in self.request.items()}
 
     def encode_reply(self, *values: Any) -> bytes:
         """Bytes from a server after success."""

@@ -25,8 +25,8 @@ class Link:
     ``idle_since`` is the time of the last answer (monotonic), ``None`` within a request.
     """
 
-    def __init__(self, connection: socket.socket, memory: MemoryBudget, limits: Limits | None = None) -> None:
-        self._socket, self._memory, self._limits = connection, memory, limits or Limits()
+    def __init__(self, connection: socket.socket, memory: MemoryBudget, limits: Limits) -> None:
+        self._socket, self._memory, self._limits = connection, memory, limits
         self._bytes = self._reserved = 0
         self._set_deadline(self._limits.register_timeout)
         self.idle_since: float | None = None

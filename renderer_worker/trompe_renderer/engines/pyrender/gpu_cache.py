@@ -26,7 +26,7 @@ class GpuCache:
     All models of one shape share a mesh, which gets the textures of the model to draw next.
     """
 
-    def __init__(self, *, anisotropy: int = 1) -> None:
+    def __init__(self, *, anisotropy: int) -> None:
         self._anisotropy = anisotropy
         self._shapes: list[_GpuMesh] = []
         self._textures: ContentCache[_GpuTexture] = ContentCache(lambda texture: texture.delete())
