@@ -69,6 +69,17 @@ def run(store: JobStore, scripted: Scripted, *, claims: Claims | None = None, **
     return state
 
 
+def test_a_finished_phase_gives_way_to_the_name_of_the_next_one(store: JobStore) -> None:
+    shown: list[str] = []
+
+    def look(_: OnProgress) -> None:
+        shown.append(store.page().jobs[0].progress.phase)
+
+    run(store, Scripted(**{"prepare": look, "attack-000": look, "attack-001": look, "judge": look}))
+
+    assert shown == ["queued", "attack", "attack", "judge"]
+
+
 def test_progress_is_written_at_most_once_per_interval(store: JobStore) -> None:
 
     def eager(on_progress: OnProgress) -> None:

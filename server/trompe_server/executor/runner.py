@@ -3,8 +3,8 @@
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
 from trompe_server.errors import NotFoundError
@@ -110,6 +110,14 @@ class JobRunner:
             phases.close()
 
 
+def _ahead(report: PhaseReport, remaining: Sequence[str]) -> PhaseReport:
+    """The report of a finished phase as it is shown until the next one reports: under the name of the next one."""
+    if not remaining:
+        return report
+    kind = remaining[0].partition("-")[0]
+    return replace(report, progress=report.progress.model_copy(update={"phase": kind}))
+
+
 class _Phases:
     """The phases of one job in this process. The job is reopened after the renderer was lost."""
 
@@ -135,7 +143,7 @@ class _Phases:
             if report.state is not None:
                 return Ending(report.state, note=report.note, progress=report.progress, public=report.public)
             number = number_after(report, number, names)
-            self._record(report, done=number)
+            self._record(_ahead(report, names[number:]), done=number)
         return Ending(JobState.succeeded)
 
     def close(self) -> None:
