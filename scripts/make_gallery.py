@@ -1,10 +1,12 @@
-"""Make the start page's example: the demo's job on a shipped object, and some of its target images.
+"""Make the start page's example: a job on a shipped object, and some of its target images.
 
-    python -m scripts.make_gallery
+    python -m scripts.make_gallery --classifier mobilenet_v2.pt2
 
-writes server/trompe_server/pages/gallery.json and static/gallery/*.png beside it.
+writes server/trompe_server/pages/gallery.json and static/gallery/*.png beside it. The classes' names are read from
+imagenet_classes.json beside the classifier.
 """
 
+import argparse
 import json
 import tempfile
 from pathlib import Path
@@ -13,43 +15,47 @@ from typing import Final
 from trompe_server.job.texture_attack import open_job
 from trompe_server.library import Library
 from trompe_server.pages.pictures import Kind, Pictures
-from trompe_server.pages.present import viewer_record
+from trompe_server.pages.present import command, viewer_record
 from trompe_server.renderers import local_renderer
 from trompe_server.storage.folders import LocalArtifacts
-from trompe_shared.api import JobSpec, Result
-from trompe_shared.shipped import shipped_objects
+from trompe_shared.api import ClassifierInfo, JobSpec, Result
 
 PAGES: Final = Path(__file__).parents[1] / "server" / "trompe_server" / "pages"
-SPEC: Final = JobSpec.of("mug", label="mug", classifier="tiny", steps=100)
-"""What `trompe demo` asks for."""
+OBJECT: Final = "teapot"
 SHOWN: Final = 8
 KINDS: Final[tuple[Kind, ...]] = ("before", "after", "difference")
-CLASSES: Final = sorted({shipped.label for shipped in shipped_objects().values()})
-"""Of the shipped classifier, in the order of its logits."""
 
 
 def main() -> None:
     """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--classifier", type=Path, required=True, help="a .pt2 file that knows ImageNet's classes")
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        artifacts = LocalArtifacts(Path(folder) / "job")
-        run(artifacts, Library(Path(folder) / "library"))
-        write(Result.model_validate_json(artifacts.read("result.json")), artifacts)
+        library, artifacts = Library(Path(folder) / "library"), LocalArtifacts(Path(folder) / "job")
+        names = json.loads(options.classifier.with_name("imagenet_classes.json").read_bytes())
+        with options.classifier.open("rb") as file:
+            classifier = library.add_classifier(file, options.classifier.name, classes=names)
+        run(JobSpec.of(OBJECT, label=OBJECT, classifier=classifier.id), artifacts, library)
+        write(Result.model_validate_json(artifacts.read("result.json")), artifacts, classifier)
 
 
-def run(artifacts: LocalArtifacts, library: Library) -> None:
+def run(spec: JobSpec, artifacts: LocalArtifacts, library: Library) -> None:
     """The job, from beginning to end."""
     with local_renderer() as target:
-        job = open_job(SPEC, library=library, artifacts=artifacts, target=target)
+        job = open_job(spec, library=library, artifacts=artifacts, target=target)
         for phase in job.phases():
             print(phase)
-            job.run(phase, lambda _: None)
+            if job.run(phase, lambda _: None).state is not None:
+                break
 
 
-def write(result: Result, artifacts: LocalArtifacts) -> None:
+def write(result: Result, artifacts: LocalArtifacts, classifier: ClassifierInfo) -> None:
     """What the start page shows: held-out views, evenly around the object, whatever became of them."""
-    held_out = result.held_out
+    held_out, classes = result.held_out, classifier.classes
     assert held_out is not None
     assert held_out.a_after is not None
+    assert classes is not None
     around = sorted(range(len(result.held_out_views)), key=lambda k: result.held_out_views[k].azimuth)
     chosen = around[:: len(around) // SHOWN][:SHOWN]
     pictures, views = Pictures(), []
@@ -59,10 +65,13 @@ def write(result: Result, artifacts: LocalArtifacts) -> None:
         for kind in KINDS:
             (place / f"{kind}.png").write_bytes(pictures.one(artifacts, "held_out", view, kind))
         address = f"/static/gallery/{number}"
-        views.append(viewer_record(result.held_out_views[view], result.labels, CLASSES.__getitem__, address))
+        views.append(viewer_record(result.held_out_views[view], result.labels, classes.__getitem__, address))
     gallery = {
         "object": result.object,
-        "epsilon": f"{result.epsilon:.0%}",
+        "classifier": classifier.name,
+        "epsilon": result.epsilon,
+        "seed": result.seed,
+        "command": command(result.spec, object=OBJECT, classifier=f"{classifier.name}.pt2"),
         "views": held_out.views,
         "before": f"{held_out.a_before:.0%}",
         "after": f"{held_out.a_after:.0%}",

@@ -29,6 +29,15 @@ OTHERS = "ERR_NETWORK_CHANGED"
 LIMIT = 120_000
 """Milliseconds that a busy machine has for anything."""
 
+REPORTED = """
+    (place) => {
+        window.told = [];
+        new MutationObserver(() => window.told.push(document.querySelector(place).textContent))
+            .observe(document.querySelector(place), {childList: true, characterData: true, subtree: true});
+    }
+"""
+"""Keeps in ``told`` every text that the element shows from now on."""
+
 SMALL = {"grid": True, "azimuths": 3, "elevations": 2, "held_out": 4, "steps": 5}
 """A job of some seconds."""
 
@@ -41,10 +50,12 @@ class Service(Served):
     def client(self) -> Client:
         return Client(self.url, token=self.token)
 
-    def submit(self, *, labels: dict[str, str] | None = None, **options: Any) -> str:  # type: ignore[override]
-        """Submit a small job on the shipped mug. Returns its id."""
+    def submit(  # type: ignore[override]
+        self, *, object: str = "mug", labels: dict[str, str] | None = None, **options: Any
+    ) -> str:
+        """Submit a small job, on the shipped mug unless told otherwise. Returns its id."""
         with self.client() as client:
-            return client.attack("mug", label="mug", labels=labels or {}, **SMALL | options).id
+            return client.attack(object, label="mug", labels=labels or {}, **SMALL | options).id
 
     def finished(self, **options: Any) -> str:
         """The id of a small job that has succeeded."""
@@ -65,6 +76,13 @@ def drop(page: Page, file: Path) -> None:
         [file.name, list(file.read_bytes())],
     )
     page.dispatch_event("#drop", "drop", {"dataTransfer": transfer})
+
+
+def slowed(context: BrowserContext, page: Page, *, bytes_per_second: int) -> None:
+    """Give the page a slow network."""
+    network = {"offline": False, "latency": 200, "downloadThroughput": bytes_per_second}
+    session = context.new_cdp_session(page)
+    session.send("Network.emulateNetworkConditions", network | {"uploadThroughput": bytes_per_second})
 
 
 @pytest.fixture(scope="module")

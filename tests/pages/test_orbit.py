@@ -36,7 +36,7 @@ def painted(service: Service, browser: Browser, tmp_path_factory: pytest.TempPat
     page.goto(f"{service.url}/jobs/new")
     drop(page, file)
     expect(page.locator("#file-says")).to_contain_text("triangles")
-    expect(page.locator(".turntable")).to_be_visible()
+    expect(page.locator(".turntable figcaption")).to_have_text("In the target renderer")
     page.fill("[name='goal.label']", "mug")
     page.fill("[name='paint.epsilon']", "0.1")
     page.check("[name=preset][value=fast]")
@@ -227,7 +227,7 @@ def test_the_result_as_one_file_opens_without_a_network(
     assert np.abs(drawn[0] - drawn[1]).max() > 8
     assert page.locator("trompe-viewer img.after").evaluate("image => image.decode().then(() => image.naturalWidth)")
     page.locator(".sphere circle").first.click()
-    expect(page.locator(".sphere circle.shown")).to_have_count(1)
+    expect(page.locator(".sphere .shown")).to_have_count(1)
 
 
 def test_the_3d_view_is_accessible_and_fits_a_phone(service: Service, page: Page, painted: str) -> None:

@@ -1,5 +1,6 @@
 """The pages as people use them: a real service, a real browser."""
 
+import io
 import json
 import re
 import subprocess
@@ -10,11 +11,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Page, Response, expect
+from PIL import Image
+from playwright.sync_api import Browser, BrowserContext, Page, Response, expect
 
-from tests.pages.conftest import LIMIT, Service, drop
+from tests.pages.conftest import LIMIT, REPORTED, Service, drop, slowed
 from trompe_shared.api import OPTIONS
 
 pytestmark = pytest.mark.timeout(1200)
@@ -26,18 +29,27 @@ def done(service: Service) -> str:
     return service.finished(labels={"experiment": "tries"})
 
 
+@pytest.fixture(scope="module")
+def stronger(service: Service) -> str:
+    """Another job, of a larger epsilon."""
+    return service.finished(epsilon=0.2, steps=1)
+
+
 def test_the_start_page_shows_an_example_before_there_is_any_job(service: Service, page: Page) -> None:
     responses: list[Response] = []
     page.on("response", lambda response: responses.append(response))
 
     page.goto(service.url)
 
-    expect(page.get_by_role("heading", level=1)).to_contain_text("mug")
+    expect(page.get_by_role("heading", level=1)).to_contain_text("teapot")
+    before, after = (int(share) for share in re.findall(r"in (\d+)%", page.inner_text(".lead")))
+    assert before - after >= 80
+    expect(page.locator(".hero")).to_contain_text("trompe attack teapot --label teapot --classifier mobilenet_v2.pt2")
     for kind in ("before", "after"):
         assert page.locator(f"trompe-viewer img.{kind}").evaluate(
             "image => image.decode().then(() => image.naturalWidth)"
         )
-    assert sum(len(each.body()) for each in responses if "stream" not in each.url) < 200_000
+    assert sum(len(each.body()) for each in responses if "stream" not in each.url) < 150_000
 
 
 def test_a_wrong_file_and_a_wrong_class_are_told_in_the_servers_words(
@@ -115,10 +127,11 @@ def test_the_divider_is_dragged_and_views_are_chosen_by_key_and_on_the_map(
     page.keyboard.press("ArrowRight")
     assert shown.get_attribute("src") != first
 
-    dot = page.locator('.sphere circle[data-set="1"][data-view="3"]')
+    assert page.locator(".sphere circle").count() == page.locator('.sphere [data-set="0"]').count()
+    dot = page.locator('.sphere rect[data-set="1"][data-view="3"]')
     dot.click()
     assert re.search(r"/pictures/own/\d+/after.png$", shown.get_attribute("src") or "")
-    assert page.locator(".sphere circle.shown").count() == 1
+    assert page.locator(".sphere .shown").count() == 1
     expect(dot).to_have_class(re.compile("shown"))
     for side in dot.locator("title").text_content().split(", then "):  # type: ignore[union-attr]
         assert side in page.inner_text("trompe-viewer .sides")
@@ -158,11 +171,12 @@ def test_the_page_of_a_result_says_what_the_result_says_and_gives_it_as_one_zip(
     figures = [str(result.target.views), f"{result.target.a_before:.2f}", f"{result.target.a_after:.2f}"]
     assert row.locator("td").all_inner_texts()[:3] == figures
     judged = [*result.views, *result.held_out_views]
-    assert page.locator(".sphere circle").count() == len(judged)
+    assert page.locator(".sphere circle").count() == len(result.held_out_views)
+    assert page.locator(".sphere rect").count() == len(result.views)
     kept = sum(view.after == result.label for view in judged)
-    assert page.locator(".sphere circle.kept").count() == kept
+    assert page.locator(".sphere .kept").count() == kept
     never = sum(result.label not in {view.before, view.after} for view in judged)
-    assert page.locator(".sphere circle.never").count() == never
+    assert page.locator(".sphere .never").count() == never
     assert page.locator("trompe-viewer .sides .true").count() == 1  # the first view shown was recognised before
 
     with page.expect_download() as download:
@@ -191,9 +205,8 @@ def test_a_new_job_appears_in_the_list_by_itself(service: Service, page: Page, d
     expect(page.locator(f"#job-{job} .state")).to_have_text("succeeded", timeout=600_000)
 
 
-def test_the_list_is_sorted_and_filtered(service: Service, page: Page, done: str) -> None:
-    for epsilon in (0.2, 0.1):
-        service.finished(epsilon=epsilon, steps=1)
+def test_the_list_is_sorted_and_filtered(service: Service, page: Page, done: str, stronger: str) -> None:
+    service.finished(epsilon=0.1, steps=1)
     page.goto(f"{service.url}/jobs")
     epsilons = page.locator("tbody tr:visible td:nth-child(4)")
     for order in (sorted, lambda found: sorted(found, reverse=True)):
@@ -208,11 +221,10 @@ def test_the_list_is_sorted_and_filtered(service: Service, page: Page, done: str
     expect(epsilons).not_to_have_count(0)
 
 
-def test_two_jobs_are_compared(service: Service, page: Page, done: str) -> None:
-    other = service.finished(epsilon=0.2)
+def test_two_jobs_are_compared(service: Service, page: Page, done: str, stronger: str) -> None:
     page.goto(f"{service.url}/jobs")
 
-    for job in (done, other):
+    for job in (done, stronger):
         page.locator(f"#job-{job}").get_by_role("checkbox").check()
     page.get_by_role("link", name="Compare these 2").click()
 
@@ -285,14 +297,68 @@ def test_no_serious_fault_of_accessibility(service: Service, browser: Browser, d
     context.close()
 
 
-def test_nothing_is_wider_than_a_phone(service: Service, browser: Browser, done: str) -> None:
-    context = browser.new_context(viewport={"width": 360, "height": 740})
+SHIFTS = """
+    window.shifted = 0;
+    new PerformanceObserver((list) => { for (const each of list.getEntries()) window.shifted += each.value; })
+        .observe({type: "layout-shift", buffered: true});
+"""
+TOO_WIDE = """
+    () => [...document.querySelectorAll("main *")]
+        .filter((each) => each.scrollWidth > each.clientWidth + 1)
+        .filter((each) => getComputedStyle(each).overflowX !== "visible")
+        .map((each) => each.outerHTML.slice(0, 100))
+"""
+
+
+def inked(page: Page) -> float:
+    """Share of the pixels of the emptiest half of the window that are not background."""
+    shown = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("L"), np.int16)
+    drawn = np.abs(shown - shown[0, 0]) > 30
+    height, width = (side // 2 for side in drawn.shape)
+    return min(float(half.mean()) for half in (drawn[:height], drawn[height:], drawn[:, :width], drawn[:, width:]))
+
+
+@pytest.mark.parametrize(("width", "height"), [pytest.param(360, 740, id="phone"), pytest.param(1280, 800, id="desk")])
+def test_no_page_is_too_wide_cut_off_half_empty_or_moves_while_it_loads(
+    service: Service, browser: Browser, done: str, width: int, height: int
+) -> None:
+    context = browser.new_context(viewport={"width": width, "height": height})
     context.set_default_timeout(LIMIT)
+    context.add_init_script(SHIFTS)
     page = context.new_page()
     for path in ("/", "/jobs", "/jobs/new", "/judgements/new", f"/jobs/{done}", "/experiments/tries", "/docs"):
         page.goto(service.url + path)
-        assert page.evaluate("document.documentElement.scrollWidth") <= 360, path
+        page.wait_for_timeout(300)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, path
+        assert page.evaluate(TOO_WIDE) == [], path
+        assert page.evaluate("window.shifted") < 0.02, path
+        assert inked(page) > 0.005, path
     context.close()
+
+
+def test_on_a_slow_network_a_result_is_read_before_its_viewer_is_there_and_3d_says_what_it_loads(
+    service: Service, page: Page, context: BrowserContext, done: str
+) -> None:
+    with service.client() as client:
+        result = client.job(done).result()
+    slowed(context, page, bytes_per_second=150_000)
+
+    page.goto(f"{service.url}/jobs/{done}", wait_until="commit")
+    expect(page.locator(".lead")).to_contain_text("views hidden from the attack")
+    expect(page.get_by_role("cell", name=f"{result.target.a_after:.2f}", exact=True).first).to_be_visible()
+    assert page.evaluate("customElements.get('trompe-viewer')") is None
+
+    page.wait_for_load_state()
+    page.evaluate(REPORTED, "trompe-orbit [role=status]")
+    page.get_by_role("button", name="Show it in 3D").click()
+    expect(page.locator("trompe-orbit [role=status]")).to_have_text("Loading three.js")
+    expect(page.locator("trompe-orbit")).to_have_attribute("data-answered", re.compile("azimuth"))
+    told = page.evaluate("window.told")
+    loaded = [
+        [float(each) for each in re.findall(r"([\d.]+) MB", text)] for text in told if "Loading the object" in text
+    ]
+    assert len(loaded) > 2
+    assert loaded == sorted(loaded, key=sum)
 
 
 def test_a_server_that_restarts_in_mid_job_is_waited_for(service: Service, page: Page, faults: list[str]) -> None:
@@ -300,10 +366,12 @@ def test_a_server_that_restarts_in_mid_job_is_waited_for(service: Service, page:
     page.goto(f"{service.url}/jobs/{job}")
     expect(page.locator("[data-field=step]")).to_contain_text("of")
 
+    expect(page.locator("[data-field=phase]")).to_have_text("attacking")
+
     for name in ("loss", "fooled"):
-        curve = page.locator(f"[data-curve={name}]")
-        expect(curve).to_be_visible()
-        points = curve.locator("polyline").get_attribute("points")
+        curve = page.locator(f"[data-curve={name}] polyline")
+        expect(curve).to_have_attribute("points", re.compile(" "))
+        points = curve.get_attribute("points")
         assert points is not None
         steps = [float(each.split(",")[0]) for each in points.split()]
         assert steps == sorted(steps)

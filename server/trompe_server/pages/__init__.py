@@ -1,6 +1,7 @@
 """The web pages. They show jobs; every action goes through the API."""
 
 from fastapi import FastAPI
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
 
 from trompe_server.pages.errors import HtmlProblems
@@ -17,6 +18,6 @@ def add_pages(app: FastAPI) -> None:
     """Add the pages to ``app``, which serves the API. Problem details become pages for browsers."""
     app.state.pictures, app.state.outcomes = Pictures(), Outcomes()
     app.include_router(router)
-    app.mount("/static/three", StaticFiles(directory=FOLDER), name="three")
-    app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    for path, folder in {"/static/three": FOLDER, "/static": STATIC}.items():
+        app.mount(path, GZipMiddleware(StaticFiles(directory=folder)), name=folder.name)
     app.add_middleware(HtmlProblems)

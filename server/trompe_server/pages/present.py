@@ -16,6 +16,7 @@ from trompe_shared.api import (
     Accuracy,
     Job,
     JobSpec,
+    JobState,
     Option,
     Progress,
     Result,
@@ -23,6 +24,7 @@ from trompe_shared.api import (
 )
 
 __all__ = [
+    "PHASES",
     "TERMS",
     "ClassNames",
     "JobRow",
@@ -122,7 +124,7 @@ class JobRow:
 def job_row(job: Job, *, object: str, classifier: str, label: str, epsilon: float | None) -> JobRow:
     """A job with names in place of ids."""
     progress, live = job.progress, not job.state.final
-    kind = progress.phase.partition("-")[0]
+    kind = _phase(job)
     return JobRow(
         id=job.id,
         object=object,
@@ -140,6 +142,12 @@ def job_row(job: Job, *, object: str, classifier: str, label: str, epsilon: floa
         created=job.created,
         artifacts=job.artifacts,
     )
+
+
+def _phase(job: Job) -> str:
+    """Kind of the present phase; a running job that has reported none is being opened."""
+    kind = job.progress.phase.partition("-")[0]
+    return "open" if job.state is JobState.running and kind == JobState.queued else kind
 
 
 def _how_it_ended(job: Job) -> str:
@@ -220,7 +228,8 @@ def _view_sets(result: Result, names: ClassNames, place: str) -> list[dict[str, 
         ):
             if views:
                 shown = _views(views, result, names, f"{place}/{numbered(kind, number)}")
-                sets.append({"name": name + title, "views": shown, "headline": each.renderer == result.renderer})
+                headline = each.renderer == result.renderer
+                sets.append({"name": name + title, "views": shown, "own": kind == "own", "headline": headline})
     return sorted(sets, key=lambda each: not each["headline"])
 
 

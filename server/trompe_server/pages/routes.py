@@ -27,7 +27,7 @@ from trompe_server.pages.naming import Names
 from trompe_server.pages.offline import offline_page
 from trompe_server.pages.orbit import orbit, painted
 from trompe_server.pages.pictures import Kind, ViewSet
-from trompe_server.pages.present import TERMS, JobRow, Shown, differences, present
+from trompe_server.pages.present import PHASES, TERMS, JobRow, Shown, differences, present
 from trompe_server.pages.serving import COOKIE, page, render
 from trompe_server.pages.turntable import TURNS, turntable
 from trompe_server.storage.database import DatabaseDownError
@@ -41,7 +41,7 @@ __all__ = ["router"]
 router = APIRouter(include_in_schema=False)
 
 GALLERY: Final[Mapping[str, Any]] = json.loads((Path(__file__).parent / "gallery.json").read_bytes())
-"""The shipped demo's result; ``scripts/make_gallery.py`` writes it."""
+"""The start page's example; ``scripts/make_gallery.py`` writes it."""
 
 LATEST: Final = 8
 PAGE: Final = 50
@@ -174,7 +174,7 @@ def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
     found = services.store.get(job)
     row, result = _row(request, services, found), _result(services, found)
     if result is None:
-        return page(request, "job.html", job=row, shown=None)
+        return page(request, "job.html", job=row, shown=None, phases=PHASES)
     turned = orbit(result, job, services.library.classifiers())
     return page(request, "job.html", job=row, shown=_shown(services, row, result), orbit=turned, terms=TERMS)
 
@@ -268,7 +268,7 @@ def show_experiment(request: Request, services: ServicesDep, name: str, cursor: 
 @router.get("/docs")
 def docs(request: Request) -> HTMLResponse:
     """The operations and schemas of the API."""
-    return page(request, "docs.html")
+    return page(request, "docs.html", api=request.app.openapi())
 
 
 @router.get("/login")

@@ -30,7 +30,7 @@ HEADERS: Final = {
 
 def _code(text: str) -> Markup:
     """``text`` with words in backquotes, such as names of options, as code."""
-    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
+    return Markup(re.sub("`+([^`]+)`+", r"<code>\1</code>", str(escape(text))))
 
 
 _TEMPLATES: Final = Jinja2Templates(

@@ -10,6 +10,8 @@ __all__ = ["Sphere", "sphere"]
 LEFT, RIGHT, TOP, BOTTOM = 50.0, 700.0, 15.0, 485.0
 LEAST, MOST = 4.0, 11.0
 """Radii of dots of no and of full confidence."""
+CROWD: Final = 200
+"""Views above which the dots shrink, so that their area stays the same."""
 ROUND: Final = 10
 """Degrees to which the range of elevations is widened."""
 AZIMUTHS: Final = range(-180, 181, 60)
@@ -36,11 +38,12 @@ def sphere(sets: Sequence[Sequence[Mapping[str, Any]]]) -> Sphere:
     def y(elevation: float) -> float:
         return round(BOTTOM - (BOTTOM - TOP) * (elevation - low) / (high - low), 1)
 
+    scale = min(1.0, math.sqrt(CROWD / max(1, len(heights))))
     dots = [
         {
             "x": x((view["azimuth"] + 180) % 360 - 180),
             "y": y(view["elevation"]),
-            "r": round(LEAST + (MOST - LEAST) * view["confidence"], 1),
+            "r": round(scale * (LEAST + (MOST - LEAST) * view["confidence"]), 1),
             "fate": view["fate"],
             "set": number,
             "view": index,

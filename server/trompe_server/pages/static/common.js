@@ -15,8 +15,9 @@ export class Refused extends Error {
 }
 
 // The JSON of an answer. Throws Refused with the server's message, or a TypeError without a connection.
-export async function ask(path, options = {}) {
-  const answer = await fetch(path, options);
+export const ask = async (path, options = {}) => answered(await fetch(path, options));
+
+export async function answered(answer) {
   if (answer.status === 401) location.assign(`/login?next=${encodeURIComponent(location.pathname)}`);
   if (!answer.ok) throw new Refused(await answer.json().catch(() => ({ title: `The server answered ${answer.status}` })));
   return answer.status === 204 ? null : answer.json();

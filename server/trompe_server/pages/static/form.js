@@ -1,5 +1,5 @@
 // Shared by the forms: uploads at once, faults beside their fields, one job for one request.
-import { Refused, ask, words } from "./common.js";
+import { Refused, answered, ask, words } from "./common.js";
 
 const form = document.getElementById("new");
 const keys = new Map();
@@ -25,11 +25,11 @@ export function complain(error, fallback = "") {
   }
 }
 
-export async function upload(path, picked, select, place) {
+export async function upload(path, picked, select, place, onShare = () => {}) {
   const body = new FormData();
   body.append("file", picked);
   try {
-    const stored = await ask(path, { method: "POST", body });
+    const stored = await answered(await posted(path, body, onShare));
     const option = [...select.options].find((each) => each.value === stored.id) ?? new Option(stored.name, stored.id);
     option.selected = true;
     select.append(option);
@@ -41,12 +41,25 @@ export async function upload(path, picked, select, place) {
   }
 }
 
+// Post with `onShare` told the share that is sent, which `fetch` does not tell.
+function posted(path, body, onShare) {
+  return new Promise((done, fail) => {
+    const request = new XMLHttpRequest();
+    request.upload.onprogress = ({ loaded, total }) => onShare(loaded / total);
+    request.onload = () => done(new Response(request.response, { status: request.status }));
+    request.onerror = () => fail(new TypeError("no connection"));
+    request.open("POST", path);
+    onShare(0);
+    request.send(body);
+  });
+}
+
 export const send = (path, body, headers = {}) =>
   ask(path, { method: "POST", body, headers: { "Content-Type": "application/json", ...headers } });
 
 // Submit what `request` gives as JSON, and go to the job. Until then the button is disabled: the form has no address.
 export function submits(path, request) {
-  const button = form.querySelector(":scope > button");
+  const button = form.querySelector("button.button");
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     button.disabled = true;

@@ -2,11 +2,13 @@
 import { ask, follow } from "./common.js";
 
 const live = document.getElementById("live");
+const phases = live && JSON.parse(live.dataset.phases);
 
-function show(progress) {
+function show({ state, progress }) {
   const put = (name, text) => { live.querySelector(`[data-field=${name}]`).textContent = text ?? "–"; };
   live.querySelector("progress").value = progress.fraction;
-  put("phase", progress.phase);
+  const phase = state === "running" && progress.phase === "queued" ? "open" : progress.phase;
+  put("phase", phases[phase] ?? phase);
   put("step", progress.step == null ? null : `${progress.step} of ${progress.steps}`);
   put("loss", progress.loss?.toFixed(3));
   put("fooled", progress.fooled == null ? null : `${Math.round(100 * progress.fooled)} %`);
@@ -26,26 +28,25 @@ function draw(progress) {
   for (const [name, points] of Object.entries(curves)) {
     if (progress.step == null || progress[name] == null) continue;
     points.set(progress.step, progress[name]);
+    if (points.size < 2) continue;
     const values = [...points.values()], steps = [...points.keys()];
     const low = Math.min(0, ...values), high = Math.max(name === "fooled" ? 1 : low + 1e-9, ...values), last = Math.max(2, ...steps);
     const figure = live.querySelector(`[data-curve=${name}]`);
     const at = (step) => `${(300 * (step - 1)) / (last - 1)},${85 - (80 * (points.get(step) - low)) / (high - low)}`;
     figure.querySelector("polyline").setAttribute("points", steps.sort((a, b) => a - b).map(at).join(" "));
     figure.querySelector("figcaption span").textContent = `${low.toPrecision(2)} to ${high.toPrecision(2)}, steps 1 to ${last}`;
-    figure.hidden = points.size < 2;
   }
 }
 
 let shown = null;
 function preview(progress) {
-  const figure = document.getElementById("preview");
   const chunk = Math.floor((progress.step ?? 0) / 5);
   if (!chunk || chunk === shown) return;
   const picture = new Image(448, 224);
   picture.alt = "The object at present, in the surrogate and in the target renderer";
   picture.onload = () => {
-    figure.querySelector("img").replaceWith(picture);
-    figure.hidden = false;
+    live.querySelector("#preview .stage").replaceChildren(picture);
+    live.querySelector("#preview span")?.remove();
   };
   picture.src = `/jobs/${live.dataset.job}/preview.png?chunk=${chunk}`;
   shown = chunk;
@@ -54,7 +55,7 @@ function preview(progress) {
 if (live) {
   const stop = follow(`/v1/jobs/${live.dataset.job}/events`, "progress", (data) => {
     const event = JSON.parse(data);
-    show(event.progress);
+    show(event);
     draw(event.progress);
     preview(event.progress);
     if (!["queued", "running"].includes(event.state)) {

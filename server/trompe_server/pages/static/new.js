@@ -12,8 +12,9 @@ const says = document.getElementById("file-says");
 
 async function take(picked) {
   if (!picked) return;
-  says.textContent = `${picked.name}: uploading`;
-  const stored = await upload("/v1/objects", picked, object, "object");
+  const stored = await upload("/v1/objects", picked, object, "object", (share) => {
+    says.textContent = share < 1 ? `${picked.name}: ${Math.round(100 * share)} % uploaded` : `${picked.name}: the server reads it`;
+  });
   says.textContent = stored
     ? `${stored.name}: ${stored.triangles} triangles, ${Object.keys(stored.textures).length} textures`
     : `${picked.name} was refused`;
@@ -28,22 +29,23 @@ async function chosen() {
     label.value = known;
     for (const more of [...form.querySelectorAll(`[name='${label.name}']`)].slice(1)) more.remove();
   }
-  const figure = document.querySelector(".turntable");
+  const caption = document.querySelector(".turntable figcaption");
+  caption.textContent = "The target renderer is drawing it.";
   const asked = new URLSearchParams({ background: option("views.background").value });
   if (option("views.distance").value) asked.set("distance", option("views.distance").value);
   if (option("views.renderers")) asked.set("renderer", option("views.renderers").value);
   const answer = await fetch(`/jobs/turntable/${encodeURIComponent(object.value)}.png?${asked}`).catch(() => null);
-  figure.hidden = !answer?.ok;
-  if (!answer?.ok) return;
-  turntable = await createImageBitmap(await answer.blob());
+  turntable = answer?.ok ? await createImageBitmap(await answer.blob()) : null;
+  caption.textContent = turntable ? "In the target renderer" : `No picture: ${await reason(answer)}`;
   turn();
 }
 
+const reason = async (answer) => (await answer?.json().catch(() => null))?.detail ?? "the server cannot be reached.";
+
 function turn() {
-  if (!turntable) return;
-  const side = turntable.height;
-  const canvas = Object.assign(document.getElementById("turntable"), { width: side, height: side });
-  canvas.getContext("2d").drawImage(turntable, -side * Number(document.getElementById("turn").value), 0);
+  const canvas = document.getElementById("turntable"), side = turntable?.height ?? canvas.height;
+  Object.assign(canvas, { width: side, height: side });
+  if (turntable) canvas.getContext("2d").drawImage(turntable, -side * Number(document.getElementById("turn").value), 0);
 }
 
 async function classes() {

@@ -37,10 +37,19 @@ class Stage {
     this.camera = new THREE.PerspectiveCamera(fov);
   }
 
-  static async open(given) {
+  // `onShare` is told what is loaded, in words.
+  static async open(given, onShare) {
+    onShare("Loading three.js");
     const modules = [import(given.files.three), import(given.files.lights)];
     const [THREE, lights] = await Promise.all(modules);
-    const models = await Promise.all([given.models.before, given.models.after].map((address) => load(THREE, address)));
+    const loaded = [0, 0];
+    const models = await Promise.all([given.models.before, given.models.after].map(async (address, side) => {
+      const data = await download(address, (bytes) => {
+        loaded[side] = bytes;
+        onShare(`Loading the object: ${megabytes(loaded[0])} before, ${megabytes(loaded[1])} after`);
+      });
+      return parse(THREE, data);
+    }));
     return new Stage(THREE, lights, models, given);
   }
 
@@ -99,15 +108,29 @@ class Half {
   }
 }
 
-async function load(THREE, address) {
+const megabytes = (bytes) => `${(bytes / 1e6).toFixed(1)} MB`;
+
+// The bytes at `address`; `onBytes` is told their number so far.
+async function download(address, onBytes) {
   const answer = await fetch(address);
   if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).detail ?? `The server answered ${answer.status}.`);
+  const chunks = [];
+  let bytes = 0;
+  for (const reader = answer.body.getReader(); ;) {
+    const { done, value } = await reader.read();
+    if (done) return new Blob(chunks).arrayBuffer();
+    chunks.push(value);
+    onBytes(bytes += value.length);
+  }
+}
+
+async function parse(THREE, data) {
   const loader = new THREE.GLTFLoader();
   loader.register((parser) => {
     parser.textureLoader = new THREE.TextureLoader(parser.options.manager);  // the other one needs connect-src blob:
     return { name: "textures as images" };
   });
-  const { scene } = await loader.parseAsync(await answer.arrayBuffer(), "");
+  const { scene } = await loader.parseAsync(data, "");
   scene.traverse((mesh) => {
     if (mesh.isMesh) mesh.castShadow = mesh.receiveShadow = !mesh.material.transparent;
   });
@@ -127,6 +150,7 @@ class Orbit extends HTMLElement {
     this.given = JSON.parse(this.querySelector("script").textContent);
     this.pose = { ...this.given.start };
     this.starter = this.querySelector("button");
+    this.status = this.querySelector("[role=status]");
     this.message = this.querySelector(".error");
     this.starter.onclick = () => this.open();
   }
@@ -143,12 +167,13 @@ class Orbit extends HTMLElement {
     }
     this.starter.disabled = true;
     try {
-      this.stage = await Stage.open(this.given);
+      this.stage = await Stage.open(this.given, (text) => { this.status.textContent = text; });
       this.build();
       this.turned();
-      this.starter.remove();
+      this.starter.parentElement.remove();
     } catch (error) {
       this.complain(`The object cannot be drawn: ${error.message}`);
+      this.status.textContent = "";
       this.starter.disabled = false;
     }
   }

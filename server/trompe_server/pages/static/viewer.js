@@ -39,7 +39,7 @@ class Viewer extends HTMLElement {
       this.stage,
       element("div", { className: "sides", ariaLive: "polite" }, this.saysBefore, this.saysAfter),
       element("div", { className: "controls" },
-        element("label", {}, "Divider", this.divider), element("label", {}, "View", this.turn), this.where, row),
+        element("label", {}, "Divider ", this.divider), element("label", {}, "View ", this.turn), this.where, row),
     );
     this.listen();
   }
@@ -95,8 +95,8 @@ class Viewer extends HTMLElement {
   // The dot of the view on the map of a result.
   mark(index) {
     const set = this.sets.findIndex(({ views }) => views === this.views);
-    for (const dot of document.querySelectorAll(".sphere circle.shown")) dot.classList.remove("shown");
-    document.querySelector(`.sphere circle[data-set="${set}"][data-view="${index}"]`)?.classList.add("shown");
+    for (const dot of document.querySelectorAll(".sphere .shown")) dot.classList.remove("shown");
+    document.querySelector(`.sphere [data-set="${set}"][data-view="${index}"]`)?.classList.add("shown");
   }
 
   say(place, title, text, right) {
@@ -108,7 +108,7 @@ customElements.define("trompe-viewer", Viewer);
 
 // The map beside the viewer leads to its views, and marks the one that is shown.
 document.querySelector(".sphere")?.addEventListener("click", (event) => {
-  const dot = event.target.closest("circle");
+  const dot = event.target.closest("[data-view]");
   if (!dot) return;
   const viewer = document.querySelector("trompe-viewer");
   viewer.choose(Number(dot.dataset.set), Number(dot.dataset.view));
