@@ -31,9 +31,9 @@ LIMIT = 120_000
 
 REPORTED = """
     (place) => {
+        const element = document.querySelector(place);
         window.told = [];
-        new MutationObserver(() => window.told.push(document.querySelector(place).textContent))
-            .observe(document.querySelector(place), {childList: true, characterData: true, subtree: true});
+        new MutationObserver(() => window.told.push(element.textContent)).observe(element, {childList: true});
     }
 """
 """Keeps in ``told`` every text that the element shows from now on."""

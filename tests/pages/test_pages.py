@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
-from playwright.sync_api import Browser, BrowserContext, Page, Response, expect
+from playwright.sync_api import Browser, BrowserContext, Page, Response, Route, expect
 
 from tests.pages.conftest import LIMIT, REPORTED, Service, drop, slowed
 from trompe_shared.api import OPTIONS
@@ -342,18 +342,25 @@ def test_on_a_slow_network_a_result_is_read_before_its_viewer_is_there_and_3d_sa
     with service.client() as client:
         result = client.job(done).result()
     slowed(context, page, bytes_per_second=150_000)
+    held: list[Route] = []
+
+    def hold(route: Route) -> None:
+        held.append(route)
+
+    page.route("**/viewer.js*", hold)
 
     page.goto(f"{service.url}/jobs/{done}", wait_until="commit")
     expect(page.locator(".lead")).to_contain_text("views hidden from the attack")
     expect(page.get_by_role("cell", name=f"{result.target.a_after:.2f}", exact=True).first).to_be_visible()
-    assert page.evaluate("customElements.get('trompe-viewer')") is None
+    assert page.evaluate("customElements.get('trompe-viewer') === undefined")
+    held[0].continue_()
+    assert page.locator("trompe-viewer img.after").evaluate("image => image.decode().then(() => image.naturalWidth)")
 
-    page.wait_for_load_state()
     page.evaluate(REPORTED, "trompe-orbit [role=status]")
     page.get_by_role("button", name="Show it in 3D").click()
-    expect(page.locator("trompe-orbit [role=status]")).to_have_text("Loading three.js")
     expect(page.locator("trompe-orbit")).to_have_attribute("data-answered", re.compile("azimuth"))
     told = page.evaluate("window.told")
+    assert told[0] == "Loading three.js"
     loaded = [
         [float(each) for each in re.findall(r"([\d.]+) MB", text)] for text in told if "Loading the object" in text
     ]
