@@ -50,11 +50,13 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def share_the_cores(processes: int) -> None:
-    """Give each of several test processes, and their children, a share of the threads."""
-    if processes > 1:
-        threads = max(1, len(os.sched_getaffinity(0)) // processes)
-        os.environ.setdefault("OMP_NUM_THREADS", str(threads))
-        torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+    """Give each test process a share of the threads, and one as large to its children.
+
+    OpenMP's threads spin while they wait: more of them than cores take several times the CPU time.
+    """
+    threads = max(1, len(os.sched_getaffinity(0)) // (processes + 1))
+    os.environ.setdefault("OMP_NUM_THREADS", str(threads))
+    torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
 
 
 @pytest.hookimpl(wrapper=True)
