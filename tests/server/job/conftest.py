@@ -1,10 +1,14 @@
 """Fixtures for the tests of jobs."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from trompe_server.library import Library
+from trompe_server.surrogate import SamplingModel
+from trompe_server.surrogate.calibration import find_physics, find_sampling
 
 
 @pytest.fixture(scope="session")
@@ -23,3 +27,26 @@ def photo() -> NDArray[np.uint8]:
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports without pictures, which take as long as a small attack."""
     monkeypatch.setattr("trompe_server.job.report.picture_files", lambda _: {})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def default_sampling() -> Iterator[None]:
+    """Calibrations with the default sampling: its search takes four times as long as the rest of a small job."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("trompe_server.surrogate.calibration.find_sampling", lambda _: SamplingModel())
+        patch.setattr("trompe_server.surrogate.calibration.find_physics", lambda best, *_: best)
+        yield
+
+
+@pytest.fixture
+def searched_sampling(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calibrations that search the sampling after all."""
+    monkeypatch.setattr("trompe_server.surrogate.calibration.find_sampling", find_sampling)
+    monkeypatch.setattr("trompe_server.surrogate.calibration.find_physics", find_physics)
+
+
+@pytest.fixture
+def measured_tone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calibrations that measure the target's tone curve."""
+    measured = SamplingModel(encoding="measured")
+    monkeypatch.setattr("trompe_server.surrogate.calibration.find_physics", lambda *_: measured)

@@ -92,7 +92,7 @@ def test_a_surrogate_without_probes_names_its_views_too(library: Library) -> Non
     assert [found for found in warnings if "off by more than 3/255 on views" in found]
 
 
-@without_pictures
+@pytest.mark.usefixtures("no_pictures", "searched_sampling")
 def test_each_attacked_view_has_the_fidelity_of_its_prediction(library: Library, target: SailenvTarget) -> None:
     spec = spec_of(surrogate="calibrated", steps=6)
     result = run_job(spec, library, target=target).result

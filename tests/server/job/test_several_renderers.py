@@ -130,7 +130,7 @@ class NoisyTarget(FakeTarget):
 
 
 @pytest.mark.thorough
-@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.usefixtures("no_pictures", "measured_tone")
 def test_held_out_views_have_noise_that_the_attack_has_not_seen(library: Library) -> None:
     target, spec = NoisyTarget(), spec_of(surrogate="calibrated", steps=2)
     run = run_job(spec, library, target=target)
