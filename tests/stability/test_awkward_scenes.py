@@ -25,8 +25,8 @@ SIZE = (32, 32)
 SAMPLING = [
     pytest.param(SamplingModel(), id="msaa"),
     pytest.param(SamplingModel(samples="centre", filtered="linear", lod="area", cull=False), id="centre, linear"),
-    pytest.param(SamplingModel(shade_at="centroid", bias=2.0), id="centroid, biased"),
-    pytest.param(SamplingModel(anisotropy=16, shift=(0.3, -0.2)), id="probes, shifted"),
+    pytest.param(SamplingModel(shade_at="centroid", bias=2.0), id="centroid, biased", marks=pytest.mark.thorough),
+    pytest.param(SamplingModel(anisotropy=16, shift=(0.3, -0.2)), id="probes, shifted", marks=pytest.mark.thorough),
     pytest.param(SamplingModel(anisotropy=16, elongated="ellipse"), id="ellipse"),
 ]
 FRONT = [View(Camera(0.5, azimuth, elevation)) for azimuth, elevation in ((0, 0), (25, 20))]

@@ -56,7 +56,7 @@ def anisotropic(running_worker: Running) -> Iterator[Ask]:
         target.close()
 
 
-@pytest.mark.parametrize("shown", ["plane", "mug"])
+@pytest.mark.parametrize("shown", ["plane", pytest.param("mug", marks=pytest.mark.thorough)])
 def test_an_anisotropic_filter_is_found(
     shown: str, anisotropic: Ask, mug: Object3D, make_object: Callable[..., Object3D], make_quad: Make
 ) -> None:
@@ -77,7 +77,7 @@ def test_no_anisotropy_and_no_shift_are_found_without_them(target: SailenvTarget
     assert fidelity.mean()["correlation"] >= 0.98
 
 
-@pytest.mark.parametrize(("column", "row"), [(0, 0), (1, 0)])
+@pytest.mark.parametrize(("column", "row"), [pytest.param(0, 0, marks=pytest.mark.thorough), (1, 0)])
 def test_a_picture_shifted_by_a_quarter_of_a_pixel_is_understood(
     column: int, row: int, target: SailenvTarget, mug: Object3D
 ) -> None:

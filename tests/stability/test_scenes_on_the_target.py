@@ -198,15 +198,15 @@ def room(make_object: MakeObject, make_quad: Make) -> Object3D:
 INSIDE = [View(Camera(*place), background=MAGENTA) for place in ((0.02, 10, 5), (0.06, 100, -20), (0.09, 250, 0))]
 SCENES = [
     pytest.param(overlapping, AROUND, 0.98, id="parts that pierce each other"),
-    pytest.param(coplanar, AROUND, 0.98, id="parts in one place, the first is visible"),
+    pytest.param(coplanar, AROUND, 0.98, id="parts in one place, the first is visible", marks=pytest.mark.thorough),
     pytest.param(two_sided, AROUND, 0.98, id="two sides of a sheet, painted differently"),
     pytest.param(outside_uvs, AROUND, 0.97, id="texture coordinates outside the unit square"),
     pytest.param(several_materials, AROUND, 0.98, id="several materials and texture sizes"),
-    pytest.param(shared_texture, AROUND, 0.98, id="a texture that two parts share"),
+    pytest.param(shared_texture, AROUND, 0.98, id="a texture that two parts share", marks=pytest.mark.thorough),
     pytest.param(thin_textures, AROUND, 0.90, id="textures of one texel, row or column"),
     pytest.param(awkward, AROUND[:4], 0.98, id="needles, points, lines and faces behind the camera"),
     pytest.param(cut_out, AROUND, 0.98, id="an alpha-tested sheet before another"),
-    pytest.param(glazed, AROUND, 0.98, id="a blended sheet before another"),
+    pytest.param(glazed, AROUND, 0.98, id="a blended sheet before another", marks=pytest.mark.thorough),
     pytest.param(vase, AROUND, 0.98, id="panes of glass behind each other"),
     pytest.param(room, INSIDE, 0.97, id="cameras inside a room"),
 ]
@@ -232,7 +232,7 @@ def test_a_black_object_on_black_is_black_and_its_repaint_is_predicted(
     assert min(shown.fidelity.correlation) >= 0.95
 
 
-@pytest.mark.parametrize("scene", [flickering, sticker])
+@pytest.mark.parametrize("scene", [flickering, pytest.param(sticker, marks=pytest.mark.thorough)])
 def test_a_calibration_warns_of_parts_in_one_plane_that_only_rounding_orders(
     scene: Make, target: SailenvTarget, make_object: MakeObject, make_quad: Make
 ) -> None:
