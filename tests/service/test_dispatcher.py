@@ -16,8 +16,8 @@ from trompe_server.executor.dispatcher import Dispatcher, dispatcher_name
 from trompe_server.executor.local import LocalExecutor
 from trompe_server.executor.port import Executor
 from trompe_server.executor.process import Setup
-from trompe_server.queue.claims import Claims
-from trompe_server.queue.tables import events
+from trompe_server.queue.claims import START_ALLOWANCE, Claims
+from trompe_server.queue.tables import events, jobs
 from trompe_server.renderers.discovery import RendererAddresses
 from trompe_server.settings import Settings
 from trompe_server.storage.database import write
@@ -56,14 +56,33 @@ def test_one_dispatches_and_the_other_waits(executed: Executed) -> None:
     wait_until(lambda: first.step() and executed.state(job).state.final)
 
 
-def test_a_job_that_stands_still_is_lost_but_not_right_after_the_dispatcher_was_held_up(executed: Executed) -> None:
-    def frozen() -> Executor:
-        executor = executed.open()
-        executor.submit = lambda claim: None  # type: ignore[method-assign]
-        return executor
+def frozen(executed: Executed) -> Executor:
+    """An executor whose attempts never begin."""
+    executor = executed.open()
+    executor.submit = lambda claim: None  # type: ignore[method-assign]
+    return executor
 
+
+def test_an_attempt_that_never_begins_is_lost_long_before_the_stall_timeout(executed: Executed) -> None:
     job = executed.submit("fine")
-    ours, clock = dispatcher(executed, "ours", frozen)
+    claims = Claims(executed.store.engine)
+    clock = Clock()
+    ours = Dispatcher(claims, lambda: frozen(executed), name="ours", silence=30, stall_timeout=1800, clock=clock)
+    ours.step()
+    for seconds in (START_ALLOWANCE, 31):
+        assert executed.state(job).attempts == 1
+        with write(executed.store.engine) as connection:
+            connection.execute(jobs.update().values(seen=jobs.c.seen - seconds))
+        for _ in range(6):
+            clock.now += 6
+            ours.step()
+    assert "no heartbeat for 30 s" in "".join(event.message or "" for event in executed.store.events(job))
+    assert executed.state(job).attempts == 2
+
+
+def test_a_job_that_stands_still_is_lost_but_not_right_after_the_dispatcher_was_held_up(executed: Executed) -> None:
+    job = executed.submit("fine")
+    ours, clock = dispatcher(executed, "ours", lambda: frozen(executed))
     ours.step()
     with write(executed.store.engine) as connection:
         connection.execute(events.update().values(time=events.c.time - 100))

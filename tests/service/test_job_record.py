@@ -21,7 +21,7 @@ from pydantic import ValidationError
 
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.queue import migrations
-from trompe_server.queue.claims import Claim, Claims, Ending, LostJobError
+from trompe_server.queue.claims import START_ALLOWANCE, Claim, Claims, Ending, LostJobError
 from trompe_server.queue.leases import end_lease, take_lease
 from trompe_server.queue.migrations import HEAD
 from trompe_server.queue.store import JobStore
@@ -205,14 +205,30 @@ def test_an_attempt_whose_heartbeats_stop_is_silent_and_the_next_one_begins_anew
     assert claims_of(store).silent(0) == {}, "it has not begun"
     claims_of(store).beat(taken)
     assert claims_of(store).silent(50) == {}
-    with write(store.engine) as connection:
-        connection.execute(jobs.update().values(seen=jobs.c.seen - 100))
+    pass_seconds(store, 100)
     assert claims_of(store).silent(50) == {taken.job.id: 1}
     claims_of(store).lose(taken, "frozen")
     assert claims_of(store).silent(50) == {}
     claim(store)
     claims_of(store).beat(taken)
     assert claims_of(store).silent(-50) == {}, "the heartbeat of an earlier attempt counts for nothing"
+
+
+def test_an_attempt_that_never_begins_is_silent_after_its_start_allowance(store: JobStore) -> None:
+    create(store)
+    taken = claim(store)
+    pass_seconds(store, START_ALLOWANCE + 40)
+    assert claims_of(store).silent(50) == {}
+    pass_seconds(store, 20)
+    assert claims_of(store).silent(50) == {taken.job.id: 1}
+    claims_of(store).beat(taken)
+    assert claims_of(store).silent(50) == {}
+
+
+def pass_seconds(store: JobStore, seconds: float) -> None:
+    """Let the last heartbeats be older by ``seconds``."""
+    with write(store.engine) as connection:
+        connection.execute(jobs.update().values(seen=jobs.c.seen - seconds))
 
 
 def test_events_tell_the_whole_story_and_their_ids_grow_by_one(store: JobStore) -> None:

@@ -15,10 +15,13 @@ from trompe_server.queue.tables import Row, events, fresh, job_of, jobs, locked,
 from trompe_server.storage.database import clock, write
 from trompe_shared.api import Job, JobState, Needs, Progress
 
-__all__ = ["MAX_LOST", "Claim", "Claims", "Ending", "LostJobError"]
+__all__ = ["MAX_LOST", "START_ALLOWANCE", "Claim", "Claims", "Ending", "LostJobError"]
 
 MAX_LOST: Final = 3
 """Attempts that may be lost in the same phase of a job before the job is failed."""
+
+START_ALLOWANCE: Final = 60.0
+"""Seconds an attempt has until its first heartbeat is due: its process may have to start and to import torch."""
 
 MOST_TOLD: Final = 500
 """Jobs told in one transaction why they wait."""
@@ -153,7 +156,10 @@ class Claims:
             connection.execute(jobs.update().where(held).values(seen=clock()))
 
     def silent(self, seconds: float) -> dict[str, int]:
-        """Running jobs whose attempts have had heartbeats, but none for ``seconds``: their attempts, by job."""
+        """Running jobs whose attempts have sent no heartbeat for ``seconds``: their attempts, by job.
+
+        An attempt that never sent one has ``START_ALLOWANCE`` more.
+        """
         query = sa.select(jobs.c.id, jobs.c.attempts).where(_RUNNING, jobs.c.seen < clock() - seconds)
         with self.engine.connect() as connection:
             return {row.id: row.attempts for row in connection.execute(query)}
@@ -179,8 +185,8 @@ class Claims:
 def _take(connection: sa.Connection, row: Row, worker: str) -> Claim:
     message = "started" if row.attempts == 0 else f"continued by {worker}"
     values = {"state": JobState.running.value, "worker": worker, "attempts": row.attempts + 1}
-    started = sa.func.coalesce(jobs.c.started, clock())
-    return _claim(update_job(connection, row.id, message=message, started=started, note=None, seen=None, **values))
+    times = {"started": sa.func.coalesce(jobs.c.started, clock()), "seen": clock() + START_ALLOWANCE}
+    return _claim(update_job(connection, row.id, message=message, note=None, **times, **values))
 
 
 def _lose(connection: sa.Connection, row: Row, reason: str) -> None:
