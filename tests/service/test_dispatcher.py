@@ -14,9 +14,9 @@ from tests.service.executors import Executed
 from trompe_server.errors import ServiceError
 from trompe_server.executor.dispatcher import Dispatcher, dispatcher_name
 from trompe_server.executor.local import LocalExecutor
-from trompe_server.executor.port import Executor
+from trompe_server.executor.port import Ended, Executor
 from trompe_server.executor.process import Setup
-from trompe_server.queue.claims import START_ALLOWANCE, Claims
+from trompe_server.queue.claims import START_ALLOWANCE, Claim, Claims
 from trompe_server.queue.tables import events, jobs
 from trompe_server.renderers.discovery import RendererAddresses
 from trompe_server.settings import Settings
@@ -122,6 +122,35 @@ def test_an_executor_that_is_lost_is_opened_again_and_the_jobs_go_on(executed: E
         executed.open_gate(job)
         (found,) = executed.ended(job)
     assert (found.state, found.attempts) == (JobState.succeeded, 2)
+
+
+def test_a_job_that_kills_its_dispatcher_is_failed_and_those_beside_it_end(executed: Executed) -> None:
+    def open_executor() -> Executor:
+        executor = executed.open()
+        submit, ended, waiting = executor.submit, executor.ended, list[Claim]()
+
+        def die_or_begin(timeout: float) -> list[Ended]:
+            if any(claim.job.id == killer for claim in waiting):
+                raise ServiceError("The machine died.")
+            while waiting:
+                submit(waiting.pop())
+            return ended(timeout)
+
+        executor.submit = waiting.append  # type: ignore[method-assign, assignment]
+        executor.ended = die_or_begin  # type: ignore[method-assign]
+        return executor
+
+    fine = executed.submit("fine")
+    killer = executed.submit("fine")
+    jobs = [fine, killer, *(executed.submit("fine", seed=number) for number in range(3))]
+    ours, _ = dispatcher(executed, "ours", open_executor)
+    while not all(executed.state(job).state.final for job in jobs):
+        try:
+            ours.step()
+        except ServiceError:
+            ours, _ = dispatcher(executed, "ours", open_executor)
+    assert {job for job in jobs if executed.state(job).state is not JobState.succeeded} == {killer}
+    assert "10 dispatchers died" in str(executed.state(killer).error)
 
 
 def test_the_job_of_a_frozen_process_goes_on_in_another(tmp_path: Path, renderer: int) -> None:

@@ -21,7 +21,7 @@ from pydantic import ValidationError
 
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.queue import migrations
-from trompe_server.queue.claims import START_ALLOWANCE, Claim, Claims, Ending, LostJobError
+from trompe_server.queue.claims import ALONE_AFTER, MAX_ORPHANED, START_ALLOWANCE, Claim, Claims, Ending, LostJobError
 from trompe_server.queue.leases import end_lease, take_lease
 from trompe_server.queue.migrations import HEAD
 from trompe_server.queue.store import JobStore
@@ -303,6 +303,49 @@ def test_a_job_that_three_workers_died_of_is_failed_with_the_reason(store: JobSt
     assert found.finished is not None
 
 
+def orphan(store: JobStore, *, times: int) -> None:
+    """Claim all queued jobs at once, and lose them together with their dispatcher."""
+    for _ in range(times):
+        while claims_of(store).upcoming():
+            claim(store)
+        claims_of(store).lose_unknown({}, "its dispatcher died")
+
+
+def test_a_dispatcher_s_death_fails_no_job_before_the_tenth_in_one_phase(store: JobStore) -> None:
+    job = create(store)
+    orphan(store, times=MAX_ORPHANED - 1)
+    claims_of(store).lose(claim(store), "w died")
+    claims_of(store).lose(claim(store), "w died")
+    taken = claim(store)
+    claims_of(store).advance(taken, HALF, done=1)
+    claims_of(store).give_back(taken)
+    orphan(store, times=MAX_ORPHANED - 1)
+    assert store.get(job).state is JobState.queued
+    orphan(store, times=1)
+    assert store.get(job).state is JobState.failed
+    assert "10 dispatchers died while running this job" in str(store.get(job).error)
+
+
+def test_a_job_orphaned_often_runs_alone_until_it_gets_on(store: JobStore) -> None:
+    first, second = create(store), create(store)
+    orphan(store, times=ALONE_AFTER)
+    behind, urgent = create(store, needs={"gpu": 1}), create(store, priority="interactive")
+    other = claim(store)
+    assert other.job.id == urgent
+    assert claims_of(store).upcoming() == [], "another job runs"
+    claims_of(store).finish(other, DONE)
+    suspect = claim(store)
+    assert suspect.job.id == first
+    assert claims_of(store).upcoming() == [], "it runs"
+    claims_of(store).advance(suspect, HALF, done=1)
+    assert claims_of(store).upcoming() == [], "the next one runs alone too"
+    claims_of(store).finish(suspect, DONE)
+    suspect = claim(store)
+    assert suspect.job.id == second
+    claims_of(store).advance(suspect, HALF, done=1)
+    assert claim(store).job.id == behind
+
+
 def test_a_job_that_gets_on_outlives_any_number_of_workers(store: JobStore) -> None:
     job = create(store)
     for done in range(1, 6):
@@ -467,6 +510,7 @@ def test_the_tables_of_an_earlier_version_are_upgraded_with_their_jobs(store: Jo
         for statement in (
             "ALTER TABLE jobs DROP COLUMN names",
             "ALTER TABLE jobs DROP COLUMN seen",
+            "ALTER TABLE jobs DROP COLUMN orphaned",
             "UPDATE jobs SET needs = CASE needs WHEN '{}' THEN 'any' ELSE 'cuda' END",
             "ALTER TABLE leases DROP COLUMN holder",
             "DELETE FROM leases WHERE name = 'dispatcher'",

@@ -6,6 +6,7 @@ attempt raise ``LostJobError``, so a worker that was frozen and comes back chang
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Any, Final
 
 import sqlalchemy as sa
@@ -15,10 +16,17 @@ from trompe_server.queue.tables import Row, events, fresh, job_of, jobs, locked,
 from trompe_server.storage.database import clock, write
 from trompe_shared.api import Job, JobState, Needs, Progress
 
-__all__ = ["MAX_LOST", "START_ALLOWANCE", "Claim", "Claims", "Ending", "LostJobError"]
+__all__ = ["ALONE_AFTER", "MAX_LOST", "MAX_ORPHANED", "START_ALLOWANCE"]
+__all__ += ["Claim", "Claims", "Ending", "LostJobError"]
 
 MAX_LOST: Final = 3
 """Attempts that may be lost in the same phase of a job before the job is failed."""
+
+MAX_ORPHANED: Final = 10
+"""The same for attempts lost together with their dispatcher: the cause may be another job, or none."""
+
+ALONE_AFTER: Final = 5
+"""Attempts of a job orphaned in the same phase after which it runs alone, so that no other job is failed with it."""
 
 START_ALLOWANCE: Final = 60.0
 """Seconds an attempt has until its first heartbeat is due: its process may have to start and to import torch."""
@@ -66,15 +74,22 @@ class Claims:
         return {Needs.model_validate_json(row.needs): row.amount for row in rows}
 
     def upcoming(self) -> list[Needs]:
-        """Different needs of the queued jobs; first those of the job to run next. Takes no longer for more jobs."""
-        found, text = [], ""
+        """Different needs of the queued jobs; first those of the job to run next. Takes no longer for more jobs.
+
+        A job orphaned ``ALONE_AFTER`` times waits until no other runs, as do the jobs behind it until it gets on.
+        """
+        found, text = list[tuple[int, int, int, Needs]](), ""
         following = sa.select(sa.func.min(jobs.c.needs)).where(jobs.c.state == JobState.queued.value)
         with self.engine.connect() as connection:
+            running = connection.scalar(sa.select(sa.func.max(jobs.c.orphaned)).where(_RUNNING))
             while (text := connection.scalar(following.where(jobs.c.needs > text))) is not None:
                 needs = Needs.model_validate_json(text)
                 if (first := connection.execute(_first(needs)).first()) is not None:  # not cancelled meanwhile
-                    found.append((*first, needs))
-        return [needs for *_, needs in sorted(found, key=lambda each: each[:2])]
+                    found.append((first.priority, first.number, first.orphaned, needs))
+        ordered = sorted(found, key=lambda each: each[:2])
+        if running is not None:
+            ordered = list(takewhile(lambda each: max(running, each[2]) < ALONE_AFTER, ordered))
+        return [needs for *_, needs in ordered]
 
     def claim(self, needs: Needs, worker: str) -> Claim | None:
         """Claim the next queued job with these ``needs`` for ``worker``; ``None`` if there is none.
@@ -104,7 +119,7 @@ class Claims:
             values: dict[str, Any] = {"progress": progress.model_dump(mode="json")}
             if done is not None:
                 values |= {"done": done, "artifacts": list(dict.fromkeys([*row.artifacts, *public]))}
-                values |= {"lost": 0} if done > row.done else {}
+                values |= {"lost": 0, "orphaned": 0} if done > row.done else {}
             update_job(connection, row.id, **values)
             return bool(row.cancel_requested)
 
@@ -134,10 +149,10 @@ class Claims:
         with write(self.engine) as connection:
             row = locked(connection, claim.job.id)
             if _is_held(row, claim):
-                _lose(connection, row, reason)
+                _lose(connection, row, reason, jobs.c.lost)
 
     def lose_unknown(self, known: Mapping[str, Claim], reason: str) -> list[str]:
-        """Take the running jobs whose attempts are not ``known`` (by job). Returns their ids."""
+        """Take the running jobs whose attempts are not ``known`` (by job): they are orphaned. Returns their ids."""
         ours = {job: claim.attempt for job, claim in known.items()}
         running = sa.select(jobs.c.id, jobs.c.attempts).where(_RUNNING)
         with self.engine.connect() as connection:
@@ -146,7 +161,7 @@ class Claims:
             with write(self.engine) as connection:
                 row = locked(connection, job)
                 if row.state == JobState.running and ours.get(job) != row.attempts:
-                    _lose(connection, row, reason)
+                    _lose(connection, row, reason, jobs.c.orphaned)
         return unknown
 
     def beat(self, claim: Claim) -> None:
@@ -189,26 +204,27 @@ def _take(connection: sa.Connection, row: Row, worker: str) -> Claim:
     return _claim(update_job(connection, row.id, message=message, note=None, **times, **values))
 
 
-def _lose(connection: sa.Connection, row: Row, reason: str) -> None:
-    """Requeue a running job, or fail it at ``MAX_LOST`` lost attempts."""
-    lost = row.lost + 1
-    ended = {"lost": lost, "finished": clock()}
+def _lose(connection: sa.Connection, row: Row, reason: str, counter: sa.Column[int]) -> None:
+    """Requeue a running job, or fail it after too many losses of the kind that ``counter`` counts."""
+    count = getattr(row, counter.name) + 1
+    most, dead = (MAX_LOST, "workers") if counter is jobs.c.lost else (MAX_ORPHANED, "dispatchers")
+    ended = {counter.name: count, "finished": clock()}
     if row.cancel_requested:
         update_job(connection, row.id, message="cancelled", state=JobState.cancelled.value, **ended)
-    elif lost >= MAX_LOST:
-        error = f"{lost} workers died while running this job; it is not retried. Last cause: {reason}."
+    elif count >= most:
+        error = f"{count} {dead} died while running this job; it is not retried. Last cause: {reason}."
         update_job(connection, row.id, message=error, state=JobState.failed.value, error=error, **ended)
     else:
-        update_job(connection, row.id, message=reason, state=JobState.queued.value, lost=lost)
+        update_job(connection, row.id, message=reason, state=JobState.queued.value, **{counter.name: count})
 
 
 def _queued(needs: Needs) -> sa.ColumnElement[bool]:
     return sa.and_(jobs.c.state == JobState.queued.value, jobs.c.needs == needs_text(needs))
 
 
-def _first(needs: Needs) -> sa.Select[tuple[int, int]]:
-    """Priority and number of the queued job with these needs that runs next."""
-    query = sa.select(jobs.c.priority, jobs.c.number).where(_queued(needs))
+def _first(needs: Needs) -> sa.Select[tuple[int, int, int]]:
+    """Priority, number and orphaned attempts of the queued job with these needs that runs next."""
+    query = sa.select(jobs.c.priority, jobs.c.number, jobs.c.orphaned).where(_queued(needs))
     return query.order_by(jobs.c.priority, jobs.c.number).limit(1)
 
 

@@ -251,6 +251,7 @@ _NEW: Final = {
     "done": 0,
     "attempts": 0,
     "lost": 0,
+    "orphaned": 0,
     "events": 1,
     "cancel_requested": False,
     "artifacts": [],

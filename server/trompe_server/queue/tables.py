@@ -49,11 +49,13 @@ jobs = sa.Table(
     sa.Column("artifacts", sa.JSON, nullable=False),
     sa.Column("names", sa.JSON, nullable=False, server_default="{}"),
     sa.Column("seen", sa.Double),
+    sa.Column("orphaned", sa.Integer, nullable=False, server_default="0"),
     sqlite_autoincrement=True,
 )
 """``attempts`` counts claims, and an attempt must name itself to write; ``lost`` counts attempts lost since the last
-finished phase; ``done`` counts finished phases; ``events`` counts the rows in ``job_events``; ``needs`` is JSON without
-defaults; ``seen`` is the time of the attempt's last heartbeat, before the first one the time at which it is due.
+finished phase, ``orphaned`` those lost together with their dispatcher; ``done`` counts finished phases; ``events``
+counts the rows in ``job_events``; ``needs`` is JSON without defaults; ``seen`` is the time of the attempt's last
+heartbeat, before the first one the time at which it is due.
 """
 sa.Index("jobs_by_state", jobs.c.state, jobs.c.number)
 sa.Index("jobs_by_object", jobs.c.object, jobs.c.number)

@@ -11,7 +11,7 @@ from trompe_server.storage.database import write
 
 __all__ = ["HEAD", "upgrade"]
 
-HEAD: Final = "3"
+HEAD: Final = "4"
 """The newest revision in ``versions``."""
 _LOCK: Final = 0x74726F6D7065
 """Advisory lock of PostgreSQL: one process migrates at a time."""
