@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from typing import Final
 
 from tests.served import CHILD, FAKE, Queue, wait_until
+from trompe_server.queue.leases import DISPATCHER, end_lease, lease_holder
 from trompe_server.service.dispatch import prepare_data
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import JobArtifacts, job_artifacts, open_folder
@@ -113,6 +114,12 @@ class Service(Queue):
             wait_until(lambda: self.in_gate(job))
             running.end(signal.SIGKILL)
         assert self.state(job).state is JobState.running
+
+    def end_silence(self) -> None:
+        """Let the lease of a dead or frozen dispatcher be over now, not after its silence."""
+        holder = lease_holder(self.store.engine, DISPATCHER)
+        assert holder is not None
+        end_lease(self.store.engine, DISPATCHER, holder=holder)
 
     def ended(self, job: str) -> Job:
         wait_until(lambda: self.state(job).state.final)

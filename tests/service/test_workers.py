@@ -90,6 +90,7 @@ def test_a_dispatcher_that_was_frozen_leaves_the_jobs_to_the_next_and_waits(serv
     with service.worker() as frozen:
         wait_until(lambda: service.in_gate(job))
         frozen.send(signal.SIGSTOP)
+        service.end_silence()
         with service.worker() as healthy:
             wait_until(lambda: service.state(job).attempts == 2)
             wait_until(lambda: "was lost" in frozen.words())  # its process was not frozen
@@ -112,6 +113,7 @@ def test_a_frozen_process_loses_its_job_and_never_replaces_what_a_newer_attempt_
         alone.send(signal.SIGSTOP)
         for pid in workers_of(alone.process.pid):
             os.kill(pid, signal.SIGSTOP)
+        service.end_silence()
         with service.worker():
             wait_until(lambda: service.state(job).attempts == 2)
             service.open_gate(job)
