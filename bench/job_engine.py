@@ -1,8 +1,8 @@
 """What a job costs apart from its attack: python -m bench.job_engine [--jobs N] [--workers N] [--executor NAME]...
 
 Jobs of nine phases that do nothing, as many as an attack of 30 steps has, run on an executor: ``local``, ``ray-local``
-or ``ray://HOST:PORT``. Then the worker of a running phase is killed: seconds until it begins again, on another worker
-if there are several.
+or ``ray://HOST:PORT``. Then the process of a running phase is killed, and on Ray its task: seconds until the phase
+begins again, on another worker if there are several.
 """
 
 import argparse
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.service.processes import listening
+from tests.service.ray_nodes import task_of
 
 import trompe_server.job.texture_attack  # noqa: F401  what an attack imports
 from bench.job_list import size
@@ -33,7 +34,7 @@ from trompe_shared.api import JobRequest, JobSpec, Progress
 
 PHASES = [f"phase-{number}" for number in range(9)]
 LOSSES = 8
-"""Workers killed, two in each job: the third loss in one phase would fail it."""
+"""Processes of a kind killed, two in each job: the third loss in one phase would fail it."""
 NAME = "bench"
 
 
@@ -83,13 +84,17 @@ def bench(settings: Settings, count: int) -> None:
             wait_for(lambda: store.get(jobs[-1]).state.final)
             ends = sorted(finished.timestamp() for job in jobs if (finished := store.get(job).finished))
             grown = (size(store) - before) / count
-            losses = [loss for _ in range(LOSSES // 2) for loss in losses_of_a_job(store, Path(settings.store_url))]
+            kinds = ["process"] if settings.executor == "local" else ["process", "task"]
+            losses = {kind: losses_of(store, Path(settings.store_url), kind) for kind in kinds}
     overhead = settings.workers * statistics.median(after - before for before, after in pairwise(ends))
     print(
         f"{store.engine.dialect.name:12}{1000 * submitted / count:8.1f} ms to submit"
-        f"{1000 * overhead:8.1f} ms to run (median of {count}){grown:8.0f} bytes a job\n"
-        f"worker killed, phase begun again: median {statistics.median(losses):.2f} s, longest {max(losses):.2f} s"
+        f"{1000 * overhead:8.1f} ms to run (median of {count}){grown:8.0f} bytes a job"
     )
+    for kind, seconds in losses.items():
+        print(
+            f"{kind} killed, phase begun again: median {statistics.median(seconds):.2f} s, {max(seconds):.2f} s at most"
+        )
     store.close()
 
 
@@ -98,15 +103,21 @@ def submit(store: JobStore, label: str) -> str:
     return store.create(JobRequest.of("mug", label=label, labels={"run": "1"}))[0].id
 
 
-def losses_of_a_job(store: JobStore, files: Path) -> list[float]:
-    """Kill the worker of a job twice: seconds until its phase begins again."""
+def losses_of(store: JobStore, files: Path, kind: str) -> list[float]:
+    """Kill a process of this kind of several jobs twice: seconds until their phases begin again."""
+    return [loss for _ in range(LOSSES // 2) for loss in losses_of_a_job(store, files, kind)]
+
+
+def losses_of_a_job(store: JobStore, files: Path, kind: str) -> list[float]:
+    """Kill a process of a job twice: seconds until its phase begins again."""
     job = submit(store, "wait")
     notes = files / "jobs" / job / "notes.txt"
     seconds = []
     for number in (1, 2):
         wait_for(lambda number=number: notes.exists() and len(notes.read_text().splitlines()) == number)  # type: ignore[misc]
+        process = task_of(job) if kind == "task" else int(notes.read_text().split()[-1])
         killed = time.time()
-        os.kill(int(notes.read_text().split()[-1]), signal.SIGKILL)
+        os.kill(process, signal.SIGKILL)
         wait_for(lambda number=number: len(notes.read_text().splitlines()) > number)  # type: ignore[misc]
         seconds.append(float(notes.read_text().split()[-2]) - killed)
     store.request_cancel(job)

@@ -1,8 +1,8 @@
 """A job without an attack, for tests of everything around it. Workers run it with ``TROMPE_PIPELINE``.
 
 The label of the job selects its behaviour. It logs the start and end of each phase to ``trace.txt`` in the folder of
-the job, if that is local. Each phase derives its file from the file of the phase before, so the result shows
-whether all phases ran, in order, on the right input.
+the job, if that is local, and its process to ``process``. Each phase derives its file from the file of the phase
+before, so the result shows whether all phases ran, in order, on the right input.
 """
 
 import hashlib
@@ -97,6 +97,7 @@ class FakeJob:
     def _log(self, what: str, phase: str) -> None:
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
+            (self._folder / "process").write_text(str(os.getpid()))
             with (self._folder / "trace.txt").open("a") as file:
                 file.write(f"{what} {phase}\n")
 

@@ -4,15 +4,16 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
 
 from tests.served import FAKE, Queue, wait_until
+from trompe_server.executor.attempts import Attempts
 from trompe_server.executor.choice import open_executor
 from trompe_server.executor.dispatcher import Dispatcher
 from trompe_server.executor.port import Ended, Executor, fits, left_in, too_much
-from trompe_server.executor.process import Setup, run_here
+from trompe_server.executor.process import Setup
 from trompe_server.queue.claims import Claim, Claims
 from trompe_server.queue.workers import Worker
 from trompe_server.renderers.discovery import RendererAddresses
@@ -36,7 +37,7 @@ class FakeExecutor:
 
     def submit(self, claim: Claim) -> None:
         deadly = claim.job.attack.goal.label == ["deadly"]
-        run = (lambda: "it died (signal 9)") if deadly else partial(run_here, self._setup, claim)
+        run = (lambda: "it died (signal 9)") if deadly else partial(_attempts(self._setup).run, claim)
         self._running[self._threads.submit(run)] = claim
 
     def cancel(self, claim: Claim) -> None:
@@ -63,6 +64,11 @@ class FakeExecutor:
         return left_in(self._rooms[name], (claim for claim in self._running.values() if claim.job.worker == name))
 
 
+@cache
+def _attempts(setup: Setup) -> Attempts:
+    return Attempts(setup.settings, setup.renderers)
+
+
 class Executed(Queue):
     """A queue of fake jobs that a dispatcher hands to an executor of three cores and one GPU: a ``kind``, or Ray at
     its address."""
@@ -73,13 +79,14 @@ class Executed(Queue):
         fixed: dict[str, Any] = {"data": folder, "workers": 3, "device": device, "executor": executor}
         super().__init__(Settings(**fixed | settings, pipeline=FAKE["TROMPE_PIPELINE"]))
         self.store.migrate()
-        self._fake, self._renderers = kind == "fake", RendererAddresses((("127.0.0.1", renderer),))
+        self._fake = kind == "fake"
+        self.setup = Setup(self.settings, RendererAddresses((("127.0.0.1", renderer),)))
 
     def open(self) -> Executor:
         """Start the executor."""
         if not self._fake:
-            return open_executor(self.settings, self._renderers, mark=NAME)
-        return FakeExecutor(Setup(self.settings, self._renderers), [Needs(), Needs(), Needs(gpu=1)])
+            return open_executor(self.settings, self.setup.renderers, mark=NAME)
+        return FakeExecutor(self.setup, [Needs(), Needs(), Needs(gpu=1)])
 
     @contextmanager
     def dispatching(self) -> Iterator[Dispatcher]:

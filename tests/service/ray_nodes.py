@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import IO, Any, Final, Self
 
 from tests.served import FAKE, free_port
@@ -60,6 +61,16 @@ class RayNodes:
 
     def __exit__(self, *exc_info: object) -> None:
         self.process.communicate(timeout=60)
+
+
+def task_of(job: str) -> int:
+    """The process of the task that holds an attempt of the job, by the name that Ray gives it."""
+    named = f"ray::{job}/".encode()
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):  # it has ended
+            if entry.name.isdecimal() and (entry / "cmdline").read_bytes().startswith(named):
+                return int(entry.name)
+    raise AssertionError(f"no process runs {job}")
 
 
 def serve(port: int, answers: IO[str]) -> None:

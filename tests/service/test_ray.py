@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ import pytest
 from tests.fake_job import trace
 from tests.served import reserved_port, wait_until
 from tests.service.executors import Executed
-from tests.service.ray_nodes import RayNodes
+from tests.service.ray_nodes import RayNodes, task_of
 from trompe_server.errors import ServiceError
 from trompe_server.executor.attempts import MARK
 from trompe_server.storage.folders import open_folder
@@ -43,16 +42,6 @@ def queue(ray_access: None, tmp_path: Path, renderer: int) -> Iterator[Open]:
         each.store.close()
 
 
-def process_of(job: str) -> int:
-    """The process that runs an attempt of the job, by the name that Ray gives it."""
-    named = f"ray::{job}/".encode()
-    for entry in Path("/proc").iterdir():
-        with suppress(OSError):  # it has ended
-            if entry.name.isdecimal() and (entry / "cmdline").read_bytes().startswith(named):
-                return int(entry.name)
-    raise AssertionError(f"no process runs {job}")
-
-
 def test_the_job_of_a_frozen_process_goes_on_elsewhere_and_the_process_does_no_harm(
     cluster: RayNodes, queue: Open
 ) -> None:
@@ -60,14 +49,16 @@ def test_the_job_of_a_frozen_process_goes_on_elsewhere_and_the_process_does_no_h
     job = executed.submit("gate")
     with executed.dispatching():
         wait_until(lambda: executed.in_gate(job))
-        frozen, first = process_of(job), executed.state(job).worker
-        os.kill(frozen, signal.SIGSTOP)
+        process, task = int((executed.folder(job) / "process").read_text()), task_of(job)
+        first = executed.state(job).worker
+        for frozen in (task, process):
+            os.kill(frozen, signal.SIGSTOP)
         wait_until(lambda: executed.state(job).attempts == 2 and executed.in_gate(job))
-        assert executed.state(job).worker != first, "a frozen process holds its room"
+        assert executed.state(job).worker != first, "a frozen task holds its room"
         executed.open_gate(job)
         (ended,) = executed.ended(job)
         result = (executed.folder(job) / "2" / "result.json").read_bytes()
-        os.kill(frozen, signal.SIGCONT)
+        wait_until(lambda: not any(Path(f"/proc/{each}").exists() for each in (task, process)))  # Ray and the node kill
         after = [executed.submit("fine", seed=number) for number in range(6)]
         executed.ended(*after)
     assert (ended.state, ended.attempts) == (JobState.succeeded, 2)
@@ -81,7 +72,7 @@ def test_the_job_of_a_killed_process_and_of_a_killed_node_goes_on_at_its_phase(c
     job = executed.submit("gate")
     with executed.dispatching():
         wait_until(lambda: executed.in_gate(job))
-        os.kill(process_of(job), signal.SIGKILL)
+        os.kill(task_of(job), signal.SIGKILL)
         wait_until(lambda: executed.state(job).attempts == 2 and executed.in_gate(job))
         place = str(executed.state(job).worker)
         (node,) = [node for node in cluster.nodes if place.endswith(node[:6])]

@@ -5,16 +5,15 @@ import multiprocessing
 import os
 import shutil
 import socket
-import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from typing import Final
 
 from trompe_server.executor.port import Ended, fits, left_in, too_much
-from trompe_server.executor.process import READY, Setup, run_attempts
+from trompe_server.executor.process import READY, Setup, ending, fork
 from trompe_server.queue.claims import Claim
 from trompe_server.queue.workers import Worker
 from trompe_server.settings import Settings
@@ -26,14 +25,12 @@ logger = logging.getLogger(__name__)
 
 LONGEST_WAIT: Final = 30.0
 """Seconds between two starts of a process that dies before it is ready."""
-_FORKING: Final = threading.Lock()
 
 
 class LocalExecutor:
     """An ``Executor`` of ``setup.settings.workers`` processes, which end with this one. A dead one is replaced.
 
-    They share the cores, the memory and, with a CUDA device, one GPU. A fork server, which has imported torch and runs
-    nothing, forks them in milliseconds, and they share its memory.
+    They share the cores, the memory and, with a CUDA device, one GPU.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -94,18 +91,14 @@ class _Slot:
         """Start the process without waiting for the fork server. ``ready`` once it takes attempts."""
         self.claim: Claim | None = None
         self.ready, self._restart = False, 0.0
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["trompe_server.executor.preload"])
-        self.connection, theirs = context.Pipe()
-        arguments = (theirs, self._environment, self._setup)
-        self._process = context.Process(target=run_attempts, args=arguments, name=self.name, daemon=True)
+        self._process: BaseProcess | None = None
+        self.connection, theirs = multiprocessing.Pipe()
         self._starting = threading.Thread(target=self._start, args=(theirs,), daemon=True)
         self._starting.start()
 
     def _start(self, theirs: Connection) -> None:
         try:
-            with _FORKING, _added(self._environment):
-                self._process.start()
+            self._process = fork(theirs, self._environment, self._setup)
         except (EOFError, OSError):  # ``listen`` will hear it
             logger.exception("the fork server of the attack workers died")
         finally:
@@ -122,7 +115,7 @@ class _Slot:
     def kill(self) -> None:
         """End the process at once."""
         self._starting.join()
-        if self._process.pid is not None:
+        if self._process is not None:
             self._process.kill()
             self._process.join()
         self.connection.close()
@@ -153,7 +146,7 @@ class _Slot:
     def _bury(self) -> Ended | None:
         """Replace the dead process, after a while if it was never ready."""
         self.kill()
-        reason = f"{self.name} died ({_ending(self._process.exitcode)})"
+        reason = f"{self.name} died ({ending(None if self._process is None else self._process.exitcode)})"
         logger.warning("%s", reason)
         claim, was_ready = self.claim, self.ready
         if was_ready:
@@ -166,38 +159,15 @@ class _Slot:
 
 
 def _environment(settings: Settings) -> dict[str, str]:
-    """Variables added to the environment of the fork server and its processes, which import the modules we see."""
+    """Variables added to the environment of the processes."""
     return {
         "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(_threads(settings.workers))),
         "PROMETHEUS_MULTIPROC_DIR": str(settings.metrics_folder),
-        "PYTHONPATH": os.pathsep.join(sys.path),
-        "PYTHONSAFEPATH": "1",
-        "TROMPE_PIPELINE": settings.pipeline,
     }
 
 
 def _threads(workers: int) -> int:
     return max(1, len(os.sched_getaffinity(0)) // workers)
-
-
-@contextmanager
-def _added(variables: Mapping[str, str]) -> Iterator[None]:
-    """Add variables to the environment of processes started in the block."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
-
-
-def _ending(status: int | None) -> str:
-    if status is None:
-        return "it could not start"
-    return f"signal {-status}" if status < 0 else f"status {status}"
 
 
 def _memory() -> float:

@@ -1,26 +1,25 @@
-"""What runs in the processes of an executor."""
+"""What runs in the processes of an executor, and how they are forked."""
 
-import functools
 import multiprocessing
 import multiprocessing.connection
 import os
 import signal
+import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Final
+from multiprocessing.process import BaseProcess
+from typing import Final
 
-from trompe_server.queue.claims import Claim
 from trompe_server.renderers.discovery import RendererAddresses
 from trompe_server.settings import Settings
 
-if TYPE_CHECKING:
-    from trompe_server.executor.attempts import Attempts
-
-__all__ = ["READY", "Setup", "check_node", "run_attempts", "run_here"]
+__all__ = ["READY", "Setup", "ending", "fork", "run_attempts"]
 
 READY: Final = "ready"
+_FORKING: Final = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -31,13 +30,31 @@ class Setup:
     renderers: RendererAddresses
 
 
+def fork(connection: Connection, environment: Mapping[str, str], setup: Setup) -> BaseProcess:
+    """Fork a process that runs ``run_attempts`` from a fork server, which has imported torch and runs nothing.
+
+    It takes milliseconds, and all share the server's memory. They end with this process. ``environment`` is added to
+    theirs. Raises ``EOFError`` or ``OSError`` if the fork server died; the next call starts another.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["trompe_server.executor.preload"])
+    process = context.Process(target=run_attempts, args=(connection, environment, setup), daemon=True)
+    with _FORKING, _added(_modules(setup.settings) | dict(environment)):
+        process.start()
+    return process
+
+
 def run_attempts(connection: Connection, environment: Mapping[str, str], setup: Setup) -> None:
     """Answer ``READY``, then run each claim from ``connection`` and answer why it was lost, until it closes."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.environ.update(environment)
-    attempts = _attempts(setup)
+    from trompe_server.executor.attempts import Attempts
+
+    attempts = Attempts(setup.settings, setup.renderers)
+    if (torch := sys.modules.get("torch")) is not None:  # imported by the fork server, with its number of threads
+        torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
     connection.send(READY)
     while True:
         try:
@@ -47,29 +64,34 @@ def run_attempts(connection: Connection, environment: Mapping[str, str], setup: 
         connection.send(attempts.run(claim))
 
 
-def run_here(setup: Setup, claim: Claim) -> str | None:
-    """Run one attempt in this process. Returns why it was lost, or ``None`` if the record has its end."""
-    return _attempts(setup).run(claim)
+def _modules(settings: Settings) -> dict[str, str]:
+    """Environment in which the fork server finds the modules that it imports: those that we see."""
+    return {
+        "PYTHONPATH": os.pathsep.join(sys.path),
+        "PYTHONSAFEPATH": "1",
+        "TROMPE_PIPELINE": settings.pipeline,
+    }
 
 
-def check_node(setup: Setup, mark: str) -> str | None:
-    """Why attempts cannot run on this node, which must reach the store and the database; ``None`` if they can.
-
-    ``mark``: name of the dispatcher that asks, in both. A sound node imports torch now.
-    """
-    from trompe_server.executor.attempts import fault_here
-
-    fault = fault_here(setup.settings, mark)
-    if fault is None:
-        _attempts(setup)
-    return fault
+def ending(status: int | None) -> str:
+    """How a process ended, by its exit status."""
+    if status is None:
+        return "it could not start"
+    return f"signal {-status}" if status < 0 else f"status {status}"
 
 
-@functools.cache
-def _attempts(setup: Setup) -> "Attempts":
-    from trompe_server.executor.attempts import Attempts
-
-    return Attempts(setup.settings, setup.renderers)
+@contextmanager
+def _added(variables: Mapping[str, str]) -> Iterator[None]:
+    """Add variables to the environment of processes started in the block."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
 
 
 def _end_with_parent() -> None:

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import pickle
 import socket
 import time
 import warnings
@@ -12,8 +13,10 @@ from typing import Any, Final
 
 from trompe_server.errors import ServiceError
 from trompe_server.executor.attempts import MARK
+from trompe_server.executor.forks import Forks
 from trompe_server.executor.port import Ended, fits, left_in, too_much
-from trompe_server.executor.process import Setup, check_node, run_here
+from trompe_server.executor.process import Setup
+from trompe_server.executor.task import run_task
 from trompe_server.queue.claims import Claim
 from trompe_server.queue.workers import Worker
 from trompe_server.storage.folders import open_folder
@@ -45,12 +48,16 @@ GIB: Final = 2**30
 
 @dataclass
 class _Node:
-    """A node of the cluster. ``check``: the running check of store and database; ``fault``: what it found."""
+    """A node of the cluster with its actor ``Forks``.
+
+    ``check``: the running check of store and database; ``fault``: what it found.
+    """
 
     id: str
     name: str
     host: str
     room: Needs
+    forks: Any
     check: Any
     fault: str | None = "its check of store and database has not ended"
     checked: float = 0.0
@@ -66,16 +73,18 @@ class RayExecutor:
     """An ``Executor`` on the cluster named by the settings. ``mark``: name of the dispatcher with the lease.
 
     Ray places nothing by itself: an attempt goes to the node that ``place`` chose, as a task without retries, named
-    ``job/attempt``. Raises ``ServiceError`` if the cluster cannot be used.
+    ``job/attempt``. The task holds the resources while the attempt runs in a process forked by the node's ``Forks``.
+    Raises ``ServiceError`` if the cluster cannot be used.
     """
 
     def __init__(self, setup: Setup, *, mark: str) -> None:
         self._setup, self._mark = setup, mark
+        self._setups = {device: pickle.dumps(_on(device, setup)) for device in ("cpu", "cuda")}
         self._address = setup.settings.executor
         self._ray = _connected(self._address, setup.settings.workers)
         open_folder(setup.settings.store_url).write(MARK, mark.encode())
-        self._run = self._ray.remote(max_retries=0)(run_here)
-        self._check = self._ray.remote(max_retries=0, num_cpus=0)(check_node)
+        self._run = self._ray.remote(max_retries=0)(run_task)
+        self._forks = self._ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(Forks)
         self._demand = self._ray.remote(max_retries=0, num_cpus=0)(_request)
         self._nodes: dict[str, _Node] = {}
         self._attempts: dict[Any, _Attempt] = {}
@@ -92,20 +101,17 @@ class RayExecutor:
         return min(free, key=lambda each: (not needs.gpu and each[0].room.gpu > 0, -each[1].cpu))[0].name
 
     def submit(self, claim: Claim) -> None:
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
         needs = claim.job.needs
         node = next(node for node in self._nodes.values() if node.name == claim.job.worker)
-        device = "cuda" if needs.gpu else "cpu"
-        setup = replace(self._setup, settings=self._setup.settings.model_copy(update={"device": device}))
+        setup = self._setups["cuda" if needs.gpu else "cpu"]
         with self._translated():
             task = self._run.options(
                 name=f"{claim.job.id}/{claim.attempt}",
                 num_cpus=needs.cpu,
                 num_gpus=needs.gpu,
                 memory=needs.memory * GIB or None,
-                scheduling_strategy=NodeAffinitySchedulingStrategy(node.id, soft=True),
-            ).remote(setup, claim)
+                scheduling_strategy=self._at(node.id),
+            ).remote(node.forks, setup, pickle.dumps(claim))
         self._attempts[task] = _Attempt(claim)
 
     def cancel(self, claim: Claim) -> None:
@@ -155,22 +161,25 @@ class RayExecutor:
             room = _room(told["Resources"])
             if id not in self._nodes and (room.cpu or room.gpu):
                 host = str(told["NodeManagerHostname"])
-                self._nodes[id] = _Node(id, f"{host}-{id[:6]}", host, room, self._start_check(id))
+                forks = self._forks.options(scheduling_strategy=self._at(id)).remote()
+                self._nodes[id] = _Node(id, f"{host}-{id[:6]}", host, room, forks, self._start_check(forks))
         for node in self._nodes.values():
             if node.check is None and node.fault is not None and self._looked - node.checked > RECHECK:
-                node.check = self._start_check(node.id)
+                node.check = self._start_check(node.forks)
 
-    def _start_check(self, node: str) -> Any:
+    def _start_check(self, forks: Any) -> Any:
+        return forks.fault.remote(self._setup, self._mark)
+
+    def _at(self, node: str) -> Any:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        there = NodeAffinitySchedulingStrategy(node, soft=False)
-        return self._check.options(scheduling_strategy=there).remote(self._setup, self._mark)
+        return NodeAffinitySchedulingStrategy(node, soft=False)
 
     def _doubt(self, name: str | None) -> None:
         """Check a node where an attempt died before its next attempt: Ray may learn later that the node is gone."""
         for node in self._nodes.values():
             if node.name == name and node.check is None:
-                node.fault, node.check = "an attempt died there; it is checked again", self._start_check(node.id)
+                node.fault, node.check = "an attempt died there; it is checked again", self._start_check(node.forks)
 
     def _end_check(self, node: _Node) -> None:
         try:
@@ -194,6 +203,7 @@ class RayExecutor:
         attempt = self._attempts.pop(task)
         try:
             reason: str | None = self._ray.get(task)
+            reason = reason and f"{attempt.claim.job.worker}: {reason}"
         except self._ray.exceptions.RayError as error:
             reason = f"{attempt.claim.job.worker} died ({_first_line(error)})"
             self._doubt(attempt.claim.job.worker)
@@ -270,6 +280,10 @@ def _check_there(address: str, place: str) -> None:
             f"No Ray cluster answers at {address} ({error}). Start its head with: ray start --head "
             "--ray-client-server-port 10001; or name another one by TROMPE_EXECUTOR."
         ) from error
+
+
+def _on(device: str, setup: Setup) -> Setup:
+    return replace(setup, settings=setup.settings.model_copy(update={"device": device}))
 
 
 def _request(bundles: list[dict[str, float]]) -> None:

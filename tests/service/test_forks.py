@@ -1,0 +1,86 @@
+"""Processes of attempts on one node of a cluster, without the cluster."""
+
+import os
+import pickle
+import signal
+from collections.abc import Iterator
+from multiprocessing.connection import Client
+from pathlib import Path
+
+import pytest
+
+from tests.served import wait_until, workers_of
+from tests.service.executors import NAME, Executed
+from trompe_server.executor.attempts import MARK
+from trompe_server.executor.forks import Forks
+from trompe_server.executor.process import READY, Setup
+from trompe_server.executor.task import run_forked
+from trompe_server.queue.claims import Claim, Claims
+from trompe_server.queue.leases import DISPATCHER, take_lease
+from trompe_server.storage.folders import open_folder
+from trompe_shared.api import JobState, Needs
+
+
+@pytest.fixture(scope="module")
+def forks() -> Forks:
+    return Forks()
+
+
+@pytest.fixture
+def executed(tmp_path: Path, renderer: int) -> Iterator[Executed]:
+    queue = Executed(tmp_path, "local", renderer)
+    yield queue
+    queue.store.close()
+
+
+def claim(executed: Executed, label: str) -> Claim:
+    executed.submit(label)
+    found = Claims(executed.store.engine).claim(Needs(), "here")
+    assert found is not None
+    return found
+
+
+def test_attempts_of_a_task_share_a_process_until_one_kills_it(
+    forks: Forks, executed: Executed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pickled = pickle.dumps(executed.setup)
+
+    def run(label: str) -> tuple[str | None, set[int]]:
+        said = run_forked(forks.address, pickled, pickle.dumps(claim(executed, label)))
+        return said, set(workers_of(os.getpid()))
+
+    (first, its), (second, same), (died, none) = run("fine"), run("fine"), run("deadly")
+    assert (first, second, died) == (None, None, "its process died (signal 9)")
+    assert len(its) == 1
+    assert (same, none) == (its, set())
+    assert executed.store.counts()[JobState.succeeded] == 2
+    third, new = run("fine")
+    assert third is None
+    assert new
+    (idle,) = new
+    os.kill(idle, signal.SIGKILL)
+    wait_until(lambda: not workers_of(os.getpid()))
+    assert run("fine")[0] is None, "a process that died between two attempts is no loss"
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    _, other = run("fine")
+    assert len(other) == 1, "the one with other devices has ended"
+
+
+def test_the_process_of_a_dead_task_is_killed_even_if_it_is_frozen(forks: Forks, executed: Executed) -> None:
+    before = set(workers_of(os.getpid()))
+    with Client(forks.address(), family="AF_UNIX") as task:
+        task.send({})
+        task.send(executed.setup)
+        assert task.recv() == READY
+        (frozen,) = set(workers_of(os.getpid())) - before
+        os.kill(frozen, signal.SIGSTOP)
+    wait_until(lambda: frozen not in workers_of(os.getpid()))
+
+
+def test_a_node_is_sound_if_it_sees_the_store_and_can_fork(forks: Forks, executed: Executed) -> None:
+    take_lease(executed.store.engine, DISPATCHER, holder=NAME, seconds=60)
+    assert "does not see the store" in str(forks.fault(executed.setup, NAME))
+    open_folder(executed.settings.store_url).write(MARK, NAME.encode())
+    assert forks.fault(executed.setup, NAME) is None
+    lacking = Setup(executed.settings.model_copy(update={"silence": "soon"}), executed.setup.renderers)
+    assert "die before they are ready (status 1)" in str(forks.fault(lacking, NAME))
