@@ -53,8 +53,9 @@ def run_attempts(connection: Connection, environment: Mapping[str, str], setup: 
     from trompe_server.executor.attempts import Attempts
 
     attempts = Attempts(setup.settings, setup.renderers)
-    if (torch := sys.modules.get("torch")) is not None:  # imported by the fork server, with its number of threads
-        torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+    torch, threads = sys.modules.get("torch"), os.environ.get("OMP_NUM_THREADS")
+    if torch is not None and threads is not None:  # the fork server has imported it with its own number of threads
+        torch.set_num_threads(int(threads))
     connection.send(READY)
     while True:
         try:
