@@ -9,8 +9,6 @@ TrompeError
 
 from trompe_shared.errors import TrompeError
 
-__all__ = ["AmbiguousError", "ConflictError", "NotFoundError", "ServiceError"]
-
 
 class NotFoundError(TrompeError):
     """Nothing is stored under this id or name."""

@@ -8,8 +8,6 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from trompe_shared.engine import DEFAULT_ENGINE
 
-__all__ = ["Settings"]
-
 
 class Settings(BaseSettings):
     """Settings of the service. ``TROMPE_DATA`` sets ``data``, and so on."""

@@ -35,8 +35,6 @@ from trompe_server.surrogate import AnySurrogate
 from trompe_shared.api import OptimiserName
 from trompe_shared.errors import SpecError
 
-__all__ = ["Step", "attack"]
-
 
 @dataclass(frozen=True)
 class Step:

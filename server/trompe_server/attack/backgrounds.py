@@ -15,8 +15,6 @@ from torch import Tensor
 
 from trompe_server.surrogate import AnySurrogate, JointSurrogate, Surrogate
 
-__all__ = ["Backgrounds"]
-
 STREAM: Final = 4
 """Separates the random numbers of a step's backgrounds from those of its views."""
 

@@ -16,8 +16,6 @@ from trompe_shared.api import levels_within
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D
 
-__all__ = ["HUE", "Bound", "Budget"]
-
 Bound = Float[Tensor, "*texels 1"]
 """Largest change of each texel's channels, in whole 8-bit levels."""
 

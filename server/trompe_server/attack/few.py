@@ -24,8 +24,6 @@ from trompe_server.classifiers import WhiteBoxClassifier
 from trompe_server.image_pipelines import ImagePipeline
 from trompe_server.surrogate import AnySurrogate
 
-__all__ = ["FewTexels", "few_texels"]
-
 ROUNDS: Final = 2
 """Trial attacks."""
 

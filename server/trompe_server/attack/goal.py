@@ -13,8 +13,6 @@ from trompe_server.spec.checks import check_labels, check_target, check_top_k
 from trompe_shared.api import Loss
 from trompe_shared.errors import SpecError
 
-__all__ = ["SAFE_MARGIN", "Goal"]
-
 SAFE_MARGIN: Final = 1.0
 """Margin from which a view is safely won: the margin loss has no gradient there."""
 

@@ -18,8 +18,6 @@ from trompe_server.image_pipelines import Drawn
 from trompe_server.surrogate import AnyCanvas, AnySurrogate
 from trompe_shared.errors import SpecError
 
-__all__ = ["Evaluation", "Flat", "Objective", "Score", "Textures", "members_of"]
-
 Textures = Mapping[str, Float[Tensor, "H W 3"]]
 Flat = Float[Tensor, "texels 3"]
 

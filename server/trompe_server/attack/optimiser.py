@@ -19,8 +19,6 @@ from trompe_server.attack.budget import Bound, Budget
 from trompe_server.attack.objective import Flat
 from trompe_shared.api import OptimiserName
 
-__all__ = ["OPTIMISERS", "Box", "Iterate", "Memory", "Optimiser", "step_factor"]
-
 Memory = Mapping[str, Tensor]
 
 MOMENTUM: Final = 0.9

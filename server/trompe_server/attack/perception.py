@@ -15,8 +15,6 @@ from torch.nn import functional as F
 
 from trompe_server.surrogate.shading import decode
 
-__all__ = ["perceptual_bounds"]
-
 LUMA: Final = (0.299, 0.587, 0.114)
 """Luminance of encoded RGB (ITU-R BT.601)."""
 WINDOW: Final = 5

@@ -13,8 +13,6 @@ from trompe_server.attack.objective import members_of
 from trompe_server.classifiers import WhiteBoxClassifier
 from trompe_shared.errors import SpecError
 
-__all__ = ["BATCH", "image_gradients", "saliency", "saliency_masks"]
-
 BATCH = 10
 
 

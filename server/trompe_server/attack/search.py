@@ -26,8 +26,6 @@ from trompe_server.attack.view_budget import ViewBudget
 from trompe_server.image_pipelines import Drawn, ImagePipeline
 from trompe_shared.api import OptimiserName
 
-__all__ = ["SHOWN", "SKIPPED", "Search", "finished", "went_on"]
-
 SKIPPED: Final = 2
 """Steps for which a settled view is skipped."""
 

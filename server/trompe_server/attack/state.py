@@ -11,8 +11,6 @@ from torch import Tensor
 from trompe_server.attack.objective import Textures
 from trompe_server.storage.arrays import pack_arrays, unpack_arrays
 
-__all__ = ["AttackState", "load_state", "save_state", "start"]
-
 DELTA, MEMORY = "delta:", "memory:"
 """Prefixes of array names in the file."""
 

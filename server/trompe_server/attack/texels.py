@@ -16,8 +16,6 @@ from trompe_server.surrogate import AnySurrogate
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D
 
-__all__ = ["TexelMasks", "backproject", "best_texels", "material_texels", "movable", "painted_texels", "rank_texels"]
-
 TexelMasks = Mapping[str, Bool[Tensor, "H W"]]
 ImageMaps = Float[Tensor, "views H W"] | Float[Tensor, "views H W 3"]
 

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from trompe_server.attack.objective import Flat, Objective
 
-__all__ = ["ViewBudget"]
-
 TOLERANCE: Final = 1e-6
 """Excess allowed for rounding of floats."""
 

@@ -8,8 +8,6 @@ from trompe_shared.api import PAPER_AZIMUTHS, Colour, ViewRanges
 from trompe_shared.errors import SpecError
 from trompe_shared.geometry import Camera, Light, View
 
-__all__ = ["ViewDistribution", "grid_views"]
-
 Range = tuple[float, float]
 
 

@@ -21,8 +21,6 @@ from trompe_server.system.memory import keep_freed_memory
 from trompe_server.system.threads import prepare_threads
 from trompe_shared.errors import TrompeError
 
-__all__ = ["MARK", "Attempts", "fault_here", "prepare"]
-
 logger = logging.getLogger(__name__)
 
 MARK: Final = "cluster-mark"

@@ -6,8 +6,6 @@ from trompe_server.executor.process import Setup
 from trompe_server.renderers.discovery import RendererAddresses
 from trompe_server.settings import Settings
 
-__all__ = ["open_executor"]
-
 
 def open_executor(settings: Settings, renderers: RendererAddresses, *, mark: str) -> Executor:
     """Start the processes of this machine, or connect to the cluster. ``mark``: name of the dispatcher with the lease.

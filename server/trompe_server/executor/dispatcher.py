@@ -18,8 +18,6 @@ from trompe_server.queue.workers import forget_workers, record_workers
 from trompe_server.storage.database import DatabaseDownError
 from trompe_server.system.files import exclusive
 
-__all__ = ["Dispatcher", "dispatcher_name"]
-
 logger = logging.getLogger(__name__)
 
 WAIT: Final = 0.1

@@ -13,8 +13,6 @@ from multiprocessing.connection import Connection, Listener
 from trompe_server.executor.process import Setup, ending, fork
 from trompe_server.executor.task import DiedError, connect
 
-__all__ = ["Forks"]
-
 
 class Forks:
     """Forks a process for each task of its node that connects to ``address``, and kills it once the task is gone."""

@@ -19,8 +19,6 @@ from trompe_server.queue.workers import Worker
 from trompe_server.settings import Settings
 from trompe_shared.api import Needs
 
-__all__ = ["LocalExecutor"]
-
 logger = logging.getLogger(__name__)
 
 LONGEST_WAIT: Final = 30.0

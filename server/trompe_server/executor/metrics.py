@@ -9,8 +9,6 @@ from typing import Final
 
 from prometheus_client import Counter
 
-__all__ = ["count_phase"]
-
 PHASE_SECONDS: Final = Counter("trompe_phase_seconds", "Seconds spent in phases of jobs.", ["phase"])
 COUNTERS: Final = {
     "attack_steps": Counter("trompe_attack_steps", "Attack steps."),

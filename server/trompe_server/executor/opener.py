@@ -19,8 +19,6 @@ from trompe_shared.api import JobSpec, JudgementSpec
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, RendererLostError
 
-__all__ = ["JobOpener", "load"]
-
 ENGINES: Final = "engines.json"
 """File with the engines of a job's renderers: later attempts use the same ones."""
 

@@ -8,8 +8,6 @@ from trompe_server.queue.claims import Claim
 from trompe_server.queue.workers import Worker
 from trompe_shared.api import Needs
 
-__all__ = ["Ended", "Executor", "fits", "left_in", "too_much"]
-
 
 @dataclass(frozen=True)
 class Ended:

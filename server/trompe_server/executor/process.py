@@ -16,8 +16,6 @@ from typing import Final
 from trompe_server.renderers.discovery import RendererAddresses
 from trompe_server.settings import Settings
 
-__all__ = ["READY", "Setup", "ending", "fork", "run_attempts"]
-
 READY: Final = "ready"
 _FORKING: Final = threading.Lock()
 

@@ -22,8 +22,6 @@ from trompe_server.queue.workers import Worker
 from trompe_server.storage.folders import open_folder
 from trompe_shared.api import Needs
 
-__all__ = ["RayExecutor"]
-
 logger = logging.getLogger(__name__)
 
 ENVIRONMENT: Final = {

@@ -15,8 +15,6 @@ from trompe_server.storage.database import RETRY_WAITS, DatabaseDownError, patie
 from trompe_shared.api import JobState, Progress
 from trompe_shared.errors import RendererError, TrompeError
 
-__all__ = ["JobRunner", "OpenedJob"]
-
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")

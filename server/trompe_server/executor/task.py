@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping
 from multiprocessing.connection import Client, Connection
 from typing import Any, Final
 
-__all__ = ["DiedError", "connect", "run_forked", "run_task"]
-
 GRANTED: Final = ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES")
 """Variables by which Ray tells a task its share of the node."""
 

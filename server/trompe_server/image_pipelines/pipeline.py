@@ -22,8 +22,6 @@ from trompe_server.classifiers.drawing import seeded_generator
 from trompe_server.classifiers.protocol import fit_images
 from trompe_server.image_pipelines.resampling import Axis, blurred, placed, resampled, resized
 
-__all__ = ["Drawn", "ImagePipeline"]
-
 Range = tuple[float, float]
 Images = Float[Tensor, "n 3 H W"]
 Image = Float[Tensor, "3 H W"]

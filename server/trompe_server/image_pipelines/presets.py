@@ -5,8 +5,6 @@ from typing import Final
 
 from trompe_server.image_pipelines.pipeline import ImagePipeline
 
-__all__ = ["PIPELINES", "SUITE"]
-
 PIPELINES: Final[Mapping[str, ImagePipeline]] = {
     "robust": ImagePipeline(
         spared=0.25, often=0.6, resize=(0.4, 1), gamma=(0.7, 1.45), gain=(0.85, 1.15), noise=(0, 0.04), jpeg=(30, 90)

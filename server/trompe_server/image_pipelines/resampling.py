@@ -11,8 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-__all__ = ["Axis", "blurred", "placed", "resampled", "resized"]
-
 Axis = Float[Tensor, "n n"]
 """Matrix from the pixels along an axis to as many new ones; its rows sum to 1."""
 

@@ -24,8 +24,6 @@ from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
 
-__all__ = ["AttackedObject", "attack_object"]
-
 VIEWS: Final = 40
 """Default number of attacked views, and of held-out ones."""
 

@@ -22,8 +22,6 @@ from trompe_server.surrogate.tone import ToneMap, measure_tone_map
 from trompe_shared.api import SearchOptions
 from trompe_shared.engine import EngineInfo
 
-__all__ = ["JobCalibrations"]
-
 logger = logging.getLogger(__name__)
 
 TONE_VERSION: Final = 1

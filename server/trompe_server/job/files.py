@@ -15,8 +15,6 @@ from trompe_server.storage.arrays import pack_arrays, unpack_arrays
 from trompe_server.surrogate.calibration import Calibration
 from trompe_server.surrogate.calibration_file import unpack_calibration
 
-__all__ = ["OPEN", "JobFiles", "Spent"]
-
 OPEN: Final = "open"
 """Kind of the time before and between phases."""
 

@@ -25,8 +25,6 @@ from trompe_server.surrogate.calibration import Calibration, build_surrogate, pa
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
-__all__ = ["GrowingPool"]
-
 LOOKS: Final = (10, 20, 30)
 """Steps after which an attack looks at further views. It also does so whenever all its views are safely won."""
 

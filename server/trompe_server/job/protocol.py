@@ -11,20 +11,6 @@ from typing import Protocol
 from trompe_shared.api import JobState, Progress
 from trompe_shared.errors import TrompeError
 
-__all__ = [
-    "SAILENV",
-    "THUMBNAIL",
-    "VIEWS_AFTER",
-    "VIEWS_BEFORE",
-    "Artifacts",
-    "DamagedFileError",
-    "OnProgress",
-    "PhaseReport",
-    "PhasedJob",
-    "number_after",
-    "numbered",
-]
-
 VIEWS_BEFORE, VIEWS_AFTER = "views_before", "views_after"
 """Names of the arrays (``.npz``) with all target images, ``own`` and ``held_out``: (views, H, W, 3) uint8."""
 

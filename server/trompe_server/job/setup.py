@@ -41,8 +41,6 @@ from trompe_shared.errors import SpecError
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, decode_rgb, load_object
 
-__all__ = ["SAFE_MARGINS", "JobRenderer", "JobSetup", "open_setup"]
-
 SAFE_MARGINS: Final[Mapping[PipelineName, float]] = {"none": SAFE_MARGIN, "robust": 3.0, "transfer": 1000.0}
 """Margin from which a view counts as safely won, by image pipeline: a chain of other draws takes some of it. No view
 reaches the last: each is won by as much as possible."""

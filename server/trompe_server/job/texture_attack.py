@@ -52,8 +52,6 @@ from trompe_shared.api import JobSpec, JobState, Progress
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, encode_png
 
-__all__ = ["CHUNK", "TextureAttack", "open_job"]
-
 logger = logging.getLogger(__name__)
 
 CHUNK: Final = 5

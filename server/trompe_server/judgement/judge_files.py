@@ -27,8 +27,6 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import ClassifierError, LabelError, RendererError, RendererLostError, SpecError
 from trompe_shared.geometry import View
 
-__all__ = ["judge_files", "noisy", "sampled"]
-
 SHARE: Final = 10
 """Images between two saves."""
 

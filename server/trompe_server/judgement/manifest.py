@@ -35,8 +35,6 @@ from trompe_shared.api import (
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import Camera, Light, View
 
-__all__ = ["PIPELINES", "Judged", "manifest_of", "view_of", "view_record"]
-
 Images = NDArray[np.uint8]
 Logits = NDArray[np.float32]
 PIPELINES: Final[Mapping[str, ImagePipeline | None]] = {AS_RENDERED: None, **SUITE}

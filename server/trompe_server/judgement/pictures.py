@@ -15,8 +15,6 @@ from trompe_server.pictures import (
     texture_sheet,
 )
 
-__all__ = ["judgement_pictures"]
-
 SHEET_VIEWS: Final = 12
 DIFFERENCE_VIEWS: Final = 4
 QUALITY: Final = 88

@@ -26,8 +26,6 @@ from trompe_shared.local_files import CLASSIFIER_SUFFIXES, LOOKED_UP, classes_be
 from trompe_shared.object3d import Object3D, load_object, unpack
 from trompe_shared.shipped import shipped_objects
 
-__all__ = ["JudgedObject", "LocalSources", "Sources", "StoredSources", "network_file"]
-
 
 @dataclass(frozen=True)
 class JudgedObject:

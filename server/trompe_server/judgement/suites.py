@@ -10,8 +10,6 @@ from typing import Final
 from trompe_shared.api import JudgementSpec
 from trompe_shared.errors import SpecError
 
-__all__ = ["SUITES", "Suite", "suite_of"]
-
 VIEWS: Final = 60
 """Default number of views, as many as a job's held-out ones."""
 

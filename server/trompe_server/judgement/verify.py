@@ -22,8 +22,6 @@ from trompe_shared.api import JudgedRenderer, Manifest, Predictions
 from trompe_shared.errors import ClassifierError, LabelError, ObjectError, RendererError
 from trompe_shared.shipped import shipped_objects
 
-__all__ = ["VIEWS_AGAIN", "verify"]
-
 VIEWS_AGAIN: Final = 20
 """Views that are rendered again."""
 

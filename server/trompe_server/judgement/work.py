@@ -17,8 +17,6 @@ from trompe_server.storage.arrays import pack_arrays, unpack_arrays
 from trompe_server.system.versions import versions
 from trompe_shared.api import Progress
 
-__all__ = ["Kept", "OnWork", "Timed", "Work", "key_of"]
-
 T = TypeVar("T", bound=np.generic)
 
 GUESS: Final = 0.05

@@ -14,8 +14,6 @@ from trompe_server.spec.labels import resolve_labels
 from trompe_server.spec.neighbours import neighbours
 from trompe_shared.api import Accuracy
 
-__all__ = ["Judge"]
-
 
 @dataclass(frozen=True)
 class Judge:

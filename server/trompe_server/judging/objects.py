@@ -18,8 +18,6 @@ from trompe_server.judging.metrics import difference
 from trompe_shared.api import Finding, TextureChange, levels_within
 from trompe_shared.object3d import Material, Object3D, decode_rgb, open_image
 
-__all__ = ["ObjectPair", "texture_changes"]
-
 TOLERANCE: Final = 1e-4
 """Distance of equal corners, as a share of the object's radius, and of equal texture coordinates."""
 

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from skimage.color import deltaE_ciede2000, rgb2lab
 from skimage.metrics import structural_similarity
 
-__all__ = ["PerceivedChange", "object_pixels", "perceived_change", "total_variation"]
-
 Images = UInt8[np.ndarray, "views H W 3"]
 Pixels = Bool[np.ndarray, "views H W"]
 

@@ -6,8 +6,6 @@ from typing import Final
 from trompe_shared.object3d import Object3D
 from trompe_shared.opacity import strongest
 
-__all__ = ["faint_warnings"]
-
 FAINT: Final = 0.25
 """Opacity below which the paint on a material is hardly seen: a quarter of its change reaches the image."""
 

@@ -10,8 +10,6 @@ from trompe_server.judging.metrics import max_view_change, mean_texel_change, sh
 from trompe_server.judging.perceptual import Images, object_pixels, perceived_change, total_variation
 from trompe_shared.api import Visibility
 
-__all__ = ["visibility_of"]
-
 Textures = Mapping[str, UInt8[np.ndarray, "H W 3"]]
 
 

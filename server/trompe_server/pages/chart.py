@@ -10,8 +10,6 @@ from typing import Any, Final
 
 from trompe_shared.comparison import Job, Mean, charged, means_of, pareto_front
 
-__all__ = ["COLOURS", "Chart", "Point", "chart"]
-
 LEFT, RIGHT, TOP, BOTTOM = 60.0, 700.0, 20.0, 310.0
 STEPS: Final = (1, 2, 5)
 COLOURS: Final = 8

@@ -10,8 +10,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from trompe_server.pages.serving import page
 
-__all__ = ["HtmlProblems"]
-
 PROBLEM = b"application/problem+json"
 
 

@@ -9,8 +9,6 @@ from trompe_server.pages.outcomes import Outcome
 from trompe_server.pages.present import span
 from trompe_shared.api import Job
 
-__all__ = ["Effort", "estimate"]
-
 CLOSE: Final = 1.5
 """Largest ratio of the epsilons of jobs that are alike."""
 

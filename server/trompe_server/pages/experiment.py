@@ -9,8 +9,6 @@ from trompe_server.pages.present import JobRow, value_text
 from trompe_shared import comparison
 from trompe_shared.api import Result
 
-__all__ = ["Entry", "Line", "columns_and_lines", "differing_options", "points_of"]
-
 Entry = tuple[JobRow, Mapping[str, Any], Result | None]
 """A job, its options by keyword, and its result."""
 

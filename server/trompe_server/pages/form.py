@@ -6,8 +6,6 @@ from typing import Any
 
 from trompe_shared.api import OPTIONS, PARTS, Option
 
-__all__ = ["Field", "form_fields"]
-
 
 @dataclass(frozen=True)
 class Field:

@@ -11,8 +11,6 @@ from trompe_server.pages.chart import COLOURS
 from trompe_server.pages.serving import STATIC, render
 from trompe_shared.api import Accuracy, Cell, Manifest
 
-__all__ = ["judgement_page", "shares_in_words"]
-
 LEFT, RIGHT, TOP, BOTTOM = 50.0, 700.0, 15.0, 250.0
 SPREAD: Final = 8.0
 """Distance of the points of one image pipeline."""

@@ -9,8 +9,6 @@ from trompe_server.library import Library
 from trompe_server.pages.present import ClassNames, JobRow, job_row
 from trompe_shared.api import OPTIONS, Job, JobSpec, JudgementSpec
 
-__all__ = ["Names"]
-
 
 class Names:
     """Names of stored things, as of the submission of the job, and of classes, looked up once for a classifier."""

@@ -22,8 +22,6 @@ from trompe_shared.api import Job, Result
 from trompe_shared.object3d import Object3D, open_image
 from trompe_shared.three import FOLDER, LIGHTS, THREE
 
-__all__ = ["LIMIT", "offline_page"]
-
 LIMIT: Final = 8 * 2**20
 """Bytes of the file; what follows and three.js are less together."""
 MODEL_BYTES: Final = 4_400_000

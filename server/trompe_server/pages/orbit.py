@@ -12,8 +12,6 @@ from trompe_shared.geometry import FIELD_OF_VIEW
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.three import FOLDER, LIGHTS, THREE
 
-__all__ = ["orbit", "painted"]
-
 ARCHIVES: Final = (ADVERSARIAL + SAILENV, f"{ADVERSARIAL}.zip")
 """Endings of the repainted object's SAILenv zip, the first one if there are both."""
 PLAIN: Final = "#ffffff"

@@ -8,8 +8,6 @@ from typing import Final
 from trompe_server.api.jobs import RESULT
 from trompe_server.storage.folders import JobArtifacts
 
-__all__ = ["Outcome", "Outcomes"]
-
 KEPT: Final = 2000
 """Outcomes in memory."""
 

@@ -13,8 +13,6 @@ from trompe_server.storage.arrays import unpack_arrays
 from trompe_server.storage.folders import JobArtifacts
 from trompe_shared.object3d import encode_png
 
-__all__ = ["Kind", "Pictures", "ViewSet"]
-
 ViewSet = Annotated[str, Path(pattern=r"^(own|held_out)(-[1-9]\d?)?$")]
 """``own`` or ``held_out``, with the number of the renderer if it is not the job's first."""
 Kind = Literal["before", "after", "difference"]

@@ -23,21 +23,6 @@ from trompe_shared.api import (
     ViewPrediction,
 )
 
-__all__ = [
-    "PHASES",
-    "TERMS",
-    "ClassNames",
-    "JobRow",
-    "Shown",
-    "command",
-    "differences",
-    "job_row",
-    "present",
-    "span",
-    "value_text",
-    "viewer_record",
-]
-
 ClassNames = Callable[[int], str]
 
 TERMS: Final = {

@@ -14,6 +14,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from trompe_server.api.experiments import LABEL
+from trompe_server.api.guard import COOKIE
 from trompe_server.api.jobs import RESULT, Cursor, labels_of
 from trompe_server.api.services import Services, ServicesDep
 from trompe_server.errors import NotFoundError
@@ -28,15 +29,13 @@ from trompe_server.pages.offline import offline_page
 from trompe_server.pages.orbit import orbit, painted
 from trompe_server.pages.pictures import Kind, ViewSet
 from trompe_server.pages.present import PHASES, TERMS, JobRow, Shown, differences, present
-from trompe_server.pages.serving import COOKIE, page, render
+from trompe_server.pages.serving import page, render
 from trompe_server.pages.turntable import TURNS, turntable
 from trompe_server.storage.database import DatabaseDownError
 from trompe_server.storage.tokens import hash_secret
 from trompe_shared.api import JOB_RESULT, MANIFEST_PAGE, Job, JobSpec, JobState, Result, in_parts
 from trompe_shared.presets import PRESETS
 from trompe_shared.shipped import shipped_objects
-
-__all__ = ["router"]
 
 router = APIRouter(include_in_schema=False)
 

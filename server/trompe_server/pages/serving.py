@@ -16,8 +16,6 @@ from markupsafe import Markup, escape
 from trompe_server.api.guard import COOKIE
 from trompe_shared import three
 
-__all__ = ["COOKIE", "STATIC", "page", "render", "static"]
-
 _HERE: Final = Path(__file__).parent
 STATIC: Final = _HERE / "static"
 

@@ -5,8 +5,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-__all__ = ["Sphere", "sphere"]
-
 LEFT, RIGHT, TOP, BOTTOM = 50.0, 700.0, 15.0, 485.0
 LEAST, MOST = 4.0, 11.0
 """Radii of dots of no and of full confidence."""

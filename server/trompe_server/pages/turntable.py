@@ -13,8 +13,6 @@ from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import encode_png, load_object
 from trompe_shared.sailenv_client import SailenvTarget
 
-__all__ = ["TURNS", "turntable"]
-
 TURNS: Final = 12
 SIDE: Final = 224
 ELEVATION: Final = 25.0

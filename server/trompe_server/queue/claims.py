@@ -16,9 +16,6 @@ from trompe_server.queue.tables import Row, events, fresh, job_of, jobs, locked,
 from trompe_server.storage.database import clock, write
 from trompe_shared.api import Job, JobState, Needs, Progress
 
-__all__ = ["ALONE_AFTER", "MAX_LOST", "MAX_ORPHANED", "START_ALLOWANCE"]
-__all__ += ["Claim", "Claims", "Ending", "LostJobError"]
-
 MAX_LOST: Final = 3
 """Attempts that may be lost in the same phase of a job before the job is failed."""
 

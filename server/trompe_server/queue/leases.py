@@ -7,8 +7,6 @@ import sqlalchemy as sa
 from trompe_server.queue.tables import leases
 from trompe_server.storage.database import clock, write
 
-__all__ = ["DISPATCHER", "RETENTION", "end_lease", "is_leased", "lease_holder", "take_lease"]
-
 DISPATCHER: Final = "dispatcher"
 RETENTION: Final = "retention"
 

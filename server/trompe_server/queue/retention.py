@@ -10,8 +10,6 @@ from trompe_server.queue.leases import RETENTION, take_lease
 from trompe_server.queue.store import JobStore
 from trompe_server.storage.folders import Folder, job_artifacts
 
-__all__ = ["Retention", "delete_job"]
-
 logger = logging.getLogger(__name__)
 
 DAY: Final = 86_400.0

@@ -31,8 +31,6 @@ from trompe_server.storage.database import clock, connect, write
 from trompe_shared.api import Event, Job, JobList, JobRequest, JobState, JudgementRequest, Progress, WorkerInfo
 from trompe_shared.errors import SpecError
 
-__all__ = ["JobGroup", "JobStore", "Statistics"]
-
 AnyRequest = JobRequest | JudgementRequest
 
 

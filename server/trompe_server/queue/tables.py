@@ -10,9 +10,6 @@ from trompe_server.errors import NotFoundError
 from trompe_server.storage.database import clock
 from trompe_shared.api import Event, Job, Needs
 
-__all__ = ["PRIORITIES", "Row", "append_event", "event_of", "events", "fresh", "job_of", "jobs", "labels", "leases"]
-__all__ += ["locked", "metadata", "needs_text", "time_of", "update_job", "workers"]
-
 PRIORITIES: Final = {"interactive": 10, "normal": 100, "sweep": 1000}
 """Lower numbers run first."""
 

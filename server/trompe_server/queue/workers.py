@@ -9,8 +9,6 @@ import sqlalchemy as sa
 from trompe_server.queue.tables import workers
 from trompe_server.storage.database import clock, write
 
-__all__ = ["Worker", "forget_workers", "record_workers"]
-
 FORGOTTEN: Final = 86_400.0
 """Seconds after which a worker that was not seen again is deleted."""
 

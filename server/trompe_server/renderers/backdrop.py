@@ -12,8 +12,6 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
-__all__ = ["BackdropTarget", "fitted"]
-
 Images = NDArray[np.uint8]
 
 

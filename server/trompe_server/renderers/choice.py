@@ -9,8 +9,6 @@ from trompe_shared.api import JobSpec
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, SpecError
 
-__all__ = ["JobEngines", "listed", "named"]
-
 
 @dataclass(frozen=True)
 class JobEngines:

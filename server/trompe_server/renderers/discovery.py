@@ -19,8 +19,6 @@ from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 from trompe_shared.sailenv_client import engine_at
 
-__all__ = ["Address", "DiscoveredRenderers", "RendererAddresses", "engines_at"]
-
 logger = logging.getLogger(__name__)
 
 Address = tuple[str, int]

@@ -11,8 +11,6 @@ from typing import IO, Final
 from trompe_shared.errors import RendererError
 from trompe_shared.sailenv_client import SailenvTarget
 
-__all__ = ["local_renderer"]
-
 COMMAND: Final = (sys.executable, "-m", "trompe_server.system.child", "render", "--port", "0")
 
 

@@ -19,8 +19,6 @@ from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 from trompe_shared.sailenv_client import SailenvTarget, engine_at
 
-__all__ = ["RendererPool"]
-
 logger = logging.getLogger(__name__)
 
 Address = tuple[str, int]

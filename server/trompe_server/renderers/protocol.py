@@ -10,8 +10,6 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
-__all__ = ["TargetRenderer"]
-
 
 class TargetRenderer(Protocol):
     """A renderer that gives images and nothing else."""

@@ -23,8 +23,6 @@ from trompe_server.settings import Settings
 from trompe_server.storage.database import DatabaseDownError
 from trompe_server.storage.folders import open_folder
 
-__all__ = ["READY", "dispatching", "prepare_data", "run_worker"]
-
 READY: Final = "trompe worker ready"
 """Line printed by ``trompe worker`` once it dispatches jobs or waits for the lease."""
 

@@ -8,8 +8,6 @@ from typing import Final
 
 from trompe_shared.api import JudgementSpec, Manifest, Progress
 
-__all__ = ["judge_here", "verify_here"]
-
 KEPT: Final = ".judging"
 """Folder with the finished work of a judgement that was stopped."""
 

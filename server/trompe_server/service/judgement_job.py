@@ -13,8 +13,6 @@ from trompe_server.judgement.work import Work
 from trompe_server.pages.judgement import judgement_page
 from trompe_shared.api import MANIFEST, MANIFEST_PAGE, JobState, JudgementSpec, Manifest, Progress
 
-__all__ = ["JudgementJob", "open_judgement", "written"]
-
 PHASE: Final = "judge"
 UNSEEN: Final = "Nothing could be judged. The findings on the page say why."
 

@@ -21,8 +21,6 @@ from trompe_shared.api import RendererInfo
 from trompe_shared.errors import RendererError
 from trompe_shared.sailenv_client import engine_at
 
-__all__ = ["Child", "Supervisor"]
-
 logger = logging.getLogger(__name__)
 
 BACKOFF: Final = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)

@@ -32,18 +32,6 @@ from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
 from trompe_shared.opacity import opacity_of
 
-__all__ = [
-    "CALIBRATED_GREYS",
-    "CURVE_GREYS",
-    "Calibration",
-    "build_surrogate",
-    "calibrate",
-    "find_physics",
-    "find_sampling",
-    "painted_grey",
-    "painted_noise",
-]
-
 CALIBRATED_GREYS: Final = (0, 128)
 CURVE_GREYS: Final = (0, 64, 128, 191, 255)
 """Encoded greys of the probes of the ``calibrated`` and the ``curve`` model. White alone would saturate."""

@@ -16,8 +16,6 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
-__all__ = ["calibration_key", "pack_calibration", "unpack_calibration"]
-
 VERSION = 4
 """To be raised whenever calibration can give another result from the same images."""
 

@@ -18,8 +18,6 @@ from torch.autograd.function import FunctionCtx
 from trompe_server.surrogate.pyramid import MipChain, round_level_
 from trompe_server.surrogate.shading import decode
 
-__all__ = ["Canvas", "canvas_of"]
-
 DEPTH = 3
 """Tiles have sides of up to 2 ** DEPTH texels: larger ones contain more fixed texels, smaller ones leave more work to
 the complete levels."""

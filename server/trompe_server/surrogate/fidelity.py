@@ -11,8 +11,6 @@ from torch import Tensor
 from trompe_server.surrogate.surrogate import Surrogate, ViewBatch, textures_of
 from trompe_shared.object3d import Object3D
 
-__all__ = ["MAX_ERROR", "MIN_EXPLAINED", "Fidelity", "ViewFit", "compare_views", "measure_fidelity"]
-
 MAX_ERROR: Final = 1.5 / 255
 """Largest mean error on the unpainted object's pixels of a colour model within tolerance, sRGB in [0, 1] units."""
 

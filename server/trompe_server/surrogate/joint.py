@@ -16,8 +16,6 @@ from torch import Tensor
 from trompe_server.surrogate.canvas import Canvas
 from trompe_server.surrogate.surrogate import Surrogate
 
-__all__ = ["AnyCanvas", "AnySurrogate", "JointCanvas", "JointSurrogate", "joined"]
-
 
 def joined(parts: Sequence[Surrogate]) -> "AnySurrogate":
     """One or several surrogates of the same object and image size as one."""

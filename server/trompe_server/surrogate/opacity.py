@@ -12,8 +12,6 @@ from trompe_server.surrogate.rasterize import Mesh, Planes, covered
 from trompe_server.surrogate.sampling import Fragments, SamplingModel, reads_of, shading_point, texture_coordinates
 from trompe_shared.opacity import CUTOFF, INVISIBLE
 
-__all__ = ["Opacities"]
-
 
 @dataclass(frozen=True)
 class Opacities:

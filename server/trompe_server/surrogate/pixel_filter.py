@@ -9,8 +9,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import conv2d, conv_transpose2d
 
-__all__ = ["KernelName", "PixelFilter", "kernel_of"]
-
 KernelName = Literal["box", "tent", "gaussian", "blackman-harris"]
 
 _BLACKMAN_HARRIS: Final = (0.35875, -0.48829, 0.14128, -0.01168)

@@ -14,8 +14,6 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import FunctionCtx
 
-__all__ = ["MipChain", "MipLayout", "Reads", "mip_chains", "mip_layout", "read_texels", "round_level_"]
-
 Reads = Sequence[Int[Tensor, " _"]]
 """For each mip level in the layout's order, texels (row * width + column) in the requested order."""
 

@@ -19,23 +19,6 @@ from trompe_shared.geometry import FIELD_OF_VIEW, Camera
 from trompe_shared.object3d import Material, Object3D
 from trompe_shared.opacity import opacity_of
 
-__all__ = [
-    "CENTRE",
-    "MSAA4",
-    "MSAA4_MIRRORED",
-    "Drawn",
-    "Mesh",
-    "Opacity",
-    "Planes",
-    "Samples",
-    "Visibility",
-    "chunks",
-    "covered",
-    "mesh_of",
-    "project",
-    "rasterize",
-]
-
 CENTRE = ((0.5, 0.5),)
 """One sample at the centre of a pixel."""
 

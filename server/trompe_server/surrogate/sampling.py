@@ -28,21 +28,6 @@ from trompe_server.surrogate.rasterize import (
 )
 from trompe_server.surrogate.shading import Encoding
 
-__all__ = [
-    "SUBPIXELS",
-    "FilteredGather",
-    "Fragments",
-    "Gather",
-    "SamplingModel",
-    "Taps",
-    "fragments_of",
-    "reads_of",
-    "shading_point",
-    "taps_of",
-    "texture_coordinates",
-]
-
-
 SUBPIXELS: Final = 4
 """Sub-pixels along a pixel's side under a reconstruction filter."""
 

@@ -18,20 +18,6 @@ Encoding = Literal["srgb", "power"]
 POWER = 2.2
 """Exponent of the power-law encoding of some renderers, in place of the sRGB curve."""
 
-__all__ = [
-    "Chord",
-    "CurveShading",
-    "DiffuseShading",
-    "Encoder",
-    "Shading",
-    "decode",
-    "decode_with_slope",
-    "encode",
-    "fit_curve",
-    "lambert",
-    "own_colours",
-]
-
 
 class Shading(Protocol):
     """The colour model of the object's pixels."""

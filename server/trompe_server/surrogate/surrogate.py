@@ -34,20 +34,6 @@ from trompe_server.surrogate.tone import ToneMap, fit_tone
 from trompe_shared.geometry import Camera, View, spherical
 from trompe_shared.object3d import Object3D
 
-__all__ = [
-    "BATCH",
-    "NO_BACKDROPS",
-    "Geometry",
-    "Surrogate",
-    "ViewBatch",
-    "behind",
-    "curve_surrogate",
-    "diffuse_surrogate",
-    "prepare_geometry",
-    "refiltered",
-    "textures_of",
-]
-
 Image8 = NDArray[np.uint8]
 
 

@@ -21,8 +21,6 @@ from trompe_server.surrogate.shading import GAIN, GAMMA, Chord, decode, decode_w
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View
 from trompe_shared.object3d import Object3D, encode_png, object_from_files
 
-__all__ = ["ToneMap", "ToneShading", "fit_tone", "measure_tone_map"]
-
 Ask = Callable[[Object3D, Sequence[View]], NDArray[np.uint8]]
 
 LEVELS: Final = 9

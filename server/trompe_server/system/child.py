@@ -12,6 +12,8 @@ import time
 from importlib.metadata import entry_points
 from typing import Final
 
+from trompe_shared.errors import TrompeError
+
 GRACE: Final = 5.0
 """Seconds from SIGTERM to a forced exit."""
 
@@ -21,7 +23,10 @@ def main(arguments: list[str]) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     name, *rest = arguments
     command = entry_points(group="trompe.commands")[name].load()
-    command.main(rest, prog_name=f"trompe {name}")
+    try:
+        command.main(rest, prog_name=f"trompe {name}")
+    except TrompeError as error:
+        sys.exit(f"Error: {error}")
 
 
 def _end_with_parent() -> None:

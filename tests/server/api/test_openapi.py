@@ -29,7 +29,9 @@ def operations(contract: Contract) -> list[tuple[str, str, Any]]:
 def test_the_documentation_works_without_any_other_host(api: Api, contract: Contract) -> None:
     page = api.get("/docs")
     assert "://" not in page.text
-    assert re.findall(r'<script[^>]* src="([^?]+)', page.text) == ["/static/docs.js"]
+    assert "<script" not in page.text
+    for path, method, _ in operations(contract):
+        assert f"<b>{method.upper()}</b> <code>{path}</code>" in page.text
     assert "script-src 'self'; style-src 'self'" in page.headers["content-security-policy"]
     assert contract["components"]["schemas"]["JobSpec"]["examples"][0]["object"] == "mug"
 

@@ -17,8 +17,6 @@ from trompe_shared.api import Accuracy, JobSpec
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
-__all__ = ["Images", "ReportData", "distinct_views"]
-
 Images = Mapping[str, NDArray[np.uint8]]
 """Target images (views, H, W, 3) of the ``own`` (attacked) and the ``held_out`` views."""
 

@@ -8,8 +8,6 @@ from trompe_shared.api import ADVERSARIAL
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D
 
-__all__ = ["model_files"]
-
 
 def model_files(painted: Object3D, name: str, original: tuple[bytes, str] | None) -> tuple[dict[str, bytes], list[str]]:
     """The painted object called ``name`` as SAILenv's zip, as GLB and in the format of its upload, by file name

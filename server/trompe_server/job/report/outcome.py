@@ -7,8 +7,6 @@ from trompe_server.job.report.data import ReportData
 from trompe_server.judging.metrics import fooled_as
 from trompe_shared.api import Accuracy, FooledAs
 
-__all__ = ["classes_of_fooled", "neighbour_warning"]
-
 NAMED: Final = 5
 """Neighbours named in the warning."""
 

@@ -26,8 +26,6 @@ from trompe_server.pictures import (
 from trompe_shared.engine import DEFAULT_ENGINE
 from trompe_shared.object3d import encode_png
 
-__all__ = ["picture_files", "saliency_views"]
-
 SHEET_VIEWS: Final = 12
 SALIENCY_VIEWS: Final = 6
 DIFFERENCE_VIEWS: Final = 4

@@ -31,8 +31,6 @@ from trompe_shared.api import (
     Visibility,
 )
 
-__all__ = ["result_of", "worst"]
-
 S = TypeVar("S")
 T = TypeVar("T")
 

@@ -10,8 +10,6 @@ from trompe_server.judging.transparency import faint_warnings
 from trompe_server.surrogate.fidelity import MAX_ERROR, MIN_EXPLAINED
 from trompe_shared.api import MOST_VIEWS, JobSpec
 
-__all__ = ["warnings_of"]
-
 POOR_VIEW: Final = 3.0 / 255
 NAMED_VIEWS: Final = 5
 LARGE_GAP: Final = 0.1
