@@ -253,7 +253,7 @@ def parse_mtl(text: str) -> dict[str, dict[str, str]]:
 
 def _moves(options: str) -> bool:
     """Whether the options of a map change its scale (``-s``, by default 1 1 1) or its place (``-o``, 0 0 0)."""
-    given = re.findall(r"-([so])((?:\s+[-+]?[\d.]+(?:e[-+]?\d+)?)+)", options.lower())
+    given = re.findall(r"-([so])((?:\s+[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:e[-+]?\d+)?)+)", options.lower())
     return any(float(number) != (flag == "s") for flag, numbers in given for number in numbers.split())
 
 

@@ -153,7 +153,7 @@ def _document(text: bytes) -> Document:
     ]:
         raise ObjectError(
             f"The glTF's materials {', '.join(older)[:200]} have their colours in KHR_materials_pbrSpecularGlossiness, "
-            "which glTF gave up; convert them to metallic-roughness, e.g. by `npx @gltf-transform/cli metalrough`."
+            "which is archived; convert them to metallic-roughness, e.g. by `npx @gltf-transform/cli metalrough`."
         )
     return document
 

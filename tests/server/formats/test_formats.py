@@ -94,6 +94,7 @@ def test_a_byte_order_mark_costs_no_first_line() -> None:
     ("options", "moved"),
     [
         pytest.param("-s 1.000 1.0 1 -o 0.0 0 0 -bm 2", False, id="the defaults"),
+        pytest.param("-s 1..2 1", False, id="no number"),
         pytest.param("-s 2 2 1", True, id="scaled"),
         pytest.param("-clamp on -o 0.25 0 0", True, id="moved"),
     ],
