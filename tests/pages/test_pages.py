@@ -326,7 +326,16 @@ def test_no_page_is_too_wide_cut_off_half_empty_or_moves_while_it_loads(
     context.set_default_timeout(LIMIT)
     context.add_init_script(SHIFTS)
     page = context.new_page()
-    for path in ("/", "/jobs", "/jobs/new", "/judgements/new", f"/jobs/{done}", "/experiments/tries", "/docs"):
+    for path in (
+        "/",
+        "/jobs",
+        "/jobs/new",
+        "/judgements/new",
+        f"/jobs/{done}",
+        "/experiments",
+        "/experiments/tries",
+        "/docs",
+    ):
         page.goto(service.url + path)
         page.wait_for_timeout(300)
         assert page.evaluate("document.documentElement.scrollWidth") <= width, path

@@ -11,6 +11,7 @@ import pytest
 
 from tests.served import wait_until, workers_of
 from tests.service.executors import NAME, Executed
+from trompe_server.executor import task
 from trompe_server.executor.attempts import MARK
 from trompe_server.executor.forks import Forks
 from trompe_server.executor.process import READY, Setup
@@ -59,7 +60,8 @@ def test_attempts_of_a_task_share_a_process_until_one_kills_it(
     assert new
     (idle,) = new
     os.kill(idle, signal.SIGKILL)
-    wait_until(lambda: not workers_of(os.getpid()))
+    (kept,) = task._kept.values()
+    wait_until(kept.poll)
     assert run("fine")[0] is None, "a process that died between two attempts is no loss"
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     _, other = run("fine")
