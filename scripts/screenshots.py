@@ -135,8 +135,8 @@ def shoot(page: Page, address: str, file: Path) -> None:
         turned = file.with_stem(f"{file.stem}-3d")
         page.locator("trompe-orbit").screenshot(path=turned)
         shrink(turned)
-    if page.locator("#turntable").count():
-        page.get_by_text("In the target renderer", exact=True).wait_for()
+    for caption in page.get_by_text("The target renderer is drawing it.").all():
+        caption.wait_for(state="hidden")
     page.wait_for_timeout(2000)
     page.evaluate("scrollTo(0, 0)")
     page.screenshot(path=file)

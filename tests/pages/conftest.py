@@ -1,11 +1,16 @@
 """A real service, and Debian's Chromium to look at it with."""
 
+import base64
+import io
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
+from PIL import Image
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, expect, sync_playwright
 
 from tests.served import Served
@@ -76,6 +81,13 @@ def drop(page: Page, file: Path) -> None:
         [file.name, list(file.read_bytes())],
     )
     page.dispatch_event("#drop", "drop", {"dataTransfer": transfer})
+
+
+def turntables(page: Page) -> list[NDArray[np.int16]]:
+    """Pixels (H, W, 3) of the pictures of objects on a form."""
+    shown = [canvas.evaluate("canvas => canvas.toDataURL()") for canvas in page.locator(".turntable canvas").all()]
+    pictures = [Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))) for data in shown]
+    return [np.asarray(picture.convert("RGB"), np.int16) for picture in pictures]
 
 
 def slowed(context: BrowserContext, page: Page, *, bytes_per_second: int) -> None:

@@ -1,6 +1,5 @@
 """What is large, on the pages: ten thousand jobs, two thousand views, an object of 30 MB."""
 
-import io
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,11 +9,10 @@ import numpy as np
 import pytest
 from bench.job_list import fill
 from bench.pages import served
-from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import BrowserContext, Page, expect
 
-from tests.pages.conftest import REPORTED, Service, slowed
+from tests.pages.conftest import REPORTED, Service, slowed, turntables
 from tests.pages.test_orbit import opened, pixels, turned
 from trompe_server.api.services import Services
 from trompe_server.formats import write_glb
@@ -138,15 +136,6 @@ def large(folder: Path) -> Path:
     return file
 
 
-def turntable(page: Page) -> NDArray[np.uint8]:
-    """Pixels of the turntable (H, W, 3)."""
-    data = page.evaluate(
-        """() => new Promise((done) => document.getElementById("turntable").toBlob(
-            async (picture) => done([...new Uint8Array(await picture.arrayBuffer())])))"""
-    )
-    return np.asarray(Image.open(io.BytesIO(bytes(data))).convert("RGB"))
-
-
 def test_an_object_of_30_megabytes_is_sent_with_its_progress_attacked_and_turned(
     service: Service, page: Page, context: BrowserContext, tmp_path: Path
 ) -> None:
@@ -162,7 +151,7 @@ def test_an_object_of_30_megabytes_is_sent_with_its_progress_attacked_and_turned
     assert [each for each in told if re.search(r"large.glb: [1-9]\d? % uploaded", each)]
     assert "large.glb: the server reads it" in told
     expect(page.locator(".turntable figcaption")).to_have_text("In the target renderer")
-    assert 500 < (turntable(page).min(axis=2) < 200).sum() < 40_000
+    assert 500 < (turntables(page)[0].min(axis=2) < 200).sum() < 40_000
 
     views = {"azimuths": 1, "elevations": 1, "held_out": 1, "surrogate": "diffuse"}
     job = service.finished(object=page.locator("[name=object]").input_value(), **views)

@@ -17,7 +17,7 @@ from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
 from playwright.sync_api import Browser, BrowserContext, Page, Response, Route, expect
 
-from tests.pages.conftest import LIMIT, REPORTED, Service, drop, slowed
+from tests.pages.conftest import LIMIT, REPORTED, Service, drop, slowed, turntables
 from trompe_shared.api import OPTIONS
 
 pytestmark = pytest.mark.timeout(1200)
@@ -258,6 +258,15 @@ def test_a_result_is_judged_with_the_form_and_its_page_is_shown(
     page.get_by_role("link", name="Judge the painted object").click()
     expect(page.locator("[name=after]")).to_have_value(f"job:{done}")
     expect(page.locator("[name=before]")).to_have_value("mug")
+    expect(page.get_by_text("In the target renderer", exact=True)).to_have_count(2)
+    first = turntables(page)
+    assert (np.abs(first[0] - first[1]) > 2).any(), "the painted object is another"
+    assert (np.abs(first[0] - first[1]) > 60).mean() < 0.01, "and stands at the same place"
+    page.locator("input[type=range]").last.fill("4")
+    turned = turntables(page)
+    assert (np.abs(turned[0] - first[0]) > 60).any(), "both turn together"
+    assert (np.abs(turned[0] - turned[1]) > 60).mean() < 0.01
+
     page.fill("[name=views]", "5000")
     page.get_by_role("button", name="Judge").click()
     expect(page.locator('[data-error="suite views seed epsilon"]')).to_contain_text("1000")
@@ -271,6 +280,37 @@ def test_a_result_is_judged_with_the_form_and_its_page_is_shown(
     expect(shown.get_by_role("cell", name="tiny").first).to_be_visible()
     page.goto(f"{service.url}/jobs")
     expect(page.get_by_role("link", name="judged beside mug").first).to_be_visible()
+
+
+def test_a_judgement_without_an_object_after_is_refused_beside_its_field(
+    service: Service, page: Page, faults: list[str]
+) -> None:
+    page.goto(f"{service.url}/judgements/new")
+    page.fill("[name=label]", "mug")
+    page.get_by_role("button", name="Judge").click()
+    expect(page.locator('[data-error="after"]')).to_be_visible()
+    faults.clear()  # browsers report answers of 422 on the console
+
+
+def test_the_picture_of_an_object_that_is_no_longer_chosen_is_not_shown(service: Service, page: Page) -> None:
+    page.goto(f"{service.url}/jobs/new")
+    drawn = page.get_by_text("In the target renderer", exact=True)
+    expect(drawn).to_be_visible()
+    held: list[Route] = []
+
+    def hold(route: Route) -> None:
+        held.append(route)
+
+    page.route("**/turntable/ball.png*", hold)
+    page.select_option("[name=object]", "ball")
+    page.select_option("[name=object]", "mug")
+    expect(drawn).to_be_visible()
+    (shown,) = turntables(page)
+    with page.expect_response("**/turntable/ball.png*"):
+        held[0].continue_()
+    page.wait_for_timeout(1000)
+    (kept,) = turntables(page)
+    assert (kept == shown).all()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -6,6 +6,7 @@ from trompe_server.api.services import Services
 from trompe_server.errors import ConflictError
 from trompe_server.judgement.suites import suite_of
 from trompe_server.library import Library
+from trompe_server.queue.store import JobStore
 from trompe_server.spec.checks import (
     check_gradients,
     check_keep,
@@ -21,6 +22,7 @@ from trompe_shared.api import (
     JOB_RESULT,
     BackgroundInfo,
     ClassifierInfo,
+    Job,
     JobSpec,
     JudgementRequest,
     ObjectInfo,
@@ -89,12 +91,18 @@ def _judged(reference: str, services: Services) -> ObjectInfo:
     """A stored object, or the painted object of a job, which is stored."""
     if not reference.startswith(JOB_RESULT):
         return services.library.object(reference)
-    job = services.store.get(reference.removeprefix(JOB_RESULT))
+    job, name = painted_archive(services.store, reference)
+    with services.artifacts(job.id).open(name) as painted:
+        return services.library.add_object(painted, name)
+
+
+def painted_archive(store: JobStore, reference: str) -> tuple[Job, str]:
+    """The job of a ``job:ID`` and the name of its painted object's archive. Raises ``ConflictError`` without one."""
+    job = store.get(reference.removeprefix(JOB_RESULT))
     name = next((each for each in job.artifacts if each.endswith(f"{ADVERSARIAL}.zip")), None)
     if name is None:
         raise ConflictError(f"Job {job.id} is {job.state} and has no painted object to judge.")
-    with services.artifacts(job.id).open(name) as painted:
-        return services.library.add_object(painted, name)
+    return job, name
 
 
 def _check_goal(spec: JobSpec, classifier: ClassifierInfo) -> None:

@@ -108,7 +108,6 @@ def new_job(request: Request, services: ServicesDep) -> HTMLResponse:
         fields=form_fields(),
         renderers=list(dict.fromkeys(each.identity for each in services.renderers() if each.identity)),
         presets={name: {"help": one.help, "options": in_parts(one.options)} for name, one in PRESETS.items()},
-        turns=TURNS,
     )
 
 
@@ -318,7 +317,7 @@ def _painted(job: Job) -> dict[str, Any]:
 
 
 def _choices(services: Services) -> dict[str, Any]:
-    """Stored objects and networks for a form."""
+    """What the forms choose from."""
     labels = {name: shipped.label for name, shipped in shipped_objects().items()}
     return {
         "objects": [
@@ -331,6 +330,7 @@ def _choices(services: Services) -> dict[str, Any]:
         ],
         "endings": ".zip,.glb,.gltf,.fbx,.ply,.stl,.obj",
         "formats": "GLB, FBX, PLY, STL, or a zip of an .obj or .gltf with its textures.",
+        "turns": TURNS,
     }
 
 

@@ -5,12 +5,13 @@ from typing import Final
 import numpy as np
 
 from trompe_server.api.services import Services
+from trompe_server.api.submission import painted_archive
 from trompe_server.spec.framing import framing_of
-from trompe_shared.api import ViewOptions
+from trompe_shared.api import JOB_RESULT, JobSpec, ViewOptions
 from trompe_shared.colours import colour_of
 from trompe_shared.errors import RendererError, SpecError
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import encode_png, load_object
+from trompe_shared.object3d import Object3D, encode_png, load_object
 from trompe_shared.sailenv_client import SailenvTarget
 
 TURNS: Final = 12
@@ -21,15 +22,15 @@ ELEVATION: Final = 25.0
 def turntable(
     services: Services, reference: str, *, background: str, distance: float | None, renderer: str = ""
 ) -> bytes:
-    """``TURNS`` pictures side by side as PNG. ``renderer``: identity of the engine; default: the first one's.
+    """``TURNS`` pictures side by side as PNG, of a stored object or of a job's painted one (``job:ID``).
 
-    Raises ``RendererError`` if no such renderer is up.
+    ``renderer``: identity of the engine; default: the first one's. Raises ``RendererError`` if no such renderer is up.
     """
     renderers = [each for each in services.renderers() if each.alive and renderer in ("", each.identity)]
     if not renderers:
         raise RendererError(f"No renderer worker {renderer} is up: start one with `trompe render`.")
-    obj = load_object(services.library.object_bytes(reference))
-    framing = framing_of(obj, ViewOptions(distance=distance), shipped=reference)
+    obj, source = _object(services, reference)
+    framing = framing_of(obj, ViewOptions(distance=distance), shipped=source)
     behind = colour_of(background)
     if behind is None:
         raise SpecError(f"The background {background!r} is not a colour; use white, black or #rrggbb.")
@@ -42,3 +43,12 @@ def turntable(
     finally:
         target.close()
     return encode_png(np.concatenate(list(images), axis=1))
+
+
+def _object(services: Services, reference: str) -> tuple[Object3D, str]:
+    """The object, and the stored one that it was."""
+    if not reference.startswith(JOB_RESULT):
+        return load_object(services.library.object_bytes(reference)), reference
+    job, name = painted_archive(services.store, reference)
+    source = job.spec.object if isinstance(job.spec, JobSpec) else ""
+    return load_object(services.artifacts(job.id).read(name)), source

@@ -1,6 +1,7 @@
 // The form of a new job: uploads at once, and shows the API's faults before anything is queued.
 import { ask } from "./common.js";
 import { complain, send, submits, upload } from "./form.js";
+import { Turntable } from "./turntable.js";
 
 const form = document.getElementById("new");
 const { object } = form.elements;
@@ -21,31 +22,17 @@ async function take(picked) {
   if (stored) await chosen();
 }
 
-// The turntable is one picture of all turns, side by side; the slider shows one of them.
-let turntable = null;
+const turntable = new Turntable(form.querySelector(".turntable"));
 async function chosen() {
   const known = object.selectedOptions[0]?.dataset.label;
   if (known && known !== label.value) {
     label.value = known;
     for (const more of [...form.querySelectorAll(`[name='${label.name}']`)].slice(1)) more.remove();
   }
-  const caption = document.querySelector(".turntable figcaption");
-  caption.textContent = "The target renderer is drawing it.";
-  const asked = new URLSearchParams({ background: option("views.background").value });
-  if (option("views.distance").value) asked.set("distance", option("views.distance").value);
-  if (option("views.renderers")) asked.set("renderer", option("views.renderers").value);
-  const answer = await fetch(`/jobs/turntable/${encodeURIComponent(object.value)}.png?${asked}`).catch(() => null);
-  turntable = answer?.ok ? await createImageBitmap(await answer.blob()) : null;
-  caption.textContent = turntable ? "In the target renderer" : `No picture: ${await reason(answer)}`;
-  turn();
-}
-
-const reason = async (answer) => (await answer?.json().catch(() => null))?.detail ?? "the server cannot be reached.";
-
-function turn() {
-  const canvas = document.getElementById("turntable"), side = turntable?.height ?? canvas.height;
-  Object.assign(canvas, { width: side, height: side });
-  if (turntable) canvas.getContext("2d").drawImage(turntable, -side * Number(document.getElementById("turn").value), 0);
+  const asked = { background: option("views.background").value };
+  if (option("views.distance").value) asked.distance = option("views.distance").value;
+  if (option("views.renderers")) asked.renderer = option("views.renderers").value;
+  await turntable.show(object.value, asked);
 }
 
 async function classes() {
@@ -108,7 +95,6 @@ document.getElementById("more-labels").onclick = (event) => {
   event.target.before(more);
   more.focus();
 };
-document.getElementById("turn").oninput = turn;
 form.addEventListener("input", (event) => {
   if (event.target.name === "paint.epsilon") form.elements["epsilon-says"].value = event.target.value;
 });

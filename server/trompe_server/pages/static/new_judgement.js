@@ -1,12 +1,29 @@
 // The form of a new judgement.
 import { submits, upload } from "./form.js";
+import { Turntable } from "./turntable.js";
 
 const { elements } = document.getElementById("new");
 
 for (const input of document.querySelectorAll("input[data-for]")) {
   const name = input.dataset.for, path = name === "networks" ? "/v1/classifiers" : "/v1/objects";
-  input.onchange = () => input.files[0] && upload(path, input.files[0], elements[name], name);
+  input.onchange = async () => {
+    if (input.files[0] && (await upload(path, input.files[0], elements[name], name))) elements[name].onchange?.();
+  };
 }
+
+// Both objects, turned together.
+const tables = [...document.querySelectorAll(".turntable")].map((figure) => new Turntable(figure));
+["before", "after"].forEach((name, index) => {
+  elements[name].onchange = () => elements[name].value && tables[index].show(elements[name].value);
+  elements[name].onchange();
+});
+for (const { slider } of tables)
+  slider.oninput = () => {
+    for (const table of tables) {
+      table.slider.value = slider.value;
+      table.turn();
+    }
+  };
 
 function request() {
   const given = (name) => elements[name].value;
