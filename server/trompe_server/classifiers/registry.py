@@ -16,12 +16,11 @@ reference                                classifier
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import torch
 
 from trompe_server.classifiers.contract import prepared
-from trompe_server.classifiers.exported import load_exported
 from trompe_server.classifiers.huggingface import huggingface_weights, load_huggingface
 from trompe_server.classifiers.network import NamedNetwork, NetworkClassifier
 from trompe_server.classifiers.onnx import load_onnx
@@ -32,6 +31,14 @@ from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, WEIGHTS, load_ti
 from trompe_server.classifiers.vision import load_torchvision, torchvision_weights
 from trompe_shared.errors import ClassifierError
 from trompe_shared.local_files import LOOKED_UP
+
+
+def load_exported(path: Path, **options: Any) -> NetworkClassifier:
+    """As ``exported.load_exported``. Importing ``torch.export`` takes as long as importing torch."""
+    from trompe_server.classifiers import exported
+
+    return exported.load_exported(path, **options)
+
 
 LOADERS: Final[Mapping[str, Callable[..., Classifier]]] = {".pt2": load_exported, ".onnx": load_onnx}
 """By the ending of the file."""

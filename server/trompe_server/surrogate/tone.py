@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
-from scipy.interpolate import make_smoothing_spline
 from torch import Tensor
 
 from trompe_server.surrogate.shading import GAIN, GAMMA, Chord, decode, decode_with_slope, encode, own_colours
@@ -239,6 +238,8 @@ def _encoded(light: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _smoothed(place: NDArray[np.float64], shown: NDArray[np.float64]) -> NDArray[np.float64]:
     """An ascending curve (NODES,) through one channel of the greys."""
+    from scipy.interpolate import make_smoothing_spline  # a third of a second, and few jobs need it
+
     levels, which = np.unique(place.round(6), return_inverse=True)
     mean = np.bincount(which, shown) / np.bincount(which)
     curve = make_smoothing_spline(levels, mean, lam=SMOOTHING)(np.linspace(0, 1, NODES))
