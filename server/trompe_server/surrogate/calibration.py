@@ -20,6 +20,7 @@ from trompe_server.surrogate.sampling import SamplingModel
 from trompe_server.surrogate.surrogate import (
     NO_BACKDROPS,
     Geometry,
+    Painted,
     Surrogate,
     curve_surrogate,
     diffuse_surrogate,
@@ -46,6 +47,9 @@ KEPT_BYTES: Final = 2**29
 
 KEPT_RASTERS: Final = 2
 """The best hypothesis and the one that is tried."""
+
+CPU: Final = torch.device("cpu")
+"""Device of the search."""
 
 Image8 = NDArray[np.uint8]
 Ask = Callable[[Object3D, Sequence[View]], Image8]
@@ -299,7 +303,7 @@ def build_surrogate(
 def _shaded(
     calibration: Calibration,
     geometry: Geometry,
-    obj: Object3D,
+    obj: Object3D | Painted,
     views: Sequence[View],
     clean: Image8,
     backdrops: Mapping[str, Image8],
@@ -422,6 +426,11 @@ class _Trial:
         difference = (self.again[changed].astype(np.float64) - self.clean[changed]) / 255
         return float(np.sqrt(np.square(difference).mean() / 2)) if len(difference) else 0.0
 
+    @cached_property
+    def painted(self) -> tuple[Painted, Painted]:
+        """The textures without and with the random repaint, for all hypotheses."""
+        return Painted(self.obj, CPU), Painted(self.repainted, CPU)
+
     def probe(self, grey: int) -> Image8:
         """Images of the trial views with the object painted in ``grey``."""
         if grey not in self.probes:
@@ -444,8 +453,9 @@ class _Trial:
         tone = self.tone if sampling.encoding == "measured" else None
         calibration = Calibration(model, "", sampling, greys, probes, nothing, 0, tone)
         geometry = replace(self._geometry(sampling), sampling=sampling)
-        surrogate = _shaded(calibration, geometry, self.obj, self.views, self.clean, self.backdrops)
-        return measure_fidelity(surrogate, self.obj, self.clean, self.repainted, self.images)
+        unpainted, repainted = self.painted
+        surrogate = _shaded(calibration, geometry, unpainted, self.views, self.clean, self.backdrops)
+        return measure_fidelity(surrogate, unpainted, self.clean, repainted, self.images)
 
     def _geometry(self, sampling: SamplingModel) -> Geometry:
         key = sampling.but(**{name: getattr(SamplingModel(), name) for name in (*_COLOURS, "kernel")})

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trompe_server.surrogate.surrogate import Surrogate, ViewBatch, textures_of
+from trompe_server.surrogate.surrogate import Painted, Surrogate, ViewBatch, painted
 from trompe_shared.object3d import Object3D
 
 MAX_ERROR: Final = 1.5 / 255
@@ -52,7 +52,7 @@ class Fidelity:
 
 
 def measure_fidelity(
-    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8
+    surrogate: Surrogate, obj: Object3D | Painted, clean: Image8, repainted: Object3D | Painted, images: Image8
 ) -> Fidelity:
     """Compare ``surrogate`` with the target's images (views, H, W, 3) of ``obj`` (clean) and of ``repainted``."""
     told = [fit for fit in compare_views(surrogate, obj, clean, repainted, images) if fit is not None]
@@ -77,7 +77,7 @@ class ViewFit(NamedTuple):
 
 
 def compare_views(
-    surrogate: Surrogate, obj: Object3D, clean: Image8, repainted: Object3D, images: Image8
+    surrogate: Surrogate, obj: Object3D | Painted, clean: Image8, repainted: Object3D | Painted, images: Image8
 ) -> list[ViewFit | None]:
     """The fidelity of each view; ``None`` if neither target nor prediction shows a change.
 
@@ -87,7 +87,7 @@ def compare_views(
     true = [torch.from_numpy(each).to(device) for each in (clean, images)]
     fits: list[ViewFit | None] = []
     with torch.no_grad():
-        texels = [surrogate.texels(textures_of(each, device=device)) for each in (obj, repainted)]
+        texels = [painted(each, device).texels(surrogate.geometry) for each in (obj, repainted)]
         for number, batch in enumerate(surrogate.geometry.batches):
             before, after = (surrogate.colours(each, number)[0] for each in texels)
             shown, repainted_shown = (batch.of(each) / 255 for each in true)

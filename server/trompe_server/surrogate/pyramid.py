@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import FunctionCtx
@@ -151,6 +151,41 @@ class MipChain:
                 part = _doubled(part, size, out=whole[strip.rows] if k == 0 else None)
                 part.view(-1, channels).index_add_(0, strip.texels, gradients[k].index_select(0, strip.which))
         return whole
+
+
+@dataclass(frozen=True)
+class StoredChain:
+    """The mip levels of one 8-bit texture, for many reads of different texels without a gradient.
+
+    first: level 0 as it is stored, (texels, 3) uint8. levels: the others, (texels, 3). table: value of each byte.
+    """
+
+    first: UInt8[Tensor, "texels 3"]
+    levels: tuple[Float[Tensor, "_ 3"], ...]
+    table: Float[Tensor, "256"]
+
+    @classmethod
+    def of(cls, texture: UInt8[Tensor, "H W 3"], table: Float[Tensor, "256"], *, rounded: bool) -> "StoredChain":
+        """The levels of ``read_texels``, of the values that ``table`` gives to the bytes of ``texture``."""
+        height, width = texture.shape[:2]
+        levels = []
+        if (height, width) != (1, 1):
+            tall = max(1, BAND_TEXELS // width) * 2 if height % 2 == 0 else height
+            bands = [table[texture[row : row + tall].int()] for row in range(0, height, tall)]
+            levels.append(torch.cat([_halved(band, rounded=rounded) for band in bands]))
+        while levels and levels[-1].shape[:2] != (1, 1):
+            levels.append(_halved(levels[-1], rounded=rounded))
+        return cls(texture.flatten(0, 1), tuple(level.flatten(0, 1) for level in levels), table)
+
+    def read(self, reads: Reads) -> list[Float[Tensor, "_ 3"]]:
+        """The texels ``reads`` of each level."""
+        coarser = [level.index_select(0, texels) for level, texels in zip(self.levels, reads[1:], strict=True)]
+        return [self.table[self.first.index_select(0, reads[0]).int()], *coarser]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes, without the texture itself."""
+        return sum(level.nbytes for level in self.levels)
 
 
 @dataclass(frozen=True)

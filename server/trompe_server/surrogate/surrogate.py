@@ -26,7 +26,7 @@ from torch.nn.functional import softshrink
 from trompe_server.surrogate.canvas import Canvas, canvas_of
 from trompe_server.surrogate.opacity import Opacities
 from trompe_server.surrogate.pixel_filter import KernelName, PixelFilter, kernel_of
-from trompe_server.surrogate.pyramid import MipChain, MipLayout, mip_chains, mip_layout, read_texels
+from trompe_server.surrogate.pyramid import MipChain, MipLayout, StoredChain, mip_chains, mip_layout, read_texels
 from trompe_server.surrogate.rasterize import Mesh, Visibility, mesh_of, project, rasterize
 from trompe_server.surrogate.sampling import FilteredGather, Gather, SamplingModel, Taps, fragments_of, taps_of
 from trompe_server.surrogate.shading import Chord, DiffuseShading, Shading, decode, encode, fit_curve, lambert
@@ -104,6 +104,37 @@ class Geometry:
     def nbytes(self) -> int:
         """Memory of the operators in bytes."""
         return sum(batch.gather.nbytes + batch.pixel.nbytes for batch in self.batches)
+
+
+KEPT_LEVELS: Final = 2**29
+"""Bytes of mip levels that ``Painted`` keeps beyond the last one asked for."""
+
+
+@dataclass(frozen=True)
+class Painted:
+    """The textures of an object, read by many hypotheses: their mip levels are averaged once for each way to do so."""
+
+    obj: Object3D
+    device: torch.device
+    stored: dict[tuple[str, bool], tuple[StoredChain, ...]] = field(default_factory=dict)
+    """Mip levels by the members of ``SamplingModel`` that change them, the last one used at the end."""
+
+    def texels(self, geometry: Geometry) -> Float[Tensor, "texels 3"]:
+        """``geometry.values`` of the textures, without a gradient."""
+        sampling = geometry.sampling
+        key = sampling.filtered, sampling.mips == "rounded" and sampling.filtered != "linear"
+        chains = self.stored.pop(key, None) or self._chains(geometry, *key)
+        self.stored[key] = chains
+        while len(self.stored) > 1 and sum(c.nbytes for each in self.stored.values() for c in each) > KEPT_LEVELS:
+            del self.stored[next(iter(self.stored))]
+        pairs = zip(chains, geometry.chains, strict=True)
+        return torch.cat([part for stored, chain in pairs for part in stored.read(chain.reads)])
+
+    def _chains(self, geometry: Geometry, filtered: str, rounded: bool) -> tuple[StoredChain, ...]:
+        table = torch.arange(256, device=self.device) / 255
+        table = decode(table) if filtered == "linear" else table
+        textures = [torch.from_numpy(self.obj.textures[name]).to(self.device) for name in geometry.textures]
+        return tuple(StoredChain.of(texture, table, rounded=rounded) for texture in textures)
 
 
 def prepare_geometry(
@@ -386,7 +417,7 @@ class Surrogate:
     @torch.no_grad()
     def images(self, obj: Object3D) -> UInt8[np.ndarray, "views H W 3"]:
         """Images of ``obj`` in 8 bits, as a target renders them."""
-        shown = self.render_all(self.texels(textures_of(obj, device=self.geometry.device)))
+        shown = self.render_all(Painted(obj, self.device).texels(self.geometry))
         images: UInt8[np.ndarray, "views H W 3"] = shown.mul(255).round().byte().permute(0, 2, 3, 1).cpu().numpy()
         return images
 
@@ -480,7 +511,7 @@ def _behind(geometry: Geometry, views: Sequence[View], backdrops: Mapping[str, I
 
 def curve_surrogate(
     geometry: Geometry,
-    obj: Object3D,
+    obj: Object3D | Painted,
     views: Sequence[View],
     clean: Image8,
     greys: Sequence[int],
@@ -498,7 +529,7 @@ def curve_surrogate(
     base = torch.from_numpy(clean).to(geometry.device)
     shown = [torch.from_numpy(probe).to(base.device) for probe in probes]
     uncovered = _behind(geometry, views, backdrops)
-    texels = geometry.values(textures_of(obj, device=base.device))
+    texels = painted(obj, geometry.device).texels(geometry)
     by_chord = geometry.sampling.slope == "chord" and len(greys) == 2
     shadings: list[Shading] = []
     for batch in geometry.batches:
@@ -553,6 +584,11 @@ def _anchored(plain: Surrogate, texels: Float[Tensor, "texels 3"]) -> Surrogate:
 
 SAME_LEVEL = 0.499 / 255
 """Largest distance of a prediction to the 8-bit value it rounds to."""
+
+
+def painted(obj: Object3D | Painted, device: torch.device) -> Painted:
+    """The textures of ``obj``, which may know them already."""
+    return obj if isinstance(obj, Painted) else Painted(obj, device)
 
 
 def textures_of(obj: Object3D, *, device: torch.device | str = "cpu") -> dict[str, Float[Tensor, "H W 3"]]:

@@ -8,7 +8,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from trompe_server.surrogate import Canvas, SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
+from trompe_server.surrogate import (
+    Canvas,
+    SamplingModel,
+    Surrogate,
+    diffuse_surrogate,
+    prepare_geometry,
+    pyramid,
+    textures_of,
+)
+from trompe_server.surrogate import surrogate as surrogate_module
+from trompe_server.surrogate.surrogate import Painted
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
 
@@ -89,3 +99,25 @@ def test_the_same_canvas_is_not_made_twice_and_another_is_made_for_other_texels(
     assert surrogate.canvas(textures, {name: mask.clone() for name, mask in masks.items()}) is first
     assert surrogate.canvas(textures, some_texels(obj, 0.9)) is not first
     assert surrogate.canvas(textures_of(obj), masks) is not first
+
+
+@pytest.mark.parametrize("band", [2**18, 16])
+def test_views_read_of_stored_levels_what_they_read_of_the_textures(
+    obj: Object3D, surrogate: Surrogate, band: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pyramid, "BAND_TEXELS", band)
+    expected, painted = surrogate.texels(textures_of(obj)), Painted(obj, surrogate.device)
+    torch.testing.assert_close(painted.texels(surrogate.geometry), expected, atol=1e-6, rtol=0)
+    again = prepare_geometry(obj, VIEWS[:1], size=(48, 48), sampling=surrogate.geometry.sampling)
+    torch.testing.assert_close(painted.texels(again), again.values(textures_of(obj)), atol=1e-6, rtol=0)
+
+
+def test_stored_levels_of_other_hypotheses_are_dropped_beyond_their_bytes(
+    obj: Object3D, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(surrogate_module, "KEPT_LEVELS", 0)
+    painted = Painted(obj, torch.device("cpu"))
+    for sampling in (*MODELS.values(), MODELS["encoded"]):
+        geometry = prepare_geometry(obj, VIEWS, size=(48, 48), sampling=sampling)
+        torch.testing.assert_close(painted.texels(geometry), geometry.values(textures_of(obj)), atol=1e-6, rtol=0)
+        assert len(painted.stored) == 1
