@@ -19,6 +19,7 @@ from trompe_server.surrogate import (
     prepare_geometry,
     textures_of,
 )
+from trompe_server.surrogate.blocks import repeated
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
@@ -64,7 +65,7 @@ def random_state(obj: Object3D, budget: Budget, seed: int) -> AttackState:
     wishes = {
         name: torch.empty_like(texture).uniform_(-1, 1, generator=generator) for name, texture in textures.items()
     }
-    return AttackState(0, {name: budget.project(wish, textures[name]) for name, wish in wishes.items()})
+    return AttackState(0, {name: budget.box(textures[name]).project(wish) for name, wish in wishes.items()})
 
 
 def steps_of(obj: Object3D, surrogate: Surrogate, **options: Any) -> list[Step]:
@@ -91,7 +92,8 @@ def objective_of(
 def mean_loss(obj: Object3D, surrogate: Surrogate, state: AttackState, goal: Goal | None = None) -> float:
     """Mean loss of a state over all views."""
     objective = objective_of(obj, surrogate, goal=goal)
-    return objective.score(objective.join(state.deltas)).loss
+    deltas = {name: repeated(state.deltas[name], texture.shape) for name, texture in objective.textures.items()}
+    return objective.score(objective.join(deltas)).loss
 
 
 def fooled_classifier() -> NetworkClassifier:

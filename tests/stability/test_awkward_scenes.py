@@ -13,6 +13,7 @@ from torch import Tensor
 from tests.fakes import FakeTarget, fake_classifier
 from trompe_server.attack import Budget, Goal, attack, saliency, start
 from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
+from trompe_server.surrogate.blocks import repeated
 from trompe_server.surrogate.calibration import CURVE_GREYS, Calibration, build_surrogate, calibrate, painted_grey
 from trompe_server.surrogate.fidelity import Fidelity
 from trompe_shared.errors import ObjectError, SpecError
@@ -75,7 +76,7 @@ def step_from(surrogate: Surrogate, obj: Object3D) -> dict[str, Tensor]:
         with pytest.raises(SpecError, match="No texel changes a pixel visibly"):
             step()
         return {}
-    return dict(step().deltas)
+    return {name: repeated(delta, textures[name].shape) for name, delta in step().deltas.items()}
 
 
 def check(obj: Object3D, views: Sequence[View], model: SamplingModel) -> None:

@@ -13,25 +13,26 @@ docs/library.md has the whole example, with a target renderer.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
 from trompe_server.attack.backgrounds import Backgrounds
-from trompe_server.attack.budget import Bound, Budget
+from trompe_server.attack.budget import Box, Budget
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Objective, Textures, members_of
-from trompe_server.attack.optimiser import OPTIMISERS, Box, Iterate, Memory
+from trompe_server.attack.optimiser import OPTIMISERS, Iterate, Memory
 from trompe_server.attack.perception import perceptual_bounds
 from trompe_server.attack.search import Search
 from trompe_server.attack.state import AttackState
-from trompe_server.attack.texels import TexelMasks, movable
+from trompe_server.attack.texels import TexelMasks, movable, moving_blocks
 from trompe_server.attack.view_budget import ViewBudget
 from trompe_server.classifiers import WhiteBoxClassifier
 from trompe_server.image_pipelines import ImagePipeline
 from trompe_server.surrogate import AnySurrogate
+from trompe_server.surrogate.blocks import halvings, means, whole
 from trompe_shared.api import OptimiserName
 from trompe_shared.errors import SpecError
 
@@ -94,7 +95,7 @@ def attack(
         raise SpecError(f"Unknown optimiser {optimiser!r}; choose one of {', '.join(OPTIMISERS)}.")
     members = members_of(classifier, goal)
     wanted = movable(surrogate, budget, masks) if texels is None else texels
-    moving = {name: mask.to(device) for name, mask in wanted.items()}
+    state, moving = _in_blocks(state, {name: mask.to(device) for name, mask in wanted.items()}, surrogate, budget)
     touched = {name: mask | state.deltas[name].any(2) for name, mask in moving.items()}
     objective = Objective(textures, surrogate, members, goal, masks, surrogate.canvas(textures, touched))
     search = Search(
@@ -102,14 +103,16 @@ def attack(
         total,
         seed,
         optimiser,
-        box=Box(budget, objective.source, _bound(objective, budget)),
+        box=_box(objective, state.deltas, budget),
         movable=objective.join(moving)[:, None].float().expand(-1, 3).contiguous(),  # booleans take seven times as long
-        view_budget=ViewBudget.of(objective, budget.epsilon_view) if budget.epsilon_view is not None else None,
+        view_budget=ViewBudget.of(objective, budget.epsilon_view, levels=budget.levels)
+        if budget.epsilon_view
+        else None,
         views_per_step=views_per_step,
         backgrounds=backgrounds,
         pipeline=pipeline,
     )
-    point = Iterate(objective.join(state.deltas), _joined(objective, state.memory))
+    point = Iterate(objective.join(state.deltas), _joined(objective, state))
     for step in range(state.step, state.step + steps):
         if search.finished(point):
             break
@@ -121,16 +124,35 @@ def attack(
     return AttackState(state.step + steps, objective.split(delta), _split(objective, point.memory))
 
 
-def _bound(objective: Objective, budget: Budget) -> Bound | None:
-    if not budget.perceptual:
-        return None
-    bounds = perceptual_bounds(objective.textures, objective.surrogate.footprint, epsilon=budget.epsilon)
-    return objective.join({name: bound[..., None] for name, bound in bounds.items()})
+def _in_blocks(
+    state: AttackState, texels: TexelMasks, surrogate: AnySurrogate, budget: Budget
+) -> tuple[AttackState, TexelMasks]:
+    """State and moving ``texels`` by block. The first step decides on the blocks; a bound on the images, which holds
+    for each saved texel, leaves the texels alone."""
+    if state.step:
+        counts = {name: halvings(state.deltas[name].shape, mask.shape) for name, mask in texels.items()}
+        return state, {name: whole(mask, counts[name]) for name, mask in texels.items()}
+    moving = texels if budget.epsilon_view is not None else moving_blocks(texels, surrogate.spare_levels)
+    deltas = {name: means(delta, halvings(moving[name].shape, delta.shape)) for name, delta in state.deltas.items()}
+    return replace(state, deltas=deltas), moving
 
 
-def _joined(objective: Objective, memory: Memory) -> Memory:
+def _box(objective: Objective, deltas: Textures, budget: Budget) -> Box:
+    """The budget's box around all textures, as one."""
+    low, high, bounds = {}, {}, {}
+    for name, texture in objective.textures.items():
+        size, bound = deltas[name].shape[:2], None
+        if budget.perceptual:
+            footprint = objective.surrogate.footprint[name]
+            bound = bounds[name] = perceptual_bounds(texture, size, footprint=footprint, epsilon=budget.epsilon)
+        box = budget.box(texture, halvings(size, texture.shape), bound=bound)
+        low[name], high[name] = box.low, box.high
+    return Box(budget, objective.join(low), objective.join(high), objective.join(bounds) if bounds else None)
+
+
+def _joined(objective: Objective, state: AttackState) -> Memory:
     """Memory per texel of all textures (texels of all, n) as memory of the texels that may move; the rest as it is."""
-    sizes = [texture.shape[:2] for texture in objective.textures.values()]
+    sizes = [delta.shape[:2] for delta in state.deltas.values()]
 
     def joined(value: Tensor) -> Tensor:
         if value.ndim != 2:
@@ -139,7 +161,7 @@ def _joined(objective: Objective, memory: Memory) -> Memory:
         tables = [part.view(*size, -1) for part, size in zip(parts, sizes, strict=True)]
         return objective.join(dict(zip(objective.textures, tables, strict=True)))
 
-    return {name: joined(value) for name, value in memory.items()}
+    return {name: joined(value) for name, value in state.memory.items()}
 
 
 def _split(objective: Objective, memory: Memory) -> Memory:

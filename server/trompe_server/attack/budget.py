@@ -12,12 +12,15 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from trompe_server.surrogate.blocks import common_change, halvings, repeated, rooms
 from trompe_shared.api import levels_within
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D
 
 Bound = Float[Tensor, "*texels 1"]
 """Largest change of each texel's channels, in whole 8-bit levels."""
+
+Change = Float[Tensor, "*texels 3"]
 
 HUE: Final = 1.0
 """Largest difference between the changes of a texel's channels, as a share of its bound."""
@@ -51,51 +54,60 @@ class Budget:
         """The largest change of an 8-bit channel."""
         return levels_within(self.epsilon)
 
-    def project(
-        self, delta: Float[Tensor, "*texels 3"], texture: Float[Tensor, "*texels 3"], bound: Bound | None = None
-    ) -> Tensor:
-        """The nearest change with ``|delta| <= epsilon`` and ``0 <= texture + delta <= 1``.
+    def box(self, texture: Float[Tensor, "H W 3"], count: int = 0, *, bound: Bound | None = None) -> "Box":
+        """The allowed changes of the texels of ``texture``, or of the means of its blocks of side ``2 ** count``.
 
-        With a ``bound`` of each texel: ``|delta| <= bound``, and channels of a texel at most ``HUE * bound`` apart.
+        bound: of each block, at most epsilon.
         """
-        return self._project_(delta.clone(), texture, bound)
+        whole = texture.new_full((texture.shape[0] >> count, texture.shape[1] >> count, 1), self.epsilon)
+        down, up = rooms(texture, whole if bound is None else bound, count)
+        return Box(self, -down, up, bound)
 
-    def _project_(self, delta: Tensor, texture: Tensor, bound: Bound | None) -> Tensor:
-        if bound is None:
-            return delta.clamp_(-self.epsilon, self.epsilon).add_(texture).clamp_(0, 1).sub_(texture)
-        low, high = torch.maximum(-bound, -texture), torch.minimum(bound, 1 - texture)
-        delta = torch.clamp(delta, low, high)
-        reach = HUE / 2 * bound
-        middle = (delta.amax(-1, keepdim=True) + delta.amin(-1, keepdim=True)) / 2
-        middle = middle.clamp(low.amax(-1, keepdim=True) - reach, high.amin(-1, keepdim=True) + reach)
-        return torch.clamp(torch.clamp(delta, middle - reach, middle + reach), low, high)
+    def quantise(self, delta: Float[Tensor, "h w 3"], texture: UInt8[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
+        """The 8-bit texture to save: ``texture`` changed by ``delta``, rounded, by at most epsilon.
 
-    def ascend(
-        self,
-        delta: Float[Tensor, "*texels 3"],
-        direction: Float[Tensor, "*texels 3"],
-        texture: Float[Tensor, "*texels 3"],
-        *,
-        scale: float = 1.0,
-        bound: Bound | None = None,
-    ) -> Tensor:
-        """One projected step of ``scale * alpha`` along the sign of ``direction``; texels with zero stay.
-
-        With a ``bound`` the step shrinks as the bound does.
+        delta: of each texel, or of the mean of each block of texels (``blocks``).
         """
-        step = scale * self.alpha if bound is None else bound * (scale * self.alpha / self.epsilon)
-        return self._project_(direction.sign().mul_(step).add_(delta), texture, bound)
+        count = halvings(delta.shape, texture.shape)
+        change = common_change(delta, texture.float() / 255) if count else delta
+        levels = (change * 255).round().clamp(-self.levels, self.levels).to(torch.int16)
+        return repeated(levels, texture.shape).add(texture).clamp_(0, 255).to(torch.uint8)
 
-    def quantise(self, delta: Float[Tensor, "H W 3"], texture: UInt8[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
-        """The 8-bit texture to save: ``texture + delta`` rounded, at most epsilon from ``texture``."""
-        change = (delta * 255).round().clamp(-self.levels, self.levels).to(torch.int16)
-        return (texture.to(torch.int16) + change).clamp(0, 255).to(torch.uint8)
-
-    def repaint(self, obj: Object3D, deltas: Mapping[str, Float[Tensor, "H W 3"]]) -> Object3D:
-        """``obj`` with textures changed by ``deltas``, in 8 bits."""
+    def repaint(self, obj: Object3D, deltas: Mapping[str, Float[Tensor, "h w 3"]]) -> Object3D:
+        """``obj`` with textures changed by ``deltas``, as for ``quantise``."""
         return obj.with_textures(
             {
                 name: self.quantise(delta.cpu(), torch.from_numpy(obj.textures[name])).numpy()
                 for name, delta in deltas.items()
             }
         )
+
+
+@dataclass(frozen=True)
+class Box:
+    """The allowed changes of texels or blocks, from ``low`` to ``high``, with zero among them.
+
+    bound: of a perceptual budget: channels are at most ``HUE`` of it apart, and steps shrink as it does.
+    """
+
+    budget: Budget
+    low: Change
+    high: Change
+    bound: Bound | None = None
+
+    def project(self, delta: Change) -> Change:
+        """The nearest allowed change."""
+        delta = torch.clamp(delta, self.low, self.high)
+        if self.bound is None:
+            return delta
+        reach = HUE / 2 * self.bound
+        middle = (delta.amax(-1, keepdim=True) + delta.amin(-1, keepdim=True)) / 2
+        middle = middle.clamp(self.low.amax(-1, keepdim=True) - reach, self.high.amin(-1, keepdim=True) + reach)
+        return torch.clamp(torch.clamp(delta, middle - reach, middle + reach), self.low, self.high)
+
+    def ascend(self, delta: Change, direction: Change, factor: float = 1.0) -> Change:
+        """``factor`` times alpha along the sign of ``direction``, projected; texels with zero stay."""
+        step = direction.sign().mul_(factor * self.budget.alpha)
+        if self.bound is not None:
+            step.mul_(self.bound / self.budget.epsilon)
+        return self.project(step.add_(delta))

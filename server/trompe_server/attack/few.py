@@ -23,6 +23,7 @@ from trompe_server.attack.texels import TexelMasks, backproject, best_texels, mo
 from trompe_server.classifiers import WhiteBoxClassifier
 from trompe_server.image_pipelines import ImagePipeline
 from trompe_server.surrogate import AnySurrogate
+from trompe_server.surrogate.blocks import repeated
 
 ROUNDS: Final = 2
 """Trial attacks."""
@@ -98,7 +99,8 @@ def few_texels(
 def _evaluate_all(objective: Objective, deltas: Textures) -> Evaluation:
     surrogate = objective.surrogate
     active = torch.ones(surrogate.n_views, dtype=torch.bool, device=objective.source.device)
-    return objective.evaluate(objective.join(deltas), range(len(surrogate.batches)), active)
+    tables = {name: repeated(deltas[name], texture.shape) for name, texture in objective.textures.items()}
+    return objective.evaluate(objective.join(tables), range(len(surrogate.batches)), active)
 
 
 def _scaled(gradient: Gradient) -> Gradient:

@@ -1,6 +1,7 @@
 """Loss and gradient of a change of the textures, over a surrogate's views.
 
-All textures are one flat tensor (texels, 3) here: the texels that may move, in the order of the surrogate's canvas.
+All textures are one flat tensor (texels, 3) here: the texels, or blocks of them, that may move, in the order of the
+surrogate's canvas.
 """
 
 from collections.abc import Mapping, Sequence

@@ -5,7 +5,7 @@
               The step falls linearly from 2 alpha to 0; a long run repeats this in rounds, each twice as long as the
               one before (Loshchilov and Hutter 2017, SGDR). The default
 
-Textures are one flat tensor (texels, 3). A texel without gradient does not move.
+Textures are one flat tensor (texels or blocks of them, 3). One without gradient does not move.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,7 +15,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from trompe_server.attack.budget import Bound, Budget
+from trompe_server.attack.budget import Box
 from trompe_server.attack.objective import Flat
 from trompe_shared.api import OptimiserName
 
@@ -35,19 +35,6 @@ class Iterate:
 
     delta: Flat
     memory: Memory
-
-
-@dataclass(frozen=True)
-class Box:
-    """The allowed changes: the budget around ``texture``; ``bound`` is that of a perceptual one."""
-
-    budget: Budget
-    texture: Flat
-    bound: Bound | None = None
-
-    def ascend(self, delta: Flat, direction: Flat, factor: float = 1.0) -> Flat:
-        """``factor`` times alpha along the sign of ``direction``, projected."""
-        return self.budget.ascend(delta, direction, self.texture, scale=factor, bound=self.bound)
 
 
 def step_factor(done: int, length: int) -> float:

@@ -5,7 +5,6 @@ Foley, 1980), and middle greys show more of it than black and white (the lightne
 """
 
 import math
-from collections.abc import Mapping
 from typing import Final
 
 import torch
@@ -27,22 +26,19 @@ STRONG: Final = 0.06
 
 
 def perceptual_bounds(
-    textures: Mapping[str, Float[Tensor, "H W 3"]], footprint: Mapping[str, float], *, epsilon: float
-) -> dict[str, Float[Tensor, "H W"]]:
+    texture: Float[Tensor, "H W 3"], size: tuple[int, ...], *, footprint: float, epsilon: float
+) -> Float[Tensor, "h w 1"]:
     """Largest change of each texel's channels: at most ``epsilon``, at least one 8-bit level, in whole levels.
 
-    textures: sRGB in [0, 1]. footprint: texels of each that a pixel reads.
+    texture: sRGB in [0, 1]. size: (h, w) of the table: that of the texture, or of its blocks of texels. footprint:
+    number of texels that a pixel reads.
     """
-    return {name: _bound(texture, footprint[name], epsilon) for name, texture in textures.items()}
-
-
-def _bound(texture: Float[Tensor, "H W 3"], footprint: float, epsilon: float) -> Float[Tensor, "H W"]:
-    size, halvings = texture.shape[:2], round(math.log(footprint, 4))
-    seen = [max(1, side >> halvings) for side in size]
+    halvings = round(math.log(footprint, 4))
+    seen = [max(1, side >> halvings) for side in texture.shape[:2]]
     luma = texture @ texture.new_tensor(LUMA)
     shown = F.interpolate(luma[None, None], seen, mode="area")
     share = (_masking(shown) * _tolerance(shown, epsilon)).clamp(max=1)
-    share = F.interpolate(share, size, mode="bilinear")[0, 0]
+    share = F.interpolate(share, list(size), mode="bilinear")[0, 0, ..., None]
     return (share * epsilon * 255 + 1e-4).floor().clamp(min=1) / 255
 
 

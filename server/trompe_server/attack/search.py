@@ -19,9 +19,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from trompe_server.attack.backgrounds import Backgrounds
+from trompe_server.attack.budget import Box
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Evaluation, Flat, Objective
-from trompe_server.attack.optimiser import OPTIMISERS, Box, Iterate, Memory, step_factor
+from trompe_server.attack.optimiser import OPTIMISERS, Iterate, Memory, step_factor
 from trompe_server.attack.view_budget import ViewBudget
 from trompe_server.image_pipelines import Drawn, ImagePipeline
 from trompe_shared.api import OptimiserName
@@ -146,7 +147,7 @@ class Search:
 
     def saved(self, delta: Flat) -> Flat:
         """``delta``, or the part of it that keeps the images within their bound once saved in 8 bits."""
-        return delta if self.view_budget is None else self.view_budget.saved(delta, levels=self.box.budget.levels)
+        return delta if self.view_budget is None else self.view_budget.saved(delta)
 
     def _no_worse(self, point: Iterate) -> Iterate:
         """The iterate, or no change if that fools more views."""

@@ -21,7 +21,8 @@ STEP: Final = "step"
 class AttackState:
     """Input of the next step.
 
-    deltas: change of each texture after ``step`` steps, in sRGB units of [0, 1]. memory: tensors of the search by name.
+    deltas: change of each texture after ``step`` steps, in sRGB units of [0, 1], or of the means of its blocks of
+    texels (``surrogate.blocks``), which the first step chooses. memory: tensors of the search by name.
     """
 
     step: int

@@ -13,11 +13,15 @@ from trompe_server.attack.budget import Budget
 from trompe_server.attack.objective import Textures
 from trompe_server.spec.checks import check_mask_size
 from trompe_server.surrogate import AnySurrogate
+from trompe_server.surrogate.blocks import most_halvings, whole
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D
 
 TexelMasks = Mapping[str, Bool[Tensor, "H W"]]
 ImageMaps = Float[Tensor, "views H W"] | Float[Tensor, "views H W 3"]
+
+CUT: Final = 0.01
+"""Largest share of the moving texels that may stay because their blocks contain fixed ones."""
 
 VISIBLE: Final = 4.0
 """Change of all views together, in 8-bit levels, from which a texel counts as visible."""
@@ -48,6 +52,21 @@ def movable(
     if not any(texels.any() for texels in found.values()):
         raise _nothing_visible(budget, masked=masks is not None, within=bool(within))
     return found
+
+
+def moving_blocks(texels: TexelMasks, spare_levels: Mapping[str, int]) -> TexelMasks:
+    """The moving ``texels`` in the largest square blocks that the surrogate's ``spare_levels`` allow.
+
+    A block moves if all its texels may. The blocks are smaller where more than a share ``CUT`` of the texels would stay
+    for that reason, down to single texels.
+    """
+    return {name: _blocks(mask, most_halvings(mask.shape, spare_levels[name])) for name, mask in texels.items()}
+
+
+def _blocks(mask: Bool[Tensor, "H W"], most: int) -> Bool[Tensor, "h w"]:
+    enough = (1 - CUT) * int(mask.sum())
+    found = ((count, whole(mask, count)) for count in range(most, 0, -1))
+    return next((blocks for count, blocks in found if int(blocks.sum()) * 4**count >= enough), mask)
 
 
 def _nothing_visible(budget: Budget, *, masked: bool, within: bool) -> SpecError:

@@ -46,7 +46,7 @@ from trompe_server.library import Library
 from trompe_server.pictures import heat_textures
 from trompe_server.renderers import TargetRenderer
 from trompe_server.storage.folders import Folder
-from trompe_server.surrogate import AnySurrogate, Surrogate, joined, textures_of
+from trompe_server.surrogate import AnySurrogate, Painted, Surrogate, joined, textures_of
 from trompe_server.surrogate.calibration import Calibration
 from trompe_shared.api import JobSpec, JobState, Progress
 from trompe_shared.geometry import View
@@ -64,6 +64,9 @@ SHARES: Final = {"prepare": 0.15, "calibrate": 0.25, "attack": 0.45, "judge": 0.
 """Parts of the progress bar by kind of phase."""
 
 DONE: Final = Progress(phase="judge", fraction=1.0)
+
+PREVIEWED: Final = 2**22
+"""Texels of an object with a preview after each phase of the attack. Twice as many have one after every second."""
 
 RECENT: Final = 10
 """Number of the latest steps that tell how long one takes."""
@@ -213,7 +216,8 @@ class TextureAttack:
         else:
             self.files.save_state(chunk + 1, after)
         if taken:
-            self._preview(after)
+            if chunk % -(-self.setup.obj.n_texels // PREVIEWED) == 0:
+                self._preview(after)
             queries = (self.setup.queries or 0) - asked
             self._counts["attack_steps"] += len(taken)
             self._counts["classifier_images"] += taken[-1].evaluations - int(before.memory.get(SHOWN, 0))
@@ -255,9 +259,8 @@ class TextureAttack:
         """Save a picture for spectators: the first view of the current texture, in surrogate and target."""
         setup, painted = self.setup, self.budget.repaint(self.setup.obj, state.deltas)
         first, surrogate = setup.renderers[0], self._surrogates[0]
-        texels = surrogate.texels(textures_of(painted, device=setup.device))
-        with torch.no_grad():
-            expected = surrogate.render(texels, 0)[0].permute(1, 2, 0).cpu().numpy()
+        texels = Painted(painted, surrogate.device).texels(surrogate.geometry)
+        expected = surrogate.render(texels, 0)[0].permute(1, 2, 0).cpu().numpy()
         shown = first.target.render(painted, first.shown(setup.views[:1]), size=setup.size)[0]
         self._counts["target_renders"] += 1
         picture = np.concatenate([(255 * expected).round().astype(np.uint8), shown], 1)

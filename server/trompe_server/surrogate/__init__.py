@@ -5,6 +5,7 @@ from trompe_server.surrogate.joint import AnyCanvas, AnySurrogate, JointSurrogat
 from trompe_server.surrogate.sampling import SamplingModel
 from trompe_server.surrogate.surrogate import (
     Geometry,
+    Painted,
     Surrogate,
     behind,
     curve_surrogate,
@@ -19,6 +20,7 @@ __all__ = [
     "Canvas",
     "Geometry",
     "JointSurrogate",
+    "Painted",
     "SamplingModel",
     "Surrogate",
     "behind",

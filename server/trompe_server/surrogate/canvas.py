@@ -1,12 +1,12 @@
 """The moving part of the textures as one flat tensor, and the texels that views read from it.
 
-No view sees most texels of a texture. The moving ones are kept in square tiles, in an order that puts the four texels
-averaged by the next mip level a quarter of the array apart: a level is the sum of four contiguous arrays, and the rest
-of the texture costs nothing.
+What moves are texels, or blocks of them. No view sees most texels of a texture. The moving ones are kept in square
+tiles, in an order that puts the four texels averaged by the next mip level a quarter of the array apart: a level is the
+sum of four contiguous arrays, and the rest of the texture costs nothing.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -15,7 +15,8 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import FunctionCtx
 
-from trompe_server.surrogate.pyramid import MipChain, round_level_
+from trompe_server.surrogate.blocks import halvings, means
+from trompe_server.surrogate.pyramid import MipChain, read_texels, round_level_
 from trompe_server.surrogate.shading import decode
 
 DEPTH = 3
@@ -25,16 +26,37 @@ the complete levels."""
 
 def canvas_of(
     textures: Sequence[Float[Tensor, "H W 3"]],
+    moving: Sequence[Bool[Tensor, "h w"]],
+    chains: Sequence[MipChain],
+    *,
+    linear: bool,
+    rounded: bool,
+) -> "Canvas":
+    """The tiles of ``textures`` (sRGB in [0, 1]) with a ``moving`` texel, or a moving block of texels (``blocks``).
+
+    linear: average in linear light instead of encoded values: the texels must move alone. Other arguments: as for
+    ``read_texels``.
+    """
+    counts = [halvings(mask.shape, texture.shape) for mask, texture in zip(moving, textures, strict=True)]
+    if not any(counts):
+        return _of_texels(textures, moving, chains, linear=linear, rounded=rounded)
+    if linear:
+        raise ValueError("the mean colour of a block does not tell its mean light: its texels must move alone")
+    texels = read_texels(textures, chains, rounded=rounded)
+    textures = [means(texture, count) for texture, count in zip(textures, counts, strict=True)]
+    chains = [chain.of_blocks(count) for chain, count in zip(chains, counts, strict=True)]
+    canvas = _of_texels(textures, moving, chains, linear=linear, rounded=rounded)
+    return replace(canvas, offset=texels - canvas.read(canvas.source))
+
+
+def _of_texels(
+    textures: Sequence[Float[Tensor, "H W 3"]],
     moving: Sequence[Bool[Tensor, "H W"]],
     chains: Sequence[MipChain],
     *,
     linear: bool,
     rounded: bool,
 ) -> "Canvas":
-    """The tiles of ``textures`` (sRGB in [0, 1]) with a ``moving`` texel.
-
-    linear: average in linear light instead of encoded values. Other arguments: as for ``read_texels``.
-    """
     sheets, source, texels = [], [], []
     for texture, mask, chain in zip(textures, moving, chains, strict=True):
         tiles = _Tiles.of(chain, mask)
@@ -51,6 +73,7 @@ class Canvas:
     """The texels that may move, (texels, 3) in an order of its own.
 
     source: their initial sRGB values. still: the initial texels read by views, sRGB or linear like the averages.
+    offset: added to the texels read: what blocks of texels lack of their texture, if any.
     """
 
     sheets: tuple["_Sheet", ...]
@@ -58,6 +81,7 @@ class Canvas:
     still: Float[Tensor, "reads 3"]
     linear: bool
     rounded: bool
+    offset: Float[Tensor, "reads 3"] | None = None
 
     @cached_property
     def counts(self) -> list[int]:
@@ -88,7 +112,7 @@ class Canvas:
         texels = self.still.clone()
         for sheet, part, reads in zip(self.sheets, torch.split(values, self.counts), self._split(texels), strict=True):
             sheet.read(part, reads, rounded=self.rounded)
-        return texels
+        return texels if self.offset is None else texels.add_(self.offset)
 
     def transpose(self, gradient: Float[Tensor, "reads 3"]) -> Float[Tensor, "texels 3"]:
         """Gradient of the canvas from the ``gradient`` of the texels read by views."""

@@ -89,7 +89,7 @@ class JointSurrogate:
         return torch.cat([part.texels(textures) for part in self._readers])
 
     def canvas(
-        self, textures: Mapping[str, Float[Tensor, "H W 3"]], moving: Mapping[str, Bool[Tensor, "H W"]]
+        self, textures: Mapping[str, Float[Tensor, "H W 3"]], moving: Mapping[str, Bool[Tensor, "h w"]]
     ) -> JointCanvas:
         """See ``Surrogate.canvas``."""
         return JointCanvas(tuple(part.canvas(textures, moving) for part in self._readers))
@@ -125,6 +125,11 @@ class JointSurrogate:
         """See ``Surrogate.footprint``: the geometric mean over the parts."""
         logs = [{name: math.log(size) for name, size in part.footprint.items()} for part in self.parts]
         return {name: math.exp(sum(each[name] for each in logs) / len(logs)) for name in self.textures}
+
+    @cached_property
+    def spare_levels(self) -> Mapping[str, int]:
+        """See ``Surrogate.spare_levels``: those of all parts."""
+        return {name: min(part.spare_levels[name] for part in self.parts) for name in self.textures}
 
     @cached_property
     def _readers(self) -> list[Surrogate]:

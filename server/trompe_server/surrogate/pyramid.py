@@ -87,6 +87,14 @@ class MipChain:
     sizes: tuple[tuple[int, int], ...]
     reads: tuple[Int[Tensor, " _"], ...]
 
+    def of_blocks(self, halvings: int) -> "MipChain":
+        """The chain of a texture stored coarser by ``halvings`` levels; finer reads become reads of its level 0."""
+        width, finest = self.sizes[halvings][1], []
+        for finer, level in zip(range(halvings, -1, -1), self.reads, strict=False):
+            row, column = level // (width << finer), level % (width << finer)
+            finest.append((row >> finer) * width + (column >> finer))
+        return MipChain(self.sizes[halvings:], (torch.cat(finest), *self.reads[halvings + 1 :]))
+
     @cached_property
     def banded(self) -> int:
         """Number of leading levels computed in bands: the large ones with even sides."""

@@ -39,6 +39,9 @@ Image8 = NDArray[np.uint8]
 
 NO_BACKDROPS: Final[Mapping[str, Image8]] = {}
 
+HARDLY: Final = 0.05
+"""Share of the reads of a texture, by weight, below which its finest mip levels are spare."""
+
 BATCH = 10
 """Views per operator: the fastest on CPUs (larger batches miss the caches)."""
 
@@ -384,9 +387,10 @@ class Surrogate:
         return self.geometry.values(textures)
 
     def canvas(
-        self, textures: Mapping[str, Float[Tensor, "H W 3"]], moving: Mapping[str, Bool[Tensor, "H W"]]
+        self, textures: Mapping[str, Float[Tensor, "H W 3"]], moving: Mapping[str, Bool[Tensor, "h w"]]
     ) -> Canvas:
-        """The tiles of ``textures`` with a ``moving`` texel; ``canvas.read`` is a cheaper ``texels``.
+        """The tiles of ``textures`` with a ``moving`` texel or block of texels; ``canvas.read`` is a cheaper
+        ``texels``.
 
         The last canvas is cached, because an attack asks for the same one every few steps.
         """
@@ -457,14 +461,31 @@ class Surrogate:
 
         A texture stored twice as finely has four times the footprint.
         """
-        geometry = self.geometry
-        by_level = iter(torch.split(self._read_weights()[:, 0], [len(level) for level in geometry.reads]))
         found = {}
-        for name, sizes in zip(geometry.textures, geometry.layout.sizes, strict=True):
-            weights = torch.stack([next(by_level).sum() for _ in sizes])
+        for (name, share), sizes in zip(self._level_shares.items(), self.geometry.layout.sizes, strict=True):
             texels = torch.tensor([math.log(sizes[0][0] * sizes[0][1] / (h * w)) for h, w in sizes])
-            found[name] = math.exp(float((weights.cpu() * texels).sum() / weights.sum().clamp(min=1e-9).cpu()))
+            found[name] = math.exp(float((share * texels).sum()))
         return found
+
+    @cached_property
+    def spare_levels(self) -> Mapping[str, int]:
+        """Finest mip levels of each texture that views hardly read: less than ``HARDLY`` of their reads, by weight.
+
+        None where the renderer averages light: the mean colour of texels does not tell their mean light.
+        """
+        if self.geometry.sampling.filtered == "linear":
+            return dict.fromkeys(self.textures, 0)
+        return {name: int((share.cumsum(0) < HARDLY).sum()) for name, share in self._level_shares.items()}
+
+    @cached_property
+    def _level_shares(self) -> Mapping[str, Float[Tensor, " levels"]]:
+        """Shares of each texture's mip levels in its reads, by weight; all of the finest for an unseen texture."""
+        geometry = self.geometry
+        by_level = iter(torch.split(self._read_weights()[:, 0].cpu(), [len(level) for level in geometry.reads]))
+        weights = [torch.stack([next(by_level).sum() for _ in sizes]) for sizes in geometry.layout.sizes]
+        finest = [torch.eye(1, len(each))[0] for each in weights]
+        shares = [each / each.sum() if each.any() else one for each, one in zip(weights, finest, strict=True)]
+        return dict(zip(geometry.textures, shares, strict=True))
 
     def spread(self, pixels: Float[Tensor, "pixels 3"], batch: int) -> Float[Tensor, "texels 3"]:
         """Weighted sums of a batch's ``pixels`` at each texel read: the transpose of the texels' gathering."""

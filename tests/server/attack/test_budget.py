@@ -29,11 +29,11 @@ def random_texture(seed: int) -> Tensor:
 @settings(max_examples=60)
 def test_a_projected_change_keeps_the_budget_and_the_colours_that_exist(budget: Budget, seed: int) -> None:
     texture = random_texture(seed)
-    delta = budget.project(random_tensor(seed + 1, low=-2, high=2), texture)
+    delta = budget.box(texture).project(random_tensor(seed + 1, low=-2, high=2))
     assert delta.abs().max() <= budget.epsilon + EPS
     assert (texture + delta).min() >= 0
     assert (texture + delta).max() <= 1
-    torch.testing.assert_close(budget.project(delta, texture), delta, atol=EPS, rtol=0)
+    torch.testing.assert_close(budget.box(texture).project(delta), delta, atol=EPS, rtol=0)
 
 
 @given(BUDGETS, SEEDS)
@@ -42,7 +42,7 @@ def test_the_projection_is_the_nearest_change_that_is_allowed(budget: Budget, se
     texture, wish = random_texture(seed), random_tensor(seed + 1, low=-2, high=2)
     low, high = (-texture).clamp(min=-budget.epsilon), (1 - texture).clamp(max=budget.epsilon)
     torch.testing.assert_close(
-        budget.project(wish, texture), torch.maximum(low, torch.minimum(high, wish)), atol=EPS, rtol=0
+        budget.box(texture).project(wish), torch.maximum(low, torch.minimum(high, wish)), atol=EPS, rtol=0
     )
 
 
@@ -53,7 +53,7 @@ def test_a_gradient_of_constant_sign_walks_straight_to_the_bound(budget: Budget,
     sign, delta = gradient.sign(), torch.zeros_like(texture)
     reach = torch.where(sign > 0, (1 - texture).clamp(max=budget.epsilon), texture.clamp(max=budget.epsilon))
     for step in range(1, steps + 1):
-        delta = budget.ascend(delta, gradient * step, texture)
+        delta = budget.box(texture).ascend(delta, gradient * step)
         expected = sign * torch.minimum(torch.tensor(step * budget.alpha), reach)
         torch.testing.assert_close(delta, expected, atol=step * EPS, rtol=0)
 
@@ -64,25 +64,25 @@ def test_a_perceptual_budget_bounds_each_texel_and_its_hue(epsilon: float, seed:
     texture, wish = random_texture(seed), random_tensor(seed + 1, low=-2, high=2)
     share = torch.empty(4, 5, 1).uniform_(0, 1, generator=torch.Generator().manual_seed(seed))
     budget, bound = Budget(epsilon, epsilon), (share * epsilon * 255).floor() / 255
-    delta = budget.project(wish, texture, bound)
+    delta = budget.box(texture, bound=bound).project(wish)
     assert (delta.abs() <= bound + EPS).all()
     assert -EPS <= (texture + delta).min() <= (texture + delta).max() <= 1 + EPS
     assert (delta.amax(-1) - delta.amin(-1) <= HUE * bound[..., 0] + EPS).all()
-    torch.testing.assert_close(budget.project(delta, texture, bound), delta, atol=EPS, rtol=0)
+    torch.testing.assert_close(budget.box(texture, bound=bound).project(delta), delta, atol=EPS, rtol=0)
     grey = wish[..., :1].expand(-1, -1, 3).clamp(-epsilon, epsilon)
     inside = ((texture + grey - 0.5).abs() <= 0.5).all(-1) & (grey.abs() <= bound).all(-1)
-    torch.testing.assert_close(budget.project(grey, texture, bound)[inside], grey[inside], atol=EPS, rtol=0)
+    torch.testing.assert_close(budget.box(texture, bound=bound).project(grey)[inside], grey[inside], atol=EPS, rtol=0)
 
 
 def test_a_perceptual_step_is_as_large_as_the_bound_allows() -> None:
     texture, bound = torch.full((1, 2, 3), 0.5), torch.tensor([[[0.1], [0.02]]])
-    delta = Budget(0.1, 0.05).ascend(torch.zeros(1, 2, 3), torch.ones(1, 2, 3), texture, bound=bound)
+    delta = Budget(0.1, 0.05).box(texture, bound=bound).ascend(torch.zeros(1, 2, 3), torch.ones(1, 2, 3))
     torch.testing.assert_close(delta[0, :, 0], torch.tensor([0.05, 0.01]))
 
 
 def test_texels_without_gradient_stay_where_they_are() -> None:
     texture, gradient = torch.full((1, 3, 3), 0.5), torch.tensor([[[0.0] * 3, [-0.0] * 3, [1e-30] * 3]])
-    delta = Budget(0.1, 0.1).ascend(torch.full((1, 3, 3), 0.02), gradient, texture)
+    delta = Budget(0.1, 0.1).box(texture).ascend(torch.full((1, 3, 3), 0.02), gradient)
     torch.testing.assert_close(delta[0, :, 0], torch.tensor([0.02, 0.02, 0.1]))
 
 
@@ -90,7 +90,7 @@ def test_texels_without_gradient_stay_where_they_are() -> None:
 @settings(max_examples=100)
 def test_the_texture_that_is_saved_keeps_the_budget_in_whole_levels(epsilon: float, seed: int) -> None:
     budget, texture = Budget(epsilon, epsilon), (random_texture(seed) * 255).round().byte()
-    delta = budget.project(random_tensor(seed + 1, low=-2, high=2), texture.float() / 255)
+    delta = budget.box(texture.float() / 255).project(random_tensor(seed + 1, low=-2, high=2))
     saved = budget.quantise(delta, texture)
     change = (saved.int() - texture.int()).abs()
     assert saved.dtype == torch.uint8

@@ -193,6 +193,50 @@ def test_a_picture_stored_at_four_sizes_is_attacked_alike() -> None:
     assert max(altered) - min(altered) < 0.01
 
 
+FRONT = [View(Camera(0.3, azimuth, 0)) for azimuth in (-40, 0, 40)]
+
+
+@pytest.fixture(scope="module")
+def fine_square(square: Object3D) -> Object3D:
+    """The square with a texture much finer than its views show, with black and white texels."""
+    image = np.random.default_rng(0).integers(-60, 316, (256, 256, 3)).clip(0, 255).astype(np.uint8)
+    return square.with_textures({"m0.png": image})
+
+
+@pytest.mark.parametrize("perceptual", [False, True])
+def test_texels_that_views_do_not_tell_apart_move_together_within_the_budget(
+    fine_square: Object3D, perceptual: bool
+) -> None:
+    surrogate, budget = surrogate_of(fine_square, FRONT), Budget(0.06, 0.02, perceptual=perceptual)
+    state = run(fine_square, surrogate, budget=budget)
+    side = 256 >> surrogate.spare_levels["m0.png"]
+    assert state.deltas["m0.png"].shape == (side, side, 3)
+    assert side < 256
+    painted = textures_of(budget.repaint(fine_square, state.deltas))
+    change = painted["m0.png"] - textures_of(fine_square)["m0.png"]
+    assert change.abs().max() <= 15 / 255 + EPS
+    seen = [surrogate.render_all(surrogate.texels(each)) for each in (painted, textures_of(fine_square))]
+    objective = objective_of(fine_square, surrogate)
+    before, after = (float(objective.goal.losses(fake_classifier().logits(each)).mean()) for each in reversed(seen))
+    assert after > before + 0.02
+    halfway = run(fine_square, surrogate, budget=budget, steps=2, total_steps=6)
+    assert same(run(fine_square, surrogate, budget=budget, steps=4, total_steps=6, state=halfway), state)
+
+
+def test_texels_that_may_not_all_move_or_whose_images_are_bounded_move_alone(fine_square: Object3D) -> None:
+    surrogate = surrogate_of(fine_square, FRONT)
+    bounded = run(fine_square, surrogate, budget=Budget(0.06, 0.02, epsilon_view=0.03), steps=1)
+    assert bounded.deltas["m0.png"].shape == (256, 256, 3)
+    left = {name: torch.zeros(image.shape[:2], dtype=torch.bool) for name, image in fine_square.textures.items()}
+    left["m0.png"][:, :128] = True
+    halves = run(fine_square, surrogate, texels=left, steps=1)
+    assert len(halves.deltas["m0.png"]) < 256
+    left["m0.png"][::2] = False
+    state = run(fine_square, surrogate, texels=left, steps=1)
+    assert state.deltas["m0.png"].shape == (256, 256, 3)
+    assert not state.deltas["m0.png"][~left["m0.png"]].any()
+
+
 def test_an_attack_without_a_visible_texel_ends_at_once(square: Object3D, surrogate: Surrogate) -> None:
     with pytest.raises(SpecError, match=r"epsilon=0.0001. Come closer by `distance`, or raise `epsilon`"):
         run(square, surrogate, budget=Budget(0.0001, 0.0001))
