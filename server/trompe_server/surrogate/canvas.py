@@ -8,6 +8,7 @@ sum of four contiguous arrays, and the rest of the texture costs nothing.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,7 +20,10 @@ from trompe_server.surrogate.blocks import halvings, means
 from trompe_server.surrogate.pyramid import MipChain, read_texels, round_level_
 from trompe_server.surrogate.shading import decode
 
-DEPTH = 3
+REACH: Final = 0.1
+"""Change of texels at which the light of their block is computed."""
+
+DEPTH: Final = 3
 """Tiles have sides of up to 2 ** DEPTH texels: larger ones contain more fixed texels, smaller ones leave more work to
 the complete levels."""
 
@@ -34,38 +38,43 @@ def canvas_of(
 ) -> "Canvas":
     """The tiles of ``textures`` (sRGB in [0, 1]) with a ``moving`` texel, or a moving block of texels (``blocks``).
 
-    linear: average in linear light instead of encoded values: the texels must move alone. Other arguments: as for
-    ``read_texels``.
+    linear: average in linear light instead of encoded values. Other arguments: as for ``read_texels``.
     """
-    counts = [halvings(mask.shape, texture.shape) for mask, texture in zip(moving, textures, strict=True)]
-    if not any(counts):
-        return _of_texels(textures, moving, chains, linear=linear, rounded=rounded)
-    if linear:
-        raise ValueError("the mean colour of a block does not tell its mean light: its texels must move alone")
-    texels = read_texels(textures, chains, rounded=rounded)
-    textures = [means(texture, count) for texture, count in zip(textures, counts, strict=True)]
-    chains = [chain.of_blocks(count) for chain, count in zip(chains, counts, strict=True)]
-    canvas = _of_texels(textures, moving, chains, linear=linear, rounded=rounded)
-    return replace(canvas, offset=texels - canvas.read(canvas.source))
-
-
-def _of_texels(
-    textures: Sequence[Float[Tensor, "H W 3"]],
-    moving: Sequence[Bool[Tensor, "H W"]],
-    chains: Sequence[MipChain],
-    *,
-    linear: bool,
-    rounded: bool,
-) -> "Canvas":
-    sheets, source, texels = [], [], []
+    sheets, source, texels, blocks = [], [], [], False
     for texture, mask, chain in zip(textures, moving, chains, strict=True):
-        tiles = _Tiles.of(chain, mask)
-        source.append(texture.flatten(0, 1).index_select(0, tiles.order))
-        texture = decode(texture) if linear else texture
-        found = tiles.fine.read(texture, rounded=rounded)
-        sheets.append(_Sheet(tiles, found[-1]))
+        count = halvings(mask.shape, texture.shape)
+        tiles, colour = _Tiles.of(chain.of_blocks(count), mask), means(texture, count)
+        source.append(colour.flatten(0, 1).index_select(0, tiles.order))
+        curve = _mean_light(texture, count) if linear and count else None
+        light = decode(texture) if linear else colour
+        found = tiles.fine.read(light if curve is None else curve[0], rounded=rounded)
+        sheets.append(_Sheet(tiles, found[-1], None if curve is None else curve.flatten(1, 2)[:, tiles.order]))
         texels += [*found[:-1], *(texture.new_zeros(len(level), 3) for level in tiles.coarse.reads)]
-    return Canvas(tuple(sheets), torch.cat(source), torch.cat(texels), linear, rounded)
+        blocks |= count > 0
+    canvas = Canvas(tuple(sheets), torch.cat(source), torch.cat(texels), linear, rounded)
+    if not blocks:
+        return canvas
+    whole = read_texels([decode(texture) for texture in textures] if linear else textures, chains, rounded=rounded)
+    return replace(canvas, offset=whole - canvas.read(canvas.source))
+
+
+def _mean_light(texture: Float[Tensor, "H W 3"], count: int) -> Float[Tensor, "5 h w 3"]:
+    """The mean light of each block, and the coefficients (linear, quadratic) of its parabolas for a darker and for a
+    brighter mean colour.
+
+    They are exact for no change, and for texels that all change by ``REACH`` or half of it as far as they stay in
+    [0, 1].
+    """
+    light, colour = means(decode(texture), count), means(texture, count)
+    found = [light]
+    for side in (-REACH, REACH):
+        half, full = ((texture + part * side).clamp(0, 1) for part in (0.5, 1))
+        near, far = means(half, count) - colour, means(full, count) - colour
+        slope, wider = ((means(decode(each), count) - light) for each in (half, full))
+        slope, wider = slope / torch.where(near == 0, 1, near), wider / torch.where(far == 0, 1, far)
+        bend = (wider - slope) / torch.where(near == far, 1, far - near)
+        found += [slope - near * bend, bend]
+    return torch.stack(found)
 
 
 @dataclass(frozen=True)
@@ -104,7 +113,12 @@ class Canvas:
 
     def read(self, values: Float[Tensor, "texels 3"]) -> Float[Tensor, "reads 3"]:
         """The texels read by views, as ``Surrogate.texels``, for canvas ``values`` (sRGB). Differentiable."""
-        texels: Tensor = _ReadCanvas.apply(decode(values) if self.linear else values, self)  # type: ignore[no-untyped-call]
+        if self.linear:
+            parts = zip(
+                self.sheets, torch.split(values, self.counts), torch.split(self.source, self.counts), strict=True
+            )
+            values = torch.cat([sheet.light(part, source) for sheet, part, source in parts])
+        texels: Tensor = _ReadCanvas.apply(values, self)  # type: ignore[no-untyped-call]
         return texels
 
     def forward(self, values: Float[Tensor, "texels 3"]) -> Float[Tensor, "reads 3"]:
@@ -201,10 +215,23 @@ def _hits(
 
 @dataclass(frozen=True)
 class _Sheet:
-    """The tiles of one texture, and its first complete level before anything moves."""
+    """The tiles of one texture, and its first complete level before anything moves.
+
+    curve: light of blocks of texels, as ``_mean_light``, if they are averaged in linear light.
+    """
 
     tiles: _Tiles
     around: Float[Tensor, "coarse 3"]
+    curve: Float[Tensor, "5 texels 3"] | None
+
+    def light(self, values: Float[Tensor, "texels 3"], source: Float[Tensor, "texels 3"]) -> Float[Tensor, "texels 3"]:
+        """Linear light of sRGB ``values`` in the place of ``source``. Differentiable."""
+        if self.curve is None:
+            return decode(values)
+        light, slope_down, bend_down, slope_up, bend_up = self.curve.unbind()
+        change = values - source
+        slope, bend = torch.where(change < 0, slope_down, slope_up), torch.where(change < 0, bend_down, bend_up)
+        return light + change * (slope + change * bend)
 
     def read(self, values: Float[Tensor, "texels 3"], reads: Float[Tensor, "reads 3"], *, rounded: bool) -> None:
         """Write the moving texels of each level into ``reads``."""

@@ -469,12 +469,7 @@ class Surrogate:
 
     @cached_property
     def spare_levels(self) -> Mapping[str, int]:
-        """Finest mip levels of each texture that views hardly read: less than ``HARDLY`` of their reads, by weight.
-
-        None where the renderer averages light: the mean colour of texels does not tell their mean light.
-        """
-        if self.geometry.sampling.filtered == "linear":
-            return dict.fromkeys(self.textures, 0)
+        """Finest mip levels of each texture that views hardly read: less than ``HARDLY`` of their reads, by weight."""
         return {name: int((share.cumsum(0) < HARDLY).sum()) for name, share in self._level_shares.items()}
 
     @cached_property

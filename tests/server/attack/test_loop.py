@@ -1,7 +1,7 @@
 """The attack loop on a small scene: ascent, budget, resumption, skipped views, safe margin, odd classifiers."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -204,10 +204,12 @@ def fine_square(square: Object3D) -> Object3D:
 
 
 @pytest.mark.parametrize("perceptual", [False, True])
+@pytest.mark.parametrize("filtered", ["encoded", "linear"])
 def test_texels_that_views_do_not_tell_apart_move_together_within_the_budget(
-    fine_square: Object3D, perceptual: bool
+    fine_square: Object3D, filtered: Literal["encoded", "linear"], perceptual: bool
 ) -> None:
-    surrogate, budget = surrogate_of(fine_square, FRONT), Budget(0.06, 0.02, perceptual=perceptual)
+    surrogate = surrogate_of(fine_square, FRONT, sampling=SamplingModel(filtered=filtered))
+    budget = Budget(0.06, 0.02, perceptual=perceptual)
     state = run(fine_square, surrogate, budget=budget)
     side = 256 >> surrogate.spare_levels["m0.png"]
     assert state.deltas["m0.png"].shape == (side, side, 3)

@@ -113,19 +113,16 @@ def test_the_mip_levels_that_views_hardly_read_are_spare(fine: Object3D) -> None
     assert joined([surrogate, surrogate_of(fine, bias=-2.0)]).spare_levels[names[0]] == spare - 2
 
 
-def test_none_is_spare_where_light_is_averaged(fine: Object3D) -> None:
-    assert set(surrogate_of(fine, filtered="linear").spare_levels.values()) == {0}
-    blocks = {name: torch.ones(4, 4, dtype=torch.bool) for name in fine.textures}
-    with pytest.raises(ValueError, match="texels must move alone"):
-        surrogate_of(fine, filtered="linear").canvas(textures_of(fine), blocks)
-
-
-@pytest.mark.parametrize(("mips", "error"), [("exact", 1e-6), ("rounded", 1.01 / 255)])
+@pytest.mark.parametrize(
+    ("sampling", "error"),
+    [({}, 1e-6), ({"mips": "rounded"}, 1.01 / 255), ({"filtered": "linear"}, 0.5 / 255)],
+    ids=["encoded", "rounded", "linear"],
+)
 @pytest.mark.parametrize("share", [0.1, 1.0])
 def test_views_read_of_moved_blocks_what_they_read_of_their_moved_texels(
-    fine: Object3D, mips: str, error: float, share: float
+    fine: Object3D, sampling: dict[str, str], error: float, share: float
 ) -> None:
-    surrogate, textures = surrogate_of(fine, mips=mips), textures_of(fine)
+    surrogate, textures = surrogate_of(fine, **sampling), textures_of(fine)
     generator = torch.Generator().manual_seed(1)
     moving = {
         name: torch.rand(surrogate.geometry.layout.sizes[k][min(2, 2 * (1 - k))], generator=generator) < share
@@ -137,3 +134,23 @@ def test_views_read_of_moved_blocks_what_they_read_of_their_moved_texels(
     tables = dict(zip(surrogate.geometry.textures, canvas.split(change), strict=True))
     painted = {name: texture + repeated(tables[name], texture.shape) for name, texture in textures.items()}
     torch.testing.assert_close(canvas.read(canvas.source + change), surrogate.texels(painted), atol=error, rtol=0)
+
+
+@pytest.mark.parametrize("bound", [0.02, 0.05, 0.1])
+def test_the_light_of_blocks_is_that_of_their_texels_as_far_as_these_have_room(fine: Object3D, bound: float) -> None:
+    random = np.random.default_rng(1)
+    images = [random.integers(-200, 456, (256, 256, 3)).clip(0, 255).astype(np.uint8) for _ in range(2)]
+    images[0][:64], images[0][64:128] = 0, 255
+    obj = fine.with_textures(dict(zip(sorted(fine.textures), images, strict=True)))
+    surrogate, textures = surrogate_of(obj, filtered="linear"), textures_of(obj)
+    canvas = surrogate.canvas(textures, {name: torch.ones(64, 64, dtype=torch.bool) for name in textures})
+    generator, changes, painted = torch.Generator().manual_seed(2), {}, {}
+    for name, texture in textures.items():
+        down, up = rooms(texture, torch.full((64, 64, 1), bound), 2)
+        changes[name] = torch.where(torch.rand(down.shape, generator=generator) < 0.5, -down, up)
+        common = common_change(changes[name], torch.from_numpy(obj.textures[name]))
+        painted[name] = (texture + repeated(common, texture.shape)).clamp(0, 1)
+    values = canvas.source + canvas.join([changes[name] for name in surrogate.geometry.textures])
+    seen, true = canvas.read(values), surrogate.texels(painted)
+    assert (true - surrogate.texels(textures)).abs().max() > 0.3 * bound
+    torch.testing.assert_close(seen, true, atol=0.002, rtol=0)
