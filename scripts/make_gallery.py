@@ -1,18 +1,23 @@
-"""Make the start page's example: a job on a shipped object, and some of its target images.
+"""Make the example of the start page and the README: a job on a shipped object, and some of its target images.
 
     python -m scripts.make_gallery --classifier mobilenet_v2.pt2
 
-writes server/trompe_server/pages/gallery.json and static/gallery/*.png beside it. The classes' names are read from
-imagenet_classes.json beside the classifier.
+writes server/trompe_server/pages/gallery.json and static/gallery/*.png beside it, docs/images/teapot.png and
+docs/bench/teapot.csv. The classes' names are read from imagenet_classes.json beside the classifier.
 """
 
 import argparse
+import csv
+import io
 import json
 import tempfile
 from pathlib import Path
 from typing import Final
 
-from trompe_server.job.texture_attack import open_job
+from PIL import Image
+
+from trompe_experiments.in_process import run_job
+from trompe_experiments.table import ResultRow, RowId
 from trompe_server.library import Library
 from trompe_server.pages.pictures import Kind, Pictures
 from trompe_server.pages.present import command, viewer_record
@@ -20,10 +25,16 @@ from trompe_server.renderers import local_renderer
 from trompe_server.storage.folders import LocalArtifacts
 from trompe_shared.api import ClassifierInfo, JobSpec, Result
 
-PAGES: Final = Path(__file__).parents[1] / "server" / "trompe_server" / "pages"
+ROOT: Final = Path(__file__).parents[1]
+PAGES: Final = ROOT / "server" / "trompe_server" / "pages"
 OBJECT: Final = "teapot"
 SHOWN: Final = 8
 KINDS: Final[tuple[Kind, ...]] = ("before", "after", "difference")
+COLUMNS: Final = (
+    *("object", "label", "classifier", "epsilon", "alpha", "seed", "steps_taken", "pool", "held_out_views"),
+    *(f"{judge}_a_{what}" for judge in ("surrogate", "target", "held_out") for what in ("before", "after", "drop")),
+    *("texels_altered", "mean_texel_change", "ssim", "delta_e", "probe_renders", "evaluations"),
+)
 
 
 def main() -> None:
@@ -31,26 +42,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--classifier", type=Path, required=True, help="a .pt2 file that knows ImageNet's classes")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        library, artifacts = Library(Path(folder) / "library"), LocalArtifacts(Path(folder) / "job")
-        names = json.loads(options.classifier.with_name("imagenet_classes.json").read_bytes())
-        with options.classifier.open("rb") as file:
-            classifier = library.add_classifier(file, options.classifier.name, classes=names)
-        run(JobSpec.of(OBJECT, label=OBJECT, classifier=classifier.id), artifacts, library)
-        write(Result.model_validate_json(artifacts.read("result.json")), artifacts, classifier)
+    names = json.loads(options.classifier.with_name("imagenet_classes.json").read_bytes())
+    with tempfile.TemporaryDirectory() as name, local_renderer() as target, options.classifier.open("rb") as file:
+        folder = Path(name)
+        classifier = Library(folder / "library").add_classifier(file, options.classifier.name, classes=names)
+        spec = JobSpec.of(OBJECT, label=OBJECT, classifier=classifier.id)
+        result, artifacts = run_job(spec, target, folder).result, LocalArtifacts(folder / "job")
+        write_gallery(result, artifacts, classifier)
+        write_readme(result, artifacts)
 
 
-def run(spec: JobSpec, artifacts: LocalArtifacts, library: Library) -> None:
-    """The job, from beginning to end."""
-    with local_renderer() as target:
-        job = open_job(spec, library=library, artifacts=artifacts, target=target)
-        for phase in job.phases():
-            print(phase)
-            if job.run(phase, lambda _: None).state is not None:
-                break
+def write_readme(result: Result, artifacts: LocalArtifacts) -> None:
+    """The README's picture, the upper half of the contact sheet, and the row with its figures."""
+    sheet = Image.open(io.BytesIO(artifacts.read("contact_sheet.png")))
+    sheet.crop((0, 0, sheet.width, sheet.height // 2)).save(ROOT / "docs" / "images" / f"{OBJECT}.png")
+    row = ResultRow.of_result(RowId(experiment="gallery", key=OBJECT), result, state="succeeded").model_dump()
+    with (ROOT / "docs" / "bench" / f"{OBJECT}.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerow({name: round(cell, 4) if isinstance(cell, float) else cell for name, cell in row.items()})
 
 
-def write(result: Result, artifacts: LocalArtifacts, classifier: ClassifierInfo) -> None:
+def write_gallery(result: Result, artifacts: LocalArtifacts, classifier: ClassifierInfo) -> None:
     """What the start page shows: held-out views, evenly around the object, whatever became of them."""
     held_out, classes = result.held_out, classifier.classes
     assert held_out is not None
