@@ -64,8 +64,8 @@ def test_an_attacked_object_gets_the_figures_of_its_job(
         assert found.a_drop is not None
         assert found.a_drop_interval is not None
         assert job.a_drop_interval is not None
-        assert max(found.a_drop_interval[0], job.a_drop_interval[0]) <= min(found.a_drop, job.a_drop)
-        assert min(found.a_drop_interval[1], job.a_drop_interval[1]) >= max(found.a_drop, job.a_drop)
+        (low, high), (own_low, own_high) = found.a_drop_interval, job.a_drop_interval
+        assert max(low, own_low) <= min(high, own_high)
         (texture,) = manifest.textures
         assert texture.texels_altered == run.result.texels_altered
         assert texture.max_levels <= 0.15 * 255
