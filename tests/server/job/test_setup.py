@@ -19,7 +19,7 @@ from trompe_server.library import Library
 from trompe_server.renderers import BackdropTarget, SailenvTarget
 from trompe_shared.errors import ClassifierError, LabelError, SpecError
 from trompe_shared.geometry import Camera, View
-from trompe_shared.object3d import Object3D, encode_png, load_object
+from trompe_shared.object3d import Object3D, encode_png
 from trompe_shared.shipped import shipped_objects
 
 WOOD = "chair_wood_AlbedoTransparency.png"
