@@ -52,7 +52,7 @@ FAKE: Final = EngineInfo("fake", "1")
 class FakeTarget:
     """Splats about ``points`` surface points under Lambert's law: no shadows, filters or specular light."""
 
-    points: int = 60_000
+    points: int = 20_000
     engine: EngineInfo = FAKE
 
     def render(

@@ -19,6 +19,11 @@ from trompe_server.storage.arrays import unpack_arrays
 from trompe_shared.api import JobSpec, Progress, Result
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, load_object
+from trompe_shared.shipped import shipped_objects
+
+_LARGE: Final = load_object(shipped_objects()["chair"].read())
+CHAIR: Final = _LARGE.with_textures({name: image[::4, ::4] for name, image in _LARGE.textures.items()})
+"""The shipped chair with textures of 128 x 128 texels: on its own of 512 x 512, most of a small job is texel work."""
 
 SMALL_JOB: Final[dict[str, Any]] = {
     "object": "chair",
@@ -90,6 +95,13 @@ class Run:
         for phase, report in self.reports.items():
             counts.update(report.counts if phase.startswith(kind) else {})
         return counts
+
+
+class SmallLibrary(Library):
+    """A library with ``CHAIR`` in place of the shipped chair."""
+
+    def object_bytes(self, reference: str) -> bytes:
+        return CHAIR.to_zip() if reference == "chair" else super().object_bytes(reference)
 
 
 class DarkTarget(FakeTarget):

@@ -15,7 +15,7 @@ from trompe_shared.object3d import Object3D, pack_zip
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl paint\nf 1/1 2/2 3/3\n"
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def triangle_zip() -> Callable[..., bytes]:
     """Makes the archive of a valid object, one textured triangle of a colour."""
     return _triangle_zip

@@ -2,7 +2,9 @@
 
 import asyncio
 import json
+import shutil
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -110,15 +112,33 @@ def settings(tmp_path: Path) -> Settings:
     return Settings(data=tmp_path, max_upload=100_000)
 
 
+@pytest.fixture(scope="session")
+def template(tmp_path_factory: pytest.TempPathFactory, triangle_zip: Callable[..., bytes]) -> Path:
+    """A service's data with an object and a classifier with class names, for copies: to make it takes seconds."""
+    settings = Settings(data=tmp_path_factory.mktemp("template"))
+    JobStore(settings.database_url).migrate()
+    with _running(settings, []) as api:
+        assert api.upload_object(triangle_zip()).status_code == 201
+        assert api.upload_classifier(b"W", classes=json.dumps(CLASSES)).status_code == 201
+    return settings.data
+
+
 @pytest.fixture
-def api(settings: Settings, missing: list[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Api]:
+def api(settings: Settings, missing: list[str], monkeypatch: pytest.MonkeyPatch, template: Path) -> Iterator[Api]:
     """An API whose classifiers are read by their first byte: b"W" is white box, b"B" is not, others are broken.
 
     What it knows of tokens is never older than the request.
     """
     monkeypatch.setattr(guard, "FRESH", -1.0)
+    for file in template.glob("*.sqlite*"):
+        shutil.copy(file, settings.data)
+    with _running(settings, missing) as api:
+        yield api
+
+
+@contextmanager
+def _running(settings: Settings, missing: list[str]) -> Iterator[Api]:
     store, files = JobStore(settings.database_url), open_folder(settings.store_url)
-    store.migrate()
     renderers = [RendererInfo(address="127.0.0.1:8085", alive=True)]
     library = Library(files.within("library"), inspect=_inspect)
     yield Api(Services(settings, library, store, files, Tokens(store.engine), lambda: renderers, lambda: missing))
@@ -126,10 +146,9 @@ def api(settings: Settings, missing: list[str], monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.fixture
-def stocked(api: Api, triangle_zip: Callable[..., bytes]) -> Api:
+def stocked(api: Api, template: Path) -> Api:
     """An API with an object and a classifier with class names."""
-    assert api.upload_object(triangle_zip()).status_code == 201
-    assert api.upload_classifier(b"W", classes=json.dumps(CLASSES)).status_code == 201
+    shutil.copytree(template / "library", api.services.settings.data / "library", dirs_exist_ok=True)
     return api
 
 

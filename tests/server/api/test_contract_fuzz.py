@@ -54,10 +54,18 @@ def test_nothing_that_is_sent_is_a_server_error(stocked: Api, right: Right | Non
         stocked.headers = stocked.token("fuzz", right)
     schema = schema_of(stocked)
     seen = set()
-    for found in schema.get_all_operations():
-        seen |= fuzz(found.ok(), stocked, mode)
+    for operation in (found.ok() for found in schema.get_all_operations()):
+        if mode is GenerationMode.POSITIVE or can_be_wrong(operation):
+            seen |= fuzz(operation, stocked, mode)
     assert ({200, 404} if mode is GenerationMode.POSITIVE else {422}) <= seen
     assert (403 in seen) == (right is Right.read)
+
+
+def can_be_wrong(operation: Any) -> bool:
+    """Whether it takes more than plain text, of which none is wrong: the search for one is long."""
+    raw = operation.definition.raw
+    schemas = [each["schema"] for each in raw.get("parameters", [])]
+    return "requestBody" in raw or any(schema.get("type") != "string" for schema in schemas)
 
 
 def fuzz(operation: Any, api: Api, mode: GenerationMode) -> set[int]:
@@ -67,7 +75,7 @@ def fuzz(operation: Any, api: Api, mode: GenerationMode) -> set[int]:
     api.end(job, JobState.succeeded, result__json=RESULT, digits__txt=b"0123456789")
 
     @settings(
-        max_examples=20 if mode is GenerationMode.POSITIVE else 8,
+        max_examples=12 if mode is GenerationMode.POSITIVE else 8,
         derandomize=True,
         database=None,
         suppress_health_check=list(HealthCheck),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.job_runs import SmallLibrary
 from trompe_server.library import Library
 from trompe_server.surrogate import SamplingModel
 from trompe_server.surrogate.calibration import find_physics, find_sampling
@@ -13,7 +14,7 @@ from trompe_server.surrogate.calibration import find_physics, find_sampling
 
 @pytest.fixture(scope="session")
 def library(tmp_path_factory: pytest.TempPathFactory) -> Library:
-    return Library(tmp_path_factory.mktemp("library"))
+    return SmallLibrary(tmp_path_factory.mktemp("library"))
 
 
 @pytest.fixture(scope="session")

@@ -7,17 +7,16 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from tests.job_runs import MemoryArtifacts, run_job, spec_of
+from tests.job_runs import CHAIR, MemoryArtifacts, run_job, spec_of
 from tests.scores_only import Scores
 from trompe_server.classifiers import load_classifier
 from trompe_server.image_pipelines import SUITE
 from trompe_server.library import Library
 from trompe_server.storage.arrays import unpack_arrays
 from trompe_shared.api import JobSpec, Result
-from trompe_shared.object3d import encode_png, load_object
+from trompe_shared.object3d import encode_png
 from trompe_shared.shipped import shipped_objects
 
-CHAIR = load_object(shipped_objects()["chair"].read())
 WOOD, CUSHION = "chair_wood_AlbedoTransparency.png", "chair_cushion_AlbedoTransparency.png"
 CLASSES = sorted({shipped.label for shipped in shipped_objects().values()})
 without_pictures = pytest.mark.usefixtures("no_pictures")
@@ -57,11 +56,11 @@ def test_only_the_named_material_moves(library: Library) -> None:
 @pytest.mark.parametrize("materials", [[], ["chair_wood"]], ids=str)
 def test_only_texels_under_white_of_a_mask_move(library: Library, materials: list[str]) -> None:
     picture = np.zeros(CHAIR.textures[WOOD].shape, np.uint8)
-    picture[:, 256:] = 255
+    picture[:, 64:] = 255
     mask = library.add_background(encode_png(picture), "mask.png").id
     _, texels = attacked(library, masks={WOOD: mask}, materials=materials, steps=1)
-    assert texels[WOOD][:, 256:].any()
-    assert not texels[WOOD][:, :256].any()
+    assert texels[WOOD][:, 64:].any()
+    assert not texels[WOOD][:, :64].any()
     assert not texels[CUSHION].any()
 
 

@@ -1,6 +1,6 @@
 """A growing pool: which views an attack adds, and that it survives interruption."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,16 +15,22 @@ from trompe_server.library import Library
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
-pytestmark = pytest.mark.usefixtures("no_pictures", "few_first_views")
+pytestmark = pytest.mark.usefixtures("few_first_views")
 
-HARD: dict[str, Any] = {"pool": 16, "steps": 20, "epsilon": 0.1, "alpha": 0.02, "surrogate": "calibrated"}
+HARD: dict[str, Any] = {"pool": 16, "steps": 15, "epsilon": 0.1, "alpha": 0.02, "surrogate": "calibrated"}
 
 
-@pytest.fixture
-def few_first_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four first views, and four at each look, which is after every chunk of steps."""
-    monkeypatch.setattr("trompe_server.job.setup.FEWEST", 4)
-    monkeypatch.setattr("trompe_server.job.pool.LOOKS", (5, 10, 15))
+@pytest.fixture(scope="module")
+def few_first_views() -> Iterator[None]:
+    """Four first views, and four at each look, which is after every chunk of steps. Reports without pictures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("trompe_server.job.setup.FEWEST", 4)
+        patch.setattr("trompe_server.job.pool.LOOKS", (5, 10))
+        patch.setattr("trompe_server.job.report.picture_files", lambda _: {})
+        yield
+
+
+Asked = tuple[Object3D, tuple[View, ...]]
 
 
 class Recorder(FakeTarget):
@@ -32,7 +38,7 @@ class Recorder(FakeTarget):
 
     def __init__(self, noisy: Sequence[View] = ()) -> None:
         super().__init__()
-        self.asked, self.noisy = list[tuple[Object3D, tuple[View, ...]]](), set(noisy)
+        self.asked, self.noisy = list[Asked](), set(noisy)
 
     def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> NDArray[np.uint8]:
         self.asked.append((obj, tuple(views)))
@@ -43,18 +49,30 @@ class Recorder(FakeTarget):
         return images
 
 
-def test_an_attack_that_loses_views_adds_those_it_has_not_safely_won(library: Library) -> None:
-    target, artifacts, setup = Recorder(), MemoryArtifacts(), setup_of(library, **HARD)
+@pytest.fixture(scope="module")
+def hard(library: Library, few_first_views: None) -> tuple[Run, dict[str, list[Asked]]]:
+    """A finished job that adds views, and what each of its phases asked of the renderer."""
+    library.calibrations.delete_all()
+    target, run, asked = Recorder(), Run(), dict[str, list[Asked]]()
+    job = opened(spec_of(**HARD), library, run.artifacts, target=target)
+    for phase in job.phases():
+        before = len(target.asked)
+        run.reports[phase] = job.run(phase, run.progress.append)
+        asked[phase] = target.asked[before:]
+    return run, asked
+
+
+def test_an_attack_that_loses_views_adds_those_it_has_not_safely_won(
+    library: Library, hard: tuple[Run, dict[str, list[Asked]]]
+) -> None:
+    artifacts, setup = hard[0].artifacts, setup_of(library, **HARD)
     assert (len(setup.views), len(setup.further)) == (4, 12)
     known = recognised(
         setup.classifier.predict(FakeTarget().render(setup.obj, setup.views, size=setup.size)), setup.labels
     )
     count = round(4 / max(float(known.mean()), 0.25))
-    job, seen = opened(spec_of(**HARD), library, artifacts, target=target), 0
-    for phase in job.phases():
-        before = len(target.asked)
-        job.run(phase, lambda _: None)
-        asked = target.asked[before:]
+    seen = 0
+    for phase, asked in hard[1].items():
         if not artifacts.exists(f"look-{phase[-3:]}.npz"):
             continue
         found = artifacts.arrays(f"look-{phase[-3:]}")
@@ -76,7 +94,7 @@ def test_an_attack_that_loses_views_adds_those_it_has_not_safely_won(library: Li
 def test_an_attack_that_loses_few_of_the_further_views_adds_none(
     library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("trompe_server.job.pool.LOOKS", (15,))
+    monkeypatch.setattr("trompe_server.job.pool.LOOKS", (10,))
     monkeypatch.setattr("trompe_server.job.pool.FEW_LOST", 1.0)
     run = run_job(spec_of(**HARD), library)
     assert run.result.attacked_views == 4
@@ -84,11 +102,14 @@ def test_an_attack_that_loses_few_of_the_further_views_adds_none(
 
 
 @pytest.mark.parametrize(
-    "surrogate", ["diffuse", *(pytest.param(each, marks=pytest.mark.thorough) for each in ("calibrated", "curve"))]
+    "surrogate", ["calibrated", *(pytest.param(each, marks=pytest.mark.thorough) for each in ("diffuse", "curve"))]
 )
-def test_a_pool_grows_to_the_same_bytes_after_interruption(library: Library, surrogate: str) -> None:
+def test_a_pool_grows_to_the_same_bytes_after_interruption(
+    library: Library, hard: tuple[Run, dict[str, list[Asked]]], surrogate: str
+) -> None:
     spec = spec_of(**HARD | {"surrogate": surrogate})
-    once, anew = run_job(spec, library), run_job(spec, library, new=True, times=2)
+    once = hard[0] if surrogate == "calibrated" else run_job(spec, library)
+    anew = run_job(spec, library, new=True, times=2)
     assert once.result.attacked_views > 4
     assert anew.artifacts.lasting() == once.artifacts.lasting()
 
@@ -104,24 +125,20 @@ def test_held_out_views_cannot_influence_the_texture(library: Library) -> None:
     assert judged == [setup.held_out] * 2
 
 
-def test_images_of_looks_are_counted(library: Library) -> None:
-    target = Recorder()
-    run = run_job(spec_of(**HARD), library, target=target)
-    assert run.counts()["target_renders"] == sum(len(views) for _, views in target.asked)
+def test_images_of_looks_are_counted(hard: tuple[Run, dict[str, list[Asked]]]) -> None:
+    run, asked = hard
+    assert run.counts()["target_renders"] == sum(len(views) for phase in asked.values() for _, views in phase)
     assert run.result.evaluations == run.counts("attack")["classifier_images"]
 
 
-def test_a_damaged_look_is_taken_anew(library: Library) -> None:
-    spec, run = spec_of(**HARD), Run()
-    job = opened(spec, library, run.artifacts)
-    for phase in job.phases()[:4]:
-        job.run(phase, lambda _: None)
-    whole = run.artifacts.files["look-001.npz"]
-    run.artifacts.files["look-001.npz"] = whole[:-40]
+def test_a_damaged_look_is_taken_anew(library: Library, hard: tuple[Run, dict[str, list[Asked]]]) -> None:
+    spec, artifacts = spec_of(**HARD), MemoryArtifacts()
+    whole = hard[0].artifacts.files["look-001.npz"]
+    artifacts.files = hard[0].artifacts.files | {"look-001.npz": whole[:-40]}
     with pytest.raises(DamagedFileError, match="look-001"):
-        opened(spec, library, run.artifacts).run("attack-002", lambda _: None)
-    opened(spec, library, run.artifacts).run("attack-001", lambda _: None)
-    assert run.artifacts.files["look-001.npz"] == whole
+        opened(spec, library, artifacts).run("attack-002", lambda _: None)
+    opened(spec, library, artifacts).run("attack-001", lambda _: None)
+    assert artifacts.files["look-001.npz"] == whole
 
 
 @pytest.mark.parametrize(

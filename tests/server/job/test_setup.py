@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tests.fakes import FakeTarget
-from tests.job_runs import MemoryArtifacts, opened, setup_of, spec_of
+from tests.job_runs import CHAIR, MemoryArtifacts, opened, setup_of, spec_of
 from tests.scores_only import Scores
 from trompe_server.classifiers import load_classifier
 from trompe_server.errors import NotFoundError
@@ -19,10 +19,9 @@ from trompe_server.library import Library
 from trompe_server.renderers import BackdropTarget, SailenvTarget
 from trompe_shared.errors import ClassifierError, LabelError, SpecError
 from trompe_shared.geometry import Camera, View
-from trompe_shared.object3d import Object3D, encode_png, load_object
+from trompe_shared.object3d import Object3D, encode_png
 from trompe_shared.shipped import shipped_objects
 
-CHAIR = shipped_objects()["chair"]
 WOOD = "chair_wood_AlbedoTransparency.png"
 Image8 = NDArray[np.uint8]
 
@@ -31,8 +30,8 @@ def test_a_shipped_object_has_its_own_framing(library: Library) -> None:
     setup = setup_of(library)
     assert (setup.object_name, setup.labels, setup.size) == ("chair", (3,), (128, 128))
     assert (len(setup.views), len(setup.held_out)) == (4, 3)
-    assert {view.camera.distance for view in setup.views} == {CHAIR.distance}
-    assert {view.camera.elevation for view in setup.views} == set(CHAIR.elevation)
+    assert {view.camera.distance for view in setup.views} == {shipped_objects()["chair"].distance}
+    assert {view.camera.elevation for view in setup.views} == set(shipped_objects()["chair"].elevation)
     assert {view.background for view in setup.views} == {(255, 255, 255)}
 
 
@@ -67,7 +66,7 @@ def test_a_background_can_be_a_colour(library: Library, background: str, colour:
         pytest.param({"label": "chairs"}, LabelError, "did you mean 'chair'", id="label"),
         pytest.param({"label": 8}, LabelError, r"0\.\.7", id="index"),
         pytest.param({"label": ["chair", 3]}, SpecError, "'chair' and 3 are the same class, 3", id="label twice"),
-        pytest.param({"keep": 9e-7}, SpecError, r"`keep: 9e-07` .* 524288 texels .* keep 2e-06 or more", id="keep"),
+        pytest.param({"keep": 9e-7}, SpecError, r"`keep: 9e-07` .* 32768 texels .* keep 3e-05 or more", id="keep"),
         pytest.param({"queries": 4}, SpecError, "'tiny' gives them: leave it out", id="queries"),
         *(
             pytest.param({"background": [name]}, NotFoundError, "background", id=f"background {name!r}")
@@ -83,11 +82,11 @@ def test_unknown_names_and_unfit_options_are_refused_before_any_work(
 
 
 def test_masks_of_another_size_or_without_a_texel_are_refused(library: Library) -> None:
-    size = load_object(CHAIR.read()).textures[WOOD].shape
+    size = CHAIR.textures[WOOD].shape
     small, white = (
         library.add_background(encode_png(np.full(shape, 255, np.uint8)), "mask.png").id for shape in ((8, 8, 3), size)
     )
-    with pytest.raises(SpecError, match=r"8 x 8 pixels, the texture 512 x 512"):
+    with pytest.raises(SpecError, match=r"8 x 8 pixels, the texture 128 x 128"):
         setup_of(library, masks={WOOD: small})
     with pytest.raises(SpecError, match=r"leave no texel of \['chair_cushion'\]: paint white"):
         setup_of(library, masks={WOOD: white}, materials=["chair_cushion"])

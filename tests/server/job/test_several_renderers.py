@@ -21,7 +21,7 @@ SHARP, DARK, COARSE = (EngineInfo(name, "1") for name in ("sharp", "dark", "coar
 TARGETS: dict[str, Any] = {
     "target": FakeTarget(engine=SHARP),
     "more_targets": [DarkTarget(engine=DARK)],
-    "judge_targets": [FakeTarget(20_000, COARSE)],
+    "judge_targets": [FakeTarget(5_000, COARSE)],
 }
 SPEC: dict[str, Any] = {"surrogate": "calibrated", "steps": 6, "epsilon": 0.3, "alpha": 0.1, "held_out": 8}
 

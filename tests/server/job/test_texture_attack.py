@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tests.fakes import FakeTarget
-from tests.job_runs import DarkTarget, MemoryArtifacts, Run, opened, run_job, setup_of, spec_of
+from tests.job_runs import CHAIR, DarkTarget, MemoryArtifacts, Run, opened, run_job, setup_of, spec_of
 from trompe_server.attack import Budget, Goal, attack, load_state, saliency_masks, start
 from trompe_server.classifiers import NetworkClassifier
 from trompe_server.job.protocol import DamagedFileError
@@ -22,10 +22,8 @@ from trompe_server.renderers import TargetRenderer
 from trompe_server.surrogate import Geometry, SamplingModel, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_shared.api import JobState, Progress
 from trompe_shared.geometry import View
-from trompe_shared.object3d import Object3D, load_object
-from trompe_shared.shipped import shipped_objects
+from trompe_shared.object3d import Object3D
 
-CHAIR = load_object(shipped_objects()["chair"].read())
 WHOLE: dict[str, Any] = {"surrogate": "calibrated", "steps": 6}
 """A job that calibrates, and attacks in two phases."""
 
@@ -405,7 +403,7 @@ def test_a_higher_threshold_alters_fewer_texels(library: Library) -> None:
 @pytest.mark.usefixtures("no_pictures")
 def test_the_threshold_stops_the_gradient_of_less_salient_pixels(library: Library) -> None:
     spec = spec_of(tau=0.2)
-    artifacts, setup = run_job(spec, library).artifacts, setup_of(library, tau=0.2)
+    artifacts, setup = run_job(spec, library, until="attack-000").artifacts, setup_of(library, tau=0.2)
     maps = torch.from_numpy(artifacts.arrays("saliency")["maps"].astype(np.float32))
     geometry = prepare_geometry(setup.obj, setup.views, size=setup.size, sampling=SamplingModel())
     textures = textures_of(setup.obj)
@@ -423,6 +421,7 @@ def test_the_threshold_stops_the_gradient_of_less_salient_pixels(library: Librar
         assert torch.equal(done.deltas[name], delta)
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_judges_classify_the_same_images(library: Library) -> None:
     result = run_job(spec_of(judges=["tiny"]), library).result
     (judge,) = result.judges
