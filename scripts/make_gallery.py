@@ -29,6 +29,8 @@ ROOT: Final = Path(__file__).parents[1]
 PAGES: Final = ROOT / "server" / "trompe_server" / "pages"
 OBJECT: Final = "teapot"
 SHOWN: Final = 8
+UPPER: Final = 306
+"""Height of the title and the first row of a contact sheet, in pixels."""
 KINDS: Final[tuple[Kind, ...]] = ("before", "after", "difference")
 COLUMNS: Final = (
     *("object", "label", "classifier", "epsilon", "alpha", "seed", "steps_taken", "pool", "held_out_views"),
@@ -53,9 +55,9 @@ def main() -> None:
 
 
 def write_readme(result: Result, artifacts: LocalArtifacts) -> None:
-    """The README's picture, the upper half of the contact sheet, and the row with its figures."""
+    """The README's picture, the upper part of the contact sheet, and the row with its figures."""
     sheet = Image.open(io.BytesIO(artifacts.read("contact_sheet.png")))
-    sheet.crop((0, 0, sheet.width, sheet.height // 2)).save(ROOT / "docs" / "images" / f"{OBJECT}.png")
+    sheet.crop((0, 0, sheet.width, UPPER)).save(ROOT / "docs" / "images" / f"{OBJECT}.png")
     row = ResultRow.of_result(RowId(experiment="gallery", key=OBJECT), result, state="succeeded").model_dump()
     with (ROOT / "docs" / "bench" / f"{OBJECT}.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore", lineterminator="\n")

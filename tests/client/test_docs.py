@@ -1,5 +1,7 @@
 """The pages about SDK and command line are true: their code runs, their tables are the code's."""
 
+import csv
+import json
 import os
 import re
 import shlex
@@ -7,6 +9,7 @@ import subprocess
 import sys
 import sysconfig
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
@@ -113,6 +116,17 @@ def test_the_page_on_the_sdk_names_every_error() -> None:
     errors = {name for name, one in public.items() if isinstance(one, type) and issubclass(one, Exception)}
     bases = {"APIError", "ClientError", "EmbeddedServerError", "JobError"}
     assert {name for name in errors if f"`{name}`" not in text} <= bases
+
+
+def test_readme_and_start_page_give_the_figures_of_the_same_job() -> None:
+    (row,) = csv.DictReader((DOCS / "bench" / "teapot.csv").read_text().splitlines())
+    shares = [round(100 * float(row[f"held_out_a_{when}"])) for when in ("before", "after")]
+    gallery = json.loads(files("trompe_server.pages").joinpath("gallery.json").read_text())
+    assert [gallery["before"], gallery["after"]] == [f"{share}%" for share in shares]
+    said = "recognises it in {} % of {} unseen views before, {} % after".format(
+        shares[0], row["held_out_views"], shares[1]
+    )
+    assert said in (DOCS.parent / "README.md").read_text()
 
 
 @pytest.mark.parametrize(
