@@ -145,3 +145,9 @@ def _quad(texture: NDArray[np.uint8], *, half: float = 0.1, z: float = 0.0, repe
     uvs = repeat * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     rows = [0, 1, 2, 0, 2, 3]
     return square[rows].reshape(-1, 3, 3), uvs[rows].reshape(-1, 3, 2), texture
+
+
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without pictures, which take as long as a small attack."""
+    monkeypatch.setattr("trompe_server.job.report.picture_files", lambda _: {})

@@ -33,12 +33,6 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Library:
     return library
 
 
-@pytest.fixture
-def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports without pictures: those of large textures take longer than some attacks."""
-    monkeypatch.setattr("trompe_server.job.report.picture_files", lambda _: {})
-
-
 def run(name: str, library: Library, target: SailenvTarget, **options: Any) -> Result:
     """One whole job by the paper's protocol: 6 azimuths x 10 elevations, epsilon 0.05, alpha 0.01."""
     assert ASSETS is not None

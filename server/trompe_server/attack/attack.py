@@ -105,9 +105,7 @@ def attack(
         optimiser,
         box=_box(objective, state.deltas, budget),
         movable=objective.join(moving)[:, None].float().expand(-1, 3).contiguous(),  # booleans take seven times as long
-        view_budget=ViewBudget.of(objective, budget.epsilon_view, levels=budget.levels)
-        if budget.epsilon_view
-        else None,
+        view_budget=ViewBudget.of(objective, budget.epsilon_view) if budget.epsilon_view is not None else None,
         views_per_step=views_per_step,
         backgrounds=backgrounds,
         pipeline=pipeline,

@@ -147,7 +147,7 @@ class Search:
 
     def saved(self, delta: Flat) -> Flat:
         """``delta``, or the part of it that keeps the images within their bound once saved in 8 bits."""
-        return delta if self.view_budget is None else self.view_budget.saved(delta)
+        return delta if self.view_budget is None else self.view_budget.saved(delta, levels=self.box.budget.levels)
 
     def _no_worse(self, point: Iterate) -> Iterate:
         """The iterate, or no change if that fools more views."""

@@ -30,23 +30,20 @@ SHARPNESS: Final = 8
 class ViewBudget:
     """Bounds the change of each channel of the surrogate's images by ``epsilon``, in (0, 1].
 
-    levels: largest change of a texel's channel in 8 bits. clean: colours of the unpainted object by batch.
+    clean: colours of the unpainted object by batch.
     """
 
     objective: Objective
     epsilon: float
-    levels: int
     clean: tuple[Float[Tensor, "pixels 3"], ...]
 
     @classmethod
     @torch.no_grad()
-    def of(cls, objective: Objective, epsilon: float, *, levels: int) -> "ViewBudget":
+    def of(cls, objective: Objective, epsilon: float) -> "ViewBudget":
         """The bound around the images of the unpainted textures."""
         surrogate = objective.surrogate
         texels = surrogate.texels(objective.textures)
-        return cls(
-            objective, epsilon, levels, tuple(surrogate.colours(texels, k)[0] for k in range(len(surrogate.batches)))
-        )
+        return cls(objective, epsilon, tuple(surrogate.colours(texels, k)[0] for k in range(len(surrogate.batches))))
 
     def project(self, delta: Flat) -> Flat:
         """``delta`` with each texel's channel scaled down until all images are within the bound.
@@ -55,12 +52,12 @@ class ViewBudget:
         """
         return self._within(delta, lambda change: change, local_rounds=LOCAL_ROUNDS)
 
-    def saved(self, delta: Flat) -> Flat:
-        """``delta`` if its images are within the bound once it is rounded to 8-bit levels; else the scaled-down change
-        in whole levels."""
+    def saved(self, delta: Flat, *, levels: int) -> Flat:
+        """``delta`` if its images are within the bound once it is rounded to at most ``levels`` 8-bit levels; else the
+        scaled-down change in whole levels."""
 
         def rounded(change: Flat) -> Flat:
-            return (change * 255).round().clamp(-self.levels, self.levels) / 255
+            return (change * 255).round().clamp(-levels, levels) / 255
 
         return self._within(delta, rounded, local_rounds=SAVED_ROUNDS)
 

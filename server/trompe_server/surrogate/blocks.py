@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
+from trompe_server.surrogate.pyramid import halved
+
 Blocks = Float[Tensor, "h w 3"]
 
 ROUNDS: Final = 32
@@ -44,24 +46,19 @@ def by_block(table: Shaped[Tensor, "H W ..."], count: int) -> Shaped[Tensor, "h 
 def means(table: Float[Tensor, "H W c"], count: int) -> Float[Tensor, "h w c"]:
     """Mean of each block of side ``2 ** count``."""
     for _ in range(count):
-        table = (table[:, 0::2] + table[:, 1::2]).div_(2)
-        table = (table[0::2] + table[1::2]).div_(2)
+        table = halved(table, rounded=False)
     return table
 
 
 def whole(mask: Bool[Tensor, "H W"], count: int) -> Bool[Tensor, "h w"]:
     """The blocks of side ``2 ** count`` all of whose texels are in ``mask``."""
-    rows = by_block(mask.byte(), count).amin(1)
-    return rows.amin(2).bool() if count else mask
+    return by_block(mask.byte(), count).amin(1).amin(2).bool()
 
 
 def repeated(blocks: Shaped[Tensor, "h w ..."], texels: tuple[int, ...]) -> Shaped[Tensor, "H W ..."]:
     """A table of the shape ``texels``, (H, W, ...), whose texels have the values of their ``blocks``."""
     side = 2 ** halvings(blocks.shape, texels)
-    if side == 1:
-        return blocks
-    wide = blocks[:, None, :, None].expand(-1, side, -1, side, *[-1] * (blocks.dim() - 2))
-    return wide.reshape(blocks.shape[0] * side, blocks.shape[1] * side, *blocks.shape[2:])
+    return blocks.repeat_interleave(side, 0).repeat_interleave(side, 1)
 
 
 def rooms(texture: Float[Tensor, "H W 3"], bound: Float[Tensor, "h w 1"], count: int) -> tuple[Blocks, Blocks]:

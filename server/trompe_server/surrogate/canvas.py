@@ -40,33 +40,32 @@ def canvas_of(
 
     linear: average in linear light instead of encoded values. Other arguments: as for ``read_texels``.
     """
-    sheets, source, texels, blocks = [], [], [], False
-    for texture, mask, chain in zip(textures, moving, chains, strict=True):
-        count = halvings(mask.shape, texture.shape)
-        tiles, colour = _Tiles.of(chain.of_blocks(count), mask), means(texture, count)
-        source.append(colour.flatten(0, 1).index_select(0, tiles.order))
-        curve = _mean_light(texture, count) if linear and count else None
-        light = decode(texture) if linear else colour
-        found = tiles.fine.read(light if curve is None else curve[0], rounded=rounded)
-        sheets.append(_Sheet(tiles, found[-1], None if curve is None else curve.flatten(1, 2)[:, tiles.order]))
+    counts = [halvings(mask.shape, texture.shape) for mask, texture in zip(moving, textures, strict=True)]
+    lights = [decode(texture) for texture in textures] if linear else textures
+    sheets, source, texels = [], [], []
+    for texture, light, mask, chain, count in zip(textures, lights, moving, chains, counts, strict=True):
+        tiles, averaged = _Tiles.of(chain.of_blocks(count), mask), means(light, count)
+        source.append(means(texture, count).flatten(0, 1).index_select(0, tiles.order))
+        found = tiles.fine.read(averaged, rounded=rounded)
+        curve = _light_curve(texture, averaged, count).flatten(1, 2)[:, tiles.order] if linear and count else None
+        sheets.append(_Sheet(tiles, found[-1], curve))
         texels += [*found[:-1], *(texture.new_zeros(len(level), 3) for level in tiles.coarse.reads)]
-        blocks |= count > 0
     canvas = Canvas(tuple(sheets), torch.cat(source), torch.cat(texels), linear, rounded)
-    if not blocks:
+    if not any(counts):
         return canvas
-    whole = read_texels([decode(texture) for texture in textures] if linear else textures, chains, rounded=rounded)
-    return replace(canvas, offset=whole - canvas.read(canvas.source))
+    return replace(canvas, offset=read_texels(lights, chains, rounded=rounded) - canvas.read(canvas.source))
 
 
-def _mean_light(texture: Float[Tensor, "H W 3"], count: int) -> Float[Tensor, "5 h w 3"]:
-    """The mean light of each block, and the coefficients (linear, quadratic) of its parabolas for a darker and for a
+def _light_curve(
+    texture: Float[Tensor, "H W 3"], light: Float[Tensor, "h w 3"], count: int
+) -> Float[Tensor, "5 h w 3"]:
+    """The mean ``light`` of each block, and the coefficients (linear, quadratic) of its parabolas for a darker and a
     brighter mean colour.
 
     They are exact for no change, and for texels that all change by ``REACH`` or half of it as far as they stay in
     [0, 1].
     """
-    light, colour = means(decode(texture), count), means(texture, count)
-    found = [light]
+    colour, found = means(texture, count), [light]
     for side in (-REACH, REACH):
         half, full = ((texture + part * side).clamp(0, 1) for part in (0.5, 1))
         near, far = means(half, count) - colour, means(full, count) - colour
@@ -217,7 +216,7 @@ def _hits(
 class _Sheet:
     """The tiles of one texture, and its first complete level before anything moves.
 
-    curve: light of blocks of texels, as ``_mean_light``, if they are averaged in linear light.
+    curve: light of blocks of texels, as ``_light_curve``, if they are averaged in linear light.
     """
 
     tiles: _Tiles

@@ -134,11 +134,11 @@ class MipChain:
             part = texture[band[0].rows]
             for strip, reads in zip(band, found, strict=True):
                 reads.index_copy_(0, strip.which, part.reshape(-1, channels).index_select(0, strip.texels))
-                part = _halved(part, rounded=rounded)
+                part = halved(part, rounded=rounded)
             level[strip.rows.start // 2 : strip.rows.stop // 2] = part
         for k in range(banded, len(self.sizes)):
             found.append(level.reshape(-1, channels).index_select(0, self.reads[k]))
-            level = _halved(level, rounded=rounded)
+            level = halved(level, rounded=rounded)
         return found
 
     def spread(self, gradients: Sequence[Float[Tensor, "_ channels"]]) -> Float[Tensor, "H W channels"]:
@@ -180,9 +180,9 @@ class StoredChain:
         if (height, width) != (1, 1):
             tall = max(1, BAND_TEXELS // width) * 2 if height % 2 == 0 else height
             bands = [table[texture[row : row + tall].int()] for row in range(0, height, tall)]
-            levels.append(torch.cat([_halved(band, rounded=rounded) for band in bands]))
+            levels.append(torch.cat([halved(band, rounded=rounded) for band in bands]))
         while levels and levels[-1].shape[:2] != (1, 1):
-            levels.append(_halved(levels[-1], rounded=rounded))
+            levels.append(halved(levels[-1], rounded=rounded))
         return cls(texture.flatten(0, 1), tuple(level.flatten(0, 1) for level in levels), table)
 
     def read(self, reads: Reads) -> list[Float[Tensor, "_ 3"]]:
@@ -205,7 +205,7 @@ class _Strip:
     texels: Int[Tensor, " _"]
 
 
-def _halved(level: Float[Tensor, "H W channels"], *, rounded: bool) -> Float[Tensor, "h w channels"]:
+def halved(level: Float[Tensor, "H W channels"], *, rounded: bool) -> Float[Tensor, "h w channels"]:
     """The next mip level: means of columns, then rows, in pairs (overlapping triples for odd sides)."""
     for axis in (1, 0):
         if level.shape[axis] > 1:

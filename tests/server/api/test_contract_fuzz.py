@@ -75,7 +75,7 @@ def fuzz(operation: Any, api: Api, mode: GenerationMode) -> set[int]:
     api.end(job, JobState.succeeded, result__json=RESULT, digits__txt=b"0123456789")
 
     @settings(
-        max_examples=12 if mode is GenerationMode.POSITIVE else 8,
+        max_examples=20 if mode is GenerationMode.POSITIVE else 8,
         derandomize=True,
         database=None,
         suppress_health_check=list(HealthCheck),

@@ -24,12 +24,6 @@ def photo() -> NDArray[np.uint8]:
     return np.kron(image[::15, ::15], np.ones((15, 15, 1), np.uint8))
 
 
-@pytest.fixture
-def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports without pictures, which take as long as a small attack."""
-    monkeypatch.setattr("trompe_server.job.report.picture_files", lambda _: {})
-
-
 @pytest.fixture(scope="module", autouse=True)
 def default_sampling() -> Iterator[None]:
     """Calibrations with the default sampling: its search takes four times as long as the rest of a small job."""
