@@ -45,8 +45,8 @@ def pytest_configure() -> None:
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """One process more than cores: many tests wait for other processes."""
-    return len(os.sched_getaffinity(0)) + 1
+    """Two processes more than cores: many tests wait for other processes."""
+    return len(os.sched_getaffinity(0)) + 2
 
 
 def share_the_cores(processes: int) -> None:

@@ -57,12 +57,14 @@ def test_the_quickstart_in_python_runs(service: str, tmp_path: Path) -> None:
     assert (tmp_path / "out-python" / "mug-adversarial.zip").is_file()
 
 
+@pytest.mark.thorough
 def test_the_quickstart_on_the_command_line_runs(service: str, tmp_path: Path) -> None:
     said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["Command line"]], tmp_path, service)
     assert "target (own views)" in said
     assert (tmp_path / "out-cli" / "mug-adversarial.zip").is_file()
 
 
+@pytest.mark.thorough
 def test_the_quickstart_with_curl_runs(service: str, tmp_path: Path) -> None:
     said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["curl"]], tmp_path, service)
     assert "event: progress" in said

@@ -65,6 +65,7 @@ def all_ended(serve: Serve) -> bool:
     return counts[JobState.queued] + counts[JobState.running] == 0
 
 
+@pytest.mark.thorough
 def test_a_thousand_jobs_submitted_at_once_are_all_there_and_none_twice(serve: Serve) -> None:
     """Every tenth request is sent twice with the same key, as by a client that lost the answer."""
     numbers = [*range(1000), *range(0, 1000, 10)]
@@ -187,6 +188,7 @@ def peak_memory(serve: Serve) -> int:
     return 1024 * int(re.search(r"VmHWM:\s+(\d+) kB", status)[1])  # type: ignore[index]
 
 
+@pytest.mark.thorough
 def test_the_examples_of_the_documentation_work(serve: Serve, tmp_path: Path) -> None:
     """All blocks of docs/api.md, as one script, in a folder with an object and the server's address and token."""
     for program in ("curl", "jq"):

@@ -66,6 +66,7 @@ def test_a_job_is_judged_through_the_service_over_a_killed_worker(tmp_path: Path
     assert list(verify(manifest, tmp_path / "judged", generator=np.random.default_rng(0))) == []
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_judged_is_said_and_a_running_judgement_is_cancelled(tmp_path: Path) -> None:
     with served(tmp_path, patience=5) as serve, Client(serve.url) as client:
         nothing = client.judge("mug", "ball", label="coffee cup", renderers=["none-such"], views=3)

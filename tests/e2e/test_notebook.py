@@ -2,9 +2,12 @@
 
 from typing import Any
 
+import pytest
+
 from tests.documentation import cells
 
 
+@pytest.mark.thorough
 def test_the_notebook_runs_from_top_to_bottom() -> None:
     names: dict[str, Any] = {}
     for number, code in enumerate(cells("first_attack.ipynb")):

@@ -313,7 +313,7 @@ def test_the_picture_of_an_object_that_is_no_longer_chosen_is_not_shown(service:
     assert (kept == shown).all()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.thorough)])
 def test_no_serious_fault_of_accessibility(service: Service, browser: Browser, done: str, scheme: Any) -> None:
     context = browser.new_context(color_scheme=scheme)
     context.set_default_timeout(LIMIT)
@@ -385,6 +385,7 @@ def test_no_page_is_too_wide_cut_off_half_empty_or_moves_while_it_loads(
     context.close()
 
 
+@pytest.mark.thorough
 def test_on_a_slow_network_a_result_is_read_before_its_viewer_is_there_and_3d_says_what_it_loads(
     service: Service, page: Page, context: BrowserContext, done: str
 ) -> None:
@@ -417,6 +418,7 @@ def test_on_a_slow_network_a_result_is_read_before_its_viewer_is_there_and_3d_sa
     assert loaded == sorted(loaded, key=sum)
 
 
+@pytest.mark.thorough
 def test_a_server_that_restarts_in_mid_job_is_waited_for(service: Service, page: Page, faults: list[str]) -> None:
     job = service.submit(steps=200, epsilon=0.004)  # so little that it does not win all views and end early
     page.goto(f"{service.url}/jobs/{job}")

@@ -189,6 +189,7 @@ def test_equal_noise_numbers_give_equal_bytes(engine: str, shown: SailenvTarget)
     assert np.abs(first - other).mean() < 5
 
 
+@pytest.mark.thorough
 def test_several_objects_and_a_point_light_are_drawn_as_by_pyrender(engine: str, running: dict[str, Worker]) -> None:
     images = []
     for name in ("pyrender", engine):
@@ -232,7 +233,13 @@ def test_surfaces_show_what_is_behind_them(
     assert np.abs(color - expected).max() < 60
 
 
-@pytest.mark.parametrize(("normal", "light"), [((218, 128, 218), (60, 0)), ((128, 218, 218), (0, 60))], ids=["x", "y"])
+@pytest.mark.parametrize(
+    ("normal", "light"),
+    [
+        pytest.param((218, 128, 218), (60, 0), id="x"),
+        pytest.param((128, 218, 218), (0, 60), id="y", marks=pytest.mark.thorough),
+    ],
+)
 def test_a_normal_map_turns_the_surface_to_the_light(
     normal: tuple[int, int, int], light: tuple[int, int], engine: str, shown: SailenvTarget
 ) -> None:

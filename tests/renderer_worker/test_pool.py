@@ -57,7 +57,7 @@ def expected(worker: Address) -> Expected:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-@pytest.mark.parametrize("when", [1, 15])
+@pytest.mark.parametrize("when", [1, pytest.param(15, marks=pytest.mark.thorough)])
 def test_a_worker_lost_in_the_middle_costs_no_view_and_no_picture_is_wrong(
     own_worker: Worker, worker: Address, expected: Expected, number: signal.Signals, when: int
 ) -> None:

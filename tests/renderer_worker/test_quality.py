@@ -42,6 +42,7 @@ def show(running_worker: Callable[..., Any], worker: tuple[str, int]) -> Iterato
         yield image
 
 
+@pytest.mark.thorough
 def test_more_samples_a_pixel_show_more_levels_of_an_edge(show: Show) -> None:
     ways = (("--set", "msaa=1"), (), ("--set", "supersample=4"))
     levels = [len(np.unique(show(options, boxes(textures=WHITE), Camera(0.5, 30, 20)))) for options in ways]
@@ -70,6 +71,7 @@ def test_the_strings_of_a_racket_are_smooth(show: Show) -> None:
     assert smooth < 0.6 * jagged
 
 
+@pytest.mark.thorough
 def test_the_larger_a_shadow_map_is_the_truer_are_the_edges_of_shadows(show: Show) -> None:
     plates = boxes(((0, -0.1, 0), (0.3, 0.005, 0.3)), ((0, 0.05, 0), (0.06, 0.005, 0.06)), textures=WHITE)
     ways = (("--set", "shadow_map=64"), ("--set", "shadow_map=256"), (), ("--set", "shadow_map=4096"))

@@ -4,6 +4,8 @@ import subprocess
 import sys
 import textwrap
 
+import pytest
+
 PREPARE = """
     import resource
     import numpy as np
@@ -52,6 +54,7 @@ def test_a_million_faces_and_4096_x_4096_texels_take_less_than_640_mib() -> None
     assert taken < 640  # 110 for the triangles and 105 for two tables of texels
 
 
+@pytest.mark.thorough
 def test_a_finer_mesh_or_texture_needs_no_larger_operators() -> None:
     (_, few, small), (_, many, large) = prepared(rows=50, side=512), prepared(rows=300, side=2048)
     assert abs(few - many) < 0.02 * few

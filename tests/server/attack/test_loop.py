@@ -171,6 +171,7 @@ def test_the_same_part_of_a_picture_is_movable_at_any_resolution(epsilon: float)
         assert (finer - chosen[0]).abs().mean() < 0.02
 
 
+@pytest.mark.thorough
 def test_a_picture_stored_at_four_sizes_is_attacked_alike() -> None:
     mug, tiny = shipped_objects()["mug"], load_classifier("tiny")
     assert isinstance(tiny, NetworkClassifier)

@@ -89,6 +89,7 @@ def test_images_are_normalised_as_timm_does(name: str, timm: Any, stored: Callab
     torch.testing.assert_close(ours, its, atol=1e-6, rtol=0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "side"), [("vit_tiny_patch16_224", 224), ("inception_v3", 299), ("vit_tiny_patch16_384", 384)]
 )
@@ -145,6 +146,7 @@ def test_without_its_library_a_name_says_what_to_install(prefix: str, monkeypatc
         load_classifier(f"{prefix}org/model")
 
 
+@pytest.mark.thorough
 def test_a_vision_transformer_by_name_is_attacked_end_to_end(
     stored: Callable[..., nn.Module], mug: Object3D, target: SailenvTarget
 ) -> None:

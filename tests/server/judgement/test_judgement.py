@@ -34,6 +34,7 @@ TEXTURE = "mug_ceramic_AlbedoTransparency.png"
 # The figures
 
 
+@pytest.mark.thorough
 def test_an_attacked_object_gets_the_figures_of_its_job(
     tmp_path: Path, worker: tuple[str, int], target: SailenvTarget
 ) -> None:

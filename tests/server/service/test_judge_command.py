@@ -27,6 +27,7 @@ def painted(tmp_path: Path) -> Path:
     return file
 
 
+@pytest.mark.thorough
 def test_a_judgement_is_interrupted_continued_and_verified(painted: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [*TROMPE, "mug", str(painted), "--label", "mug", "--views", "11", "--epsilon", "0.05", "--out", str(out)]

@@ -381,6 +381,7 @@ def test_edges_averaged_in_light_are_predicted_better_as_such(make_object: Make,
     assert explained(truth) > explained(truth.but(edges="encoded")) + 0.05
 
 
+@pytest.mark.thorough
 def test_charts_are_asked_for_once_and_counted(mug: Object3D) -> None:
     asked = Asked(KnownTarget(SamplingModel(), film=aces))
     measured: list[ToneMap] = []

@@ -9,6 +9,7 @@ import pytest
 from trompe_server.system.memory import GIB
 
 
+@pytest.mark.thorough
 def test_freed_memory_is_kept_but_no_more_than_a_gibibyte() -> None:
     code = """
         import os, numpy as np
