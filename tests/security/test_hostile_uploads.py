@@ -236,6 +236,15 @@ def accessor(**changes: Any) -> bytes:
     return glb(document)
 
 
+def sparse(count: int) -> dict[str, Any]:
+    """Other values for rows whose numbers are the bits of positions."""
+    return {
+        "count": count,
+        "indices": {"bufferView": 0, "byteOffset": 12, "componentType": 5125},
+        "values": {"bufferView": 0},
+    }
+
+
 def image_at(uri: str) -> bytes:
     return external(images=[{"uri": uri}])
 
@@ -277,7 +286,9 @@ GLTFS = {
         "not",
     ),
     "a view beyond the buffer": (lambda: changed(bufferViews=[{"buffer": 0, "byteLength": 10**9}] * 3), "beyond"),
-    "sparse accessors": (lambda: accessor(sparse={"count": 10**9}), "sparse"),
+    "a sparse accessor of a billion rows": (lambda: accessor(sparse=sparse(10**9)), "not valid at accessors"),
+    "a sparse accessor beyond its view": (lambda: accessor(sparse=sparse(10**6)), "beyond its buffer view"),
+    "a sparse accessor of rows that are not there": (lambda: accessor(sparse=sparse(3)), "changes row"),
     "indices that are fractions": (
         lambda: changed(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "indices": 0}]}]),
         "whole numbers",

@@ -137,10 +137,10 @@ class Model:
         return Slot(image, (red, green, blue), alpha)
 
     def _image_of(self, info: TextureInfo) -> int:
-        texture = at(self.document.textures, info.index, "texture")
-        if texture.source is None:
-            raise ObjectError(f"Texture {info.index} of the glTF has no supported image; use PNG or JPEG.")
-        return texture.source
+        image = at(self.document.textures, info.index, "texture").image
+        if image is None:
+            raise ObjectError(f"Texture {info.index} of the glTF has no supported image; use PNG, JPEG or WebP.")
+        return image
 
     def _paint(self, shape: Shape) -> None:
         """Add the material of ``shape`` with its textures."""

@@ -54,17 +54,32 @@ class Container:
     def raw(self, index: int) -> NDArray[np.generic]:
         """Stored numbers of an accessor, (count, components)."""
         accessor = at(self.document.accessors, index, "accessor")
-        if accessor.sparse is not None:
-            raise ObjectError("The glTF has sparse accessors, which are not supported; export it without.")
         kind, width = np.dtype(COMPONENTS[accessor.component_type]), WIDTHS[accessor.type]
+        what = f"Accessor {index}"
         if accessor.buffer_view is None:
-            return np.zeros((accessor.count, width), kind)
-        data, size = self.view(accessor.buffer_view), kind.itemsize * width
-        stride = self.document.buffer_views[accessor.buffer_view].byte_stride or size
-        if accessor.byte_offset + stride * (accessor.count - 1) + size > len(data) or stride < size:
-            raise ObjectError(f"Accessor {index} of the glTF reads beyond its buffer view; export it again.")
-        strides = (stride, kind.itemsize)
-        return np.ndarray((accessor.count, width), kind, data, accessor.byte_offset, strides).copy()
+            values = np.zeros((accessor.count, width), kind)
+        else:
+            values = self._rows(accessor.buffer_view, accessor.byte_offset, (accessor.count, width), kind, what)
+        if (sparse := accessor.sparse) is not None:
+            where, of = sparse.indices, sparse.values
+            numbers = np.dtype(COMPONENTS[where.component_type])
+            changed = self._rows(where.buffer_view, where.byte_offset, (sparse.count, 1), numbers, what)[:, 0]
+            if changed.max() >= accessor.count:
+                raise ObjectError(
+                    f"{what} of the glTF changes row {changed.max()} of {accessor.count}; export it again."
+                )
+            values[changed] = self._rows(of.buffer_view, of.byte_offset, (sparse.count, width), kind, what)
+        return values
+
+    def _rows(
+        self, view: int, offset: int, shape: tuple[int, int], kind: np.dtype[np.generic], what: str
+    ) -> NDArray[np.generic]:
+        """Numbers of a buffer view, in rows as far apart as it says."""
+        data, size = self.view(view), kind.itemsize * shape[1]
+        stride = self.document.buffer_views[view].byte_stride or size
+        if offset + stride * (shape[0] - 1) + size > len(data) or stride < size:
+            raise ObjectError(f"{what} of the glTF reads beyond its buffer view; export it again.")
+        return np.ndarray(shape, kind, data, offset, (stride, kind.itemsize)).copy()
 
     def numbers(self, index: int, width: int) -> NDArray[np.float32]:
         """An accessor of ``width`` components as float32 (count, width), normalised if declared so."""
@@ -145,8 +160,8 @@ def _document(text: bytes) -> Document:
     unread = [name for name in document.extensions_required if not name.startswith(READ_EXTENSIONS)]
     if unread:
         raise ObjectError(
-            f"The glTF requires {', '.join(unread)[:200]}, which is not supported; export it uncompressed, with PNG or "
-            "JPEG textures and without extensions."
+            f"The glTF requires {', '.join(unread)[:200]}, which is not supported; export it uncompressed, with PNG, "
+            "JPEG or WebP textures and without extensions."
         )
     if older := [
         material.name or f"number {k}" for k, material in enumerate(document.materials) if material.colour_unread

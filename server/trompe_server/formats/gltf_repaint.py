@@ -157,6 +157,24 @@ class _Editor:
             self._replace_file(entry, uri, png)
         if entry.get("mimeType", "image/png") != "image/png":
             entry["mimeType"] = "image/png"
+        self._show_in_all_readers(index)
+
+    def _show_in_all_readers(self, image: int) -> None:
+        """Leave the textures of an image no copy in another encoding, which other readers would show instead."""
+        dropped = set()
+        for texture in self.document["textures"]:
+            if image in _sources(texture) and (others := _encodings(texture)):
+                texture["source"] = image
+                dropped |= others
+                kept = {name: entry for name, entry in texture["extensions"].items() if name not in others}
+                texture |= {"extensions": kept}
+                if not kept:
+                    del texture["extensions"]
+        unused = dropped.difference(*[_encodings(texture) for texture in self.document["textures"]])
+        for key in {"extensionsUsed", "extensionsRequired"} & set(self.document):
+            self.document[key] = [name for name in self.document[key] if name not in unused]
+            if not self.document[key]:
+                del self.document[key]
 
     def _replace_file(self, entry: Json, uri: str, png: bytes) -> None:
         path = self._container.upload.beside(uri)
@@ -312,6 +330,12 @@ def _texture_uses(entry: object, path: str) -> Iterator[tuple[str, int]]:
         if key.endswith("Texture") and isinstance(value, dict) and isinstance(value.get("index"), int):
             yield f"{path}.{key}", value["index"]
         yield from _texture_uses(value, f"{path}.{key}")
+
+
+def _encodings(texture: Json) -> set[str]:
+    """Extensions of a texture that name an image."""
+    found = texture.get("extensions", {}).items()
+    return {name for name, entry in found if isinstance(entry, dict) and "source" in entry}
 
 
 def _sources(texture: Json) -> Iterator[int]:

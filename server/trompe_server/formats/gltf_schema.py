@@ -7,7 +7,13 @@ from pydantic.alias_generators import to_camel
 
 from trompe_shared.wavefront import MAX_FACES
 
-READ_EXTENSIONS: Final = ("KHR_texture_transform", "KHR_mesh_quantization", "KHR_materials_", "KHR_lights_punctual")
+READ_EXTENSIONS: Final = (
+    "KHR_texture_transform",
+    "KHR_mesh_quantization",
+    "KHR_materials_",
+    "KHR_lights_punctual",
+    "EXT_texture_webp",
+)
 """Prefixes of extensions a file may require: supported, or about light and finish without effect here."""
 
 MAX_NODES: Final = 100_000
@@ -47,6 +53,22 @@ class BufferView(_Part):
     byte_stride: Annotated[int, Field(ge=1, le=1024)] | None = None
 
 
+class SparseRows(_Part):
+    """Where the numbers, or the values, of changed rows are; indices alone have a component type."""
+
+    buffer_view: Index
+    byte_offset: Size = 0
+    component_type: Literal[5121, 5123, 5125] = 5125
+
+
+class Sparse(_Part):
+    """Rows of an accessor with other values than its buffer view."""
+
+    count: Annotated[int, Field(ge=1, le=3 * MAX_FACES)]
+    indices: SparseRows
+    values: SparseRows
+
+
 class Accessor(_Part):
     """Numbers in a buffer view."""
 
@@ -56,7 +78,7 @@ class Accessor(_Part):
     normalized: bool = False
     count: Annotated[int, Field(ge=1, le=3 * MAX_FACES)]
     type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
-    sparse: Any = None
+    sparse: Sparse | None = None
 
 
 class Primitive(_Part):
@@ -103,11 +125,29 @@ class Image(_Part):
     name: str | None = None
 
 
+class Encoding(_Part):
+    """The same image in another encoding."""
+
+    source: Index | None = None
+
+
+class Encodings(_Part):
+    """Extensions of a texture that name its image."""
+
+    webp: Encoding = Field(default=Encoding(), alias="EXT_texture_webp")
+
+
 class Texture(_Part):
     """An image with a sampler."""
 
     source: Index | None = None
     sampler: Index | None = None
+    extensions: Encodings = Encodings()
+
+    @property
+    def image(self) -> Index | None:
+        """The image in an encoding that is read."""
+        return self.extensions.webp.source if self.source is None else self.source
 
 
 class Sampler(_Part):

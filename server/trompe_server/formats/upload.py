@@ -28,17 +28,21 @@ class Upload:
         return base_name(self.main).rsplit(".", 1)[0] or "object"
 
     def beside(self, uri: str) -> str:
-        """The path of a relative URI in the mesh file. Raises ``ObjectError`` outside the mesh's folder."""
+        """The path of a relative URI in the mesh file, in other capitals if only such a file is there.
+
+        Raises ``ObjectError`` outside the mesh's folder.
+        """
         path = posixpath.normpath(posixpath.join(posixpath.dirname(self.main), unquote(uri).replace("\\", "/")))
         if ":" in uri or path.startswith(("/", "..")):
             raise ObjectError(
                 f"{self.main!r} names {uri[:80]!r}; only files below its own folder are read. Put the file there."
             )
-        if path not in self.files:
+        alike = [path] if path in self.files else [name for name in self.files if name.casefold() == path.casefold()]
+        if len(alike) != 1:
             raise ObjectError(
                 f"{self.main!r} names {uri[:80]!r}, which is missing; zip the model together with its files."
             )
-        return path
+        return alike[0]
 
     def flat(self) -> dict[str, bytes]:
         """The files by name without folders. Raises ``ObjectError`` if two names are equal."""

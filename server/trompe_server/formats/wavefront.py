@@ -1,5 +1,6 @@
 """OBJ with MTL or SAILenv's mat_def: kept if complete, otherwise completed with maps and UVs."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -23,7 +24,22 @@ def read(upload: Upload, max_texture: int | None = None) -> Object3D:
 
 def _completed(upload: Upload) -> Mapping[str, bytes]:
     files = upload.flat()
-    return files if _has_table(files) else complete(files)
+    return files if _has_table(files) else complete(_spelled(files))
+
+
+def _spelled(files: Mapping[str, bytes]) -> dict[str, bytes]:
+    """``files`` with MTLs that spell pictures as their files are; some systems take no note of capitals."""
+    actual: dict[str, list[str]] = {}
+    for name in files:
+        actual.setdefault(name.casefold(), []).append(name)
+    spelled = dict(files)
+    for library in (name for name in files if name.lower().endswith(".mtl")):
+        text = files[library].decode("utf-8-sig", "replace")
+        for picture in {name for maps in parse_mtl(text).values() for name in maps.values()} - files.keys():
+            if len(found := actual.get(picture.casefold(), [])) == 1:
+                text = re.sub(rf"{re.escape(picture)}(?=\s*$)", found[0], text, flags=re.MULTILINE)
+                spelled[library] = text.encode()
+    return spelled
 
 
 def _object(files: Mapping[str, bytes]) -> Object3D:

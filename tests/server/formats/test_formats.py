@@ -21,7 +21,7 @@ from trompe_server.formats.unwrap import unwrap
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.errors import ObjectError
 from trompe_shared.geometry import Camera, View
-from trompe_shared.object3d import Object3D, decode_alpha, encode_png, load_object, pack_zip, unpack
+from trompe_shared.object3d import Object3D, decode_alpha, decode_rgb, encode_png, load_object, pack_zip, unpack
 from trompe_shared.wavefront import Part, obj_text, parse_obj
 
 PICTURE = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
@@ -57,6 +57,18 @@ def test_a_sailenv_zip_comes_back_with_other_albedos_and_nothing_else(mug: Objec
     _, out = comes_back(data, "mug.zip")
     before, after = unpack(data), unpack(out)
     assert {name for name in before if before[name] != after[name]} == set(mug.textures)
+
+
+def test_pictures_in_other_capitals_are_found_where_only_one_is_meant() -> None:
+    files = {"t.obj": OBJ.encode(), "t.mtl": b"newmtl red\nmap_Kd Maps\\Red.PNG\n", "red.png": encode_png(PICTURE)}
+    obj = read_object(pack_zip(files), name="t.zip").obj
+    assert (obj.textures["red.png"] == PICTURE).all()
+
+    out = unpack(repaint_file(pack_zip(files), painted(obj), name="t.zip").data)
+    assert out["t.mtl"] == b"newmtl red\nmap_Kd Maps\\red.png\n"
+    assert (decode_rgb(out["red.png"], "red.png") == painted(obj).textures["red.png"]).all()
+
+    assert "Red.PNG" in refusal(pack_zip(files | {"RED.png": encode_png(PICTURE)}), "t.zip")
 
 
 def test_an_obj_with_textures_in_a_folder_of_their_own_keeps_its_folders() -> None:

@@ -235,6 +235,25 @@ def test_textures_are_made_smaller_on_request() -> None:
     assert [image.shape for image in obj.textures.values()] == [(8, 8, 3)]
 
 
+@pytest.mark.parametrize("based", [True, False])
+def test_sparse_accessors_change_some_rows(based: bool) -> None:
+    """Of the square, or of zeros: the corners named have other values."""
+    scene = textured()
+    rows, values = np.array([1, 2], "<u2"), np.array([[5, -1, 0], [5, 1, 0]], "<f4")
+    positions = scene.document["accessors"][scene.document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+    positions["sparse"] = {
+        "count": 2,
+        "indices": {"bufferView": scene.view(rows.tobytes()), "componentType": 5123},
+        "values": {"bufferView": scene.view(values.tobytes())},
+    }
+    expected = SQUARE.copy()
+    if not based:
+        expected[:] = 0
+        del positions["bufferView"]
+    expected[rows] = values
+    assert (corners(read(scene)) == expected[CORNERS].reshape(2, 3, 3)).all()
+
+
 # What is not read
 
 
@@ -280,6 +299,40 @@ def test_paint_as_long_as_the_image_before_comes_back() -> None:
     (name,) = obj.textures
     (image,) = read(repainted(data, obj.with_textures({name: after}))).textures.values()
     assert (image == after).all()
+
+
+def webp(scene: Scene, picture: Pixels) -> int:
+    """An image of ``scene`` in WebP, without loss."""
+    file = BytesIO()
+    Image.fromarray(picture).save(file, "WEBP", lossless=True)
+    return scene.add("images", {"bufferView": scene.view(file.getvalue()), "mimeType": "image/webp"})
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_webp_is_read_and_comes_back_as_png_that_every_reader_shows(beside: bool) -> None:
+    """Whether a PNG is there for readers without WebP, or not. Another texture keeps its WebP."""
+    scene = textured()
+    named = {"EXT_texture_webp": {"source": webp(scene, GRADIENT)}}
+    (first,) = scene.document["textures"]
+    first |= {"extensions": dict(named)}
+    if not beside:
+        del first["source"]
+    scene.document["extensionsUsed"] = ["EXT_texture_webp"]
+    scene.document["extensionsRequired"] = ["EXT_texture_webp"]
+    ((name, image),) = read(scene).textures.items()
+    assert (image == GRADIENT).all(), name
+
+    new, out = painted_over(scene)
+    same_paint(read(out), new)
+    document = contents(out)[0]
+    assert [texture.keys() for texture in document["textures"]] == [{"source"}]
+    assert document["images"][document["textures"][0]["source"]]["mimeType"] == "image/png"
+    assert not {"extensionsUsed", "extensionsRequired"} & document.keys()
+
+    scene.material(scene.add("textures", {"extensions": {"EXT_texture_webp": {"source": webp(scene, 255 - GRADIENT)}}}))
+    kept = contents(painted_over(scene)[1])[0]
+    assert kept["extensionsRequired"] == ["EXT_texture_webp"]
+    assert "source" not in kept["textures"][1]
 
 
 def test_only_the_base_colour_image_changes() -> None:
@@ -397,6 +450,15 @@ def test_of_a_folder_only_the_picture_changes() -> None:
     after = unpack(exported.data)
     assert exported.ending == ".zip"
     assert [name for name in files if after[name] != files[name]] == ["my maps/skin.png"]
+    assert list(after) == list(files)
+
+
+def test_a_picture_in_other_capitals_is_found_and_stays_where_it_is() -> None:
+    files = external()
+    files["My Maps/SKIN.png"] = files.pop("my maps/skin.png")
+    data = pack_zip(files)
+    after = unpack(repaint_file(data, painted(read_object(data, name="s.zip").obj), name="s.zip").data)
+    assert [name for name in files if after[name] != files[name]] == ["My Maps/SKIN.png"]
     assert list(after) == list(files)
 
 
