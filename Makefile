@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 help:
 	@echo "make demo    attack an object that comes with Trompe; results in trompe-demo/"
 	@echo "make test    run the tests (those with real objects too, if TROMPE_ASSETS names their folder)"
-	@echo "make thorough  run the tests on further cases (10 minutes)"
+	@echo "make thorough  run the tests on further cases (7 minutes)"
 	@echo "make chaos   kill, freeze and stop the service's processes while it works (6 minutes)"
 	@echo "make cluster run jobs on Ray clusters of simulated nodes (4 minutes)"
 	@echo "make compose build the images and test the stack of docker-compose.yml (needs Docker)"

@@ -54,7 +54,7 @@ def test_agents_at_work_at_once_get_their_own_pictures_and_none_waits_for_long(
 
     def go_on() -> bool:
         """Until the time is over, or a slow machine has had enough requests to compare."""
-        return time.monotonic() < until or sum(map(len, waits)) < 25 * AGENTS
+        return time.monotonic() < until or sum(map(len, waits)) < 50 * AGENTS
 
     def work(agent: int) -> None:
         random = np.random.default_rng(agent)
@@ -82,7 +82,7 @@ def test_agents_at_work_at_once_get_their_own_pictures_and_none_waits_for_long(
         *(AGENTS, seconds, sum(counts), min(counts), max(counts), 1000 * middle, 1000 * late),
     )
     assert wrong == []
-    assert min(counts) > max(counts) / 3, "turns are not fair"
+    assert min(counts) > 0.5 * max(counts), "turns are not fair"
     assert late < 30.0
 
 

@@ -161,20 +161,16 @@ class _Editor:
 
     def _show_in_all_readers(self, image: int) -> None:
         """Leave the textures of an image no copy in another encoding, which other readers would show instead."""
-        dropped = set()
-        for texture in self.document["textures"]:
-            if image in _sources(texture) and (others := _encodings(texture)):
+        textures = self.document["textures"]
+        dropped: set[str] = set()
+        for texture in textures:
+            if image in _sources(texture) and (others := _encodings(texture).keys()):
                 texture["source"] = image
                 dropped |= others
-                kept = {name: entry for name, entry in texture["extensions"].items() if name not in others}
-                texture |= {"extensions": kept}
-                if not kept:
-                    del texture["extensions"]
-        unused = dropped.difference(*[_encodings(texture) for texture in self.document["textures"]])
-        for key in {"extensionsUsed", "extensionsRequired"} & set(self.document):
-            self.document[key] = [name for name in self.document[key] if name not in unused]
-            if not self.document[key]:
-                del self.document[key]
+                _keep(texture, "extensions", {k: v for k, v in texture["extensions"].items() if k not in others})
+        unused = dropped.difference(*map(_encodings, textures))
+        for key in {"extensionsUsed", "extensionsRequired"} & self.document.keys():
+            _keep(self.document, key, [name for name in self.document[key] if name not in unused])
 
     def _replace_file(self, entry: Json, uri: str, png: bytes) -> None:
         path = self._container.upload.beside(uri)
@@ -332,14 +328,21 @@ def _texture_uses(entry: object, path: str) -> Iterator[tuple[str, int]]:
         yield from _texture_uses(value, f"{path}.{key}")
 
 
-def _encodings(texture: Json) -> set[str]:
-    """Extensions of a texture that name an image."""
+def _keep(entry: Json, key: str, left: Json | list[str]) -> None:
+    """Replace ``entry[key]`` by what is left of it; glTF allows no empty lists."""
+    if left:
+        entry[key] = left
+    else:
+        del entry[key]
+
+
+def _encodings(texture: Json) -> dict[str, int]:
+    """Extensions of a texture that name an image, with its number."""
     found = texture.get("extensions", {}).items()
-    return {name for name, entry in found if isinstance(entry, dict) and "source" in entry}
+    return {k: v["source"] for k, v in found if isinstance(v, dict) and isinstance(v.get("source"), int)}
 
 
-def _sources(texture: Json) -> Iterator[int]:
+def _sources(texture: Json) -> list[int]:
     """The images of a texture in all encodings."""
-    for entry in (texture, *texture.get("extensions", {}).values()):
-        if isinstance(entry, dict) and isinstance(entry.get("source"), int):
-            yield entry["source"]
+    own = texture.get("source")
+    return [*([own] if isinstance(own, int) else []), *_encodings(texture).values()]

@@ -53,20 +53,25 @@ class BufferView(_Part):
     byte_stride: Annotated[int, Field(ge=1, le=1024)] | None = None
 
 
-class SparseRows(_Part):
-    """Where the numbers, or the values, of changed rows are; indices alone have a component type."""
+class SparseValues(_Part):
+    """Values of the changed rows of an accessor."""
 
     buffer_view: Index
     byte_offset: Size = 0
-    component_type: Literal[5121, 5123, 5125] = 5125
+
+
+class SparseIndices(SparseValues):
+    """Numbers of the changed rows."""
+
+    component_type: Literal[5121, 5123, 5125]
 
 
 class Sparse(_Part):
     """Rows of an accessor with other values than its buffer view."""
 
     count: Annotated[int, Field(ge=1, le=3 * MAX_FACES)]
-    indices: SparseRows
-    values: SparseRows
+    indices: SparseIndices
+    values: SparseValues
 
 
 class Accessor(_Part):

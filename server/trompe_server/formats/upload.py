@@ -1,7 +1,7 @@
 """An uploaded model: its files, and the mesh file among them."""
 
 import posixpath
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from urllib.parse import unquote
 
@@ -37,12 +37,12 @@ class Upload:
             raise ObjectError(
                 f"{self.main!r} names {uri[:80]!r}; only files below its own folder are read. Put the file there."
             )
-        alike = [path] if path in self.files else [name for name in self.files if name.casefold() == path.casefold()]
-        if len(alike) != 1:
+        found = named(path, self.files)
+        if found is None:
             raise ObjectError(
                 f"{self.main!r} names {uri[:80]!r}, which is missing; zip the model together with its files."
             )
-        return alike[0]
+        return found
 
     def flat(self) -> dict[str, bytes]:
         """The files by name without folders. Raises ``ObjectError`` if two names are equal."""
@@ -66,3 +66,11 @@ class Upload:
 def base_name(path: str) -> str:
     """The file name at the end of a path with slashes or backslashes."""
     return path.replace("\\", "/").rsplit("/", 1)[-1]
+
+
+def named(name: str, files: Collection[str]) -> str | None:
+    """The file ``name`` among ``files``, or the only one that differs in capitals alone."""
+    if name in files:
+        return name
+    alike = [file for file in files if file.casefold() == name.casefold()]
+    return alike[0] if len(alike) == 1 else None

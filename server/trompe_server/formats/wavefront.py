@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from trompe_server.formats.assembly import DEFAULT_COLOUR, free_name, painted_flat, safe_name
 from trompe_server.formats.comparison import repainted
 from trompe_server.formats.pictures import decode, shrink, with_alpha_of
-from trompe_server.formats.upload import Upload
+from trompe_server.formats.upload import Upload, named
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import PICTURE_SUFFIXES
 from trompe_shared.object3d import Object3D, decode_alpha, decode_rgb, encode_png, object_from_files
@@ -24,22 +24,7 @@ def read(upload: Upload, max_texture: int | None = None) -> Object3D:
 
 def _completed(upload: Upload) -> Mapping[str, bytes]:
     files = upload.flat()
-    return files if _has_table(files) else complete(_spelled(files))
-
-
-def _spelled(files: Mapping[str, bytes]) -> dict[str, bytes]:
-    """``files`` with MTLs that spell pictures as their files are; some systems take no note of capitals."""
-    actual: dict[str, list[str]] = {}
-    for name in files:
-        actual.setdefault(name.casefold(), []).append(name)
-    spelled = dict(files)
-    for library in (name for name in files if name.lower().endswith(".mtl")):
-        text = files[library].decode("utf-8-sig", "replace")
-        for picture in {name for maps in parse_mtl(text).values() for name in maps.values()} - files.keys():
-            if len(found := actual.get(picture.casefold(), [])) == 1:
-                text = re.sub(rf"{re.escape(picture)}(?=\s*$)", found[0], text, flags=re.MULTILINE)
-                spelled[library] = text.encode()
-    return spelled
+    return files if _has_table(files) else complete(files)
 
 
 def _object(files: Mapping[str, bytes]) -> Object3D:
@@ -75,14 +60,28 @@ def shrunk(obj: Object3D, side: int | None) -> Object3D:
 def complete(files: Mapping[str, bytes]) -> dict[str, bytes]:
     """Complete the ``files`` of an OBJ: a texture for each material without one, UVs for each mesh without any.
 
-    Complete files stay unchanged. An MTL gets the missing lines; a changed OBJ is rewritten.
+    Complete files stay unchanged. An MTL gets the missing lines and the capitals of the pictures' files. A changed OBJ
+    is rewritten.
     """
+    files = _spelled(files)
     mesh = next(name for name in files if name.lower().endswith(".obj"))
     libraries = {
         name: data.decode("utf-8-sig", "replace") for name, data in files.items() if name.lower().endswith(".mtl")
     }
     surfaces = parse_surfaces(files[mesh].decode("utf-8-sig", "replace"), mesh)
     return _Completion(mesh, dict(files), libraries, surfaces).files_of()
+
+
+def _spelled(files: Mapping[str, bytes]) -> dict[str, bytes]:
+    """``files`` with the capitals of pictures' names in MTLs as in the files' names; Windows takes either."""
+    spelled = dict(files)
+    for library in (name for name in files if name.lower().endswith(".mtl")):
+        text = files[library].decode("utf-8-sig", "replace")
+        for picture in {name for maps in parse_mtl(text).values() for name in maps.values()} - files.keys():
+            if (found := named(picture, files)) is not None:
+                text = re.sub(rf"{re.escape(picture)}(?=\s*$)", found, text, flags=re.MULTILINE)
+                spelled[library] = text.encode()
+    return spelled
 
 
 def dissolved(files: Mapping[str, bytes]) -> dict[str, bytes]:

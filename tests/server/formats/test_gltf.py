@@ -312,9 +312,8 @@ def webp(scene: Scene, picture: Pixels) -> int:
 def test_webp_is_read_and_comes_back_as_png_that_every_reader_shows(beside: bool) -> None:
     """Whether a PNG is there for readers without WebP, or not. Another texture keeps its WebP."""
     scene = textured()
-    named = {"EXT_texture_webp": {"source": webp(scene, GRADIENT)}}
     (first,) = scene.document["textures"]
-    first |= {"extensions": dict(named)}
+    first["extensions"] = {"EXT_texture_webp": {"source": webp(scene, GRADIENT)}}
     if not beside:
         del first["source"]
     scene.document["extensionsUsed"] = ["EXT_texture_webp"]
