@@ -150,14 +150,23 @@ class Objective:
         everything = len(chosen) == len(shown)
         seen = (shown.detach() if everything else _rows(shown.detach(), chosen)).requires_grad_()
         passed = self._through(seen, batch, chosen)
-        logits = [member.logits(passed) for member in self.members]
-        loss = torch.stack([self.goal.losses(each).sum() for each in logits]).mean()
-        (gradient,) = torch.autograd.grad(loss, seen)
+        by_member = [self._of_member(member, passed.detach()) for member in self.members]
+        (gradient,) = torch.autograd.grad(passed, seen, torch.stack([each for each, *_ in by_member]).mean(0))
         by_image = gradient if everything else torch.zeros_like(shown).index_copy_(0, chosen, gradient)
         shown.backward(by_image)  # type: ignore[no-untyped-call]
-        reached = torch.stack([self.goal.reached(each) for each in logits]).all(0)
-        settled = torch.stack([self.goal.settled(each) for each in logits]).all(0)
-        return float(loss.detach()), int(reached.sum()), settled
+        _, losses, reached, settled = zip(*by_member, strict=True)
+        return sum(losses) / len(losses), int(torch.stack(reached).all(0).sum()), torch.stack(settled).all(0)
+
+    def _of_member(self, member: WhiteBoxClassifier, images: Tensor) -> tuple[Tensor, float, Tensor, Tensor]:
+        """Gradient of the summed loss of one classifier, the loss, and masks of reached and settled images.
+
+        Each has its own graph: the activations of one network are most of an attack's memory.
+        """
+        images.requires_grad_()
+        logits = member.logits(images)
+        loss = self.goal.losses(logits).sum()
+        (gradient,) = torch.autograd.grad(loss, images)
+        return gradient, float(loss.detach()), self.goal.reached(logits), self.goal.settled(logits)
 
     def _through(self, images: Tensor, batch: int, chosen: Int[Tensor, " chosen"]) -> Tensor:
         """Images of the ``chosen`` views of a batch through the pipeline."""
