@@ -271,7 +271,7 @@ class SearchOptions(_Part):
         None, f"views in one step; default: {VIEWS_PER_STEP} of a pool, all of the grid"
     )
     surrogate: SurrogateModel = _option("auto", "colour model of the surrogate")
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = _option(0, "the same seed and threads give the same bytes", in_form=True)
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = _option(0, "the same seed and threads give equal bytes", in_form=True)
 
 
 class ViewOptions(_Part):
