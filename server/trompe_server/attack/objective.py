@@ -150,11 +150,11 @@ class Objective:
         everything = len(chosen) == len(shown)
         seen = (shown.detach() if everything else _rows(shown.detach(), chosen)).requires_grad_()
         passed = self._through(seen, batch, chosen)
-        by_member = [self._of_member(member, passed.detach()) for member in self.members]
-        (gradient,) = torch.autograd.grad(passed, seen, torch.stack([each for each, *_ in by_member]).mean(0))
+        by_member = (self._of_member(member, passed.detach()) for member in self.members)
+        gradients, losses, reached, settled = zip(*by_member, strict=True)
+        (gradient,) = torch.autograd.grad(passed, seen, torch.stack(gradients).mean(0))
         by_image = gradient if everything else torch.zeros_like(shown).index_copy_(0, chosen, gradient)
         shown.backward(by_image)  # type: ignore[no-untyped-call]
-        _, losses, reached, settled = zip(*by_member, strict=True)
         return sum(losses) / len(losses), int(torch.stack(reached).all(0).sum()), torch.stack(settled).all(0)
 
     def _of_member(self, member: WhiteBoxClassifier, images: Tensor) -> tuple[Tensor, float, Tensor, Tensor]:

@@ -49,8 +49,8 @@ def _gradients(
     for start in range(0, len(images), BATCH):
         batch = torch.from_numpy(images[start : start + BATCH]).float().div(255)
         inputs = batch.permute(0, 3, 1, 2).requires_grad_()
-        losses = [goal.losses(member.logits(inputs), clamped=False).sum() for member in members]
-        (gradient,) = torch.autograd.grad(torch.stack(losses).mean(), inputs)
+        losses = (goal.losses(member.logits(inputs), clamped=False).sum() for member in members)
+        gradient = torch.stack([torch.autograd.grad(loss, inputs)[0] for loss in losses]).mean(0)
         yield gradient.nan_to_num(0, 0, 0).permute(0, 2, 3, 1).cpu()
 
 
