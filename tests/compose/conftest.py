@@ -25,6 +25,7 @@ from trompe_client import Client
 
 ROOT: Final = Path(__file__).parents[2]
 STAND_INS: Final = Path(__file__).parent / "stand_ins"
+THREADS: Final = Path(__file__).parent / "threads.yml"
 OFFICIAL: Final = re.compile(r"image: ((?:postgres|minio/minio):\S+)")
 PROFILES: Final = ("--profile", "cluster", "--profile", "s3")
 VERSION: Final = "test"
@@ -159,7 +160,7 @@ def engine() -> str:
 @pytest.fixture(scope="session")
 def built(engine: str) -> Stack:
     """The project with its images built, nothing of it running."""
-    files = [ROOT / "docker-compose.yml"]
+    files = [ROOT / "docker-compose.yml", THREADS]
     figures.append(f"engine {engine}, {os.cpu_count()} cores")
     if _official_images_missing():
         logger.warning("the official images can't be pulled: Debian's PostgreSQL and moto stand in for them")

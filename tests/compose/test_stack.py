@@ -303,18 +303,19 @@ def test_the_same_stack_keeps_its_files_in_an_object_store(stack: Stack, tmp_pat
     assert job.id not in stack.run_in(worker, "find", "/data", "-name", "*")
 
 
-def test_the_same_jobs_run_on_a_ray_cluster_and_outlive_one_of_its_nodes(stack: Stack, tmp_path: Path) -> None:
+def test_the_same_jobs_run_on_a_ray_cluster_and_outlive_one_of_its_nodes(
+    stack: Stack, undisturbed: Outcome, tmp_path: Path
+) -> None:
     cluster = stack.renewed(COMPOSE_PROFILES="cluster")
     with stack.timed("changing to a Ray cluster"):
         cluster.up(worker=0)
     with cluster.client() as client:
         wait_until(lambda: sum(each.alive and each.fault is None for each in client.workers()) == 2, seconds=PATIENCE)
-        undisturbed = outcome(client.attack("mug", **LONG), tmp_path / "undisturbed")  # a node has threads of its own
         job = begin(client)
         node = host_of(client, job)
         assert node in {container[:12] for container in cluster.containers("ray-node")}
         with stack.timed("from the death of a Ray node in mid-job to the job's end on the other"):
             stack.docker("kill", node)
-            assert outcome(job, tmp_path / "outlived") == undisturbed
+            assert outcome(job, tmp_path) == undisturbed
         assert job.refresh().attempts == 2
         assert host_of(client, job) != node
