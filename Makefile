@@ -26,10 +26,10 @@ demo: $(VENV)/.installed-server egl
 	$(BIN)/trompe demo --out trompe-demo
 
 test: $(VENV)/.installed-dev egl
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 thorough: $(VENV)/.installed-dev egl
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m thorough
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m thorough
 
 chaos: $(VENV)/.installed-dev egl
 	$(BIN)/python -m pytest -m "chaos and not slow" tests/service/test_chaos.py

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import signal
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -23,6 +24,9 @@ from trompe_shared.shipped import shipped_objects
 
 Surface = tuple[ArrayLike, ArrayLike, NDArray[np.uint8]]
 """Corners (F, 3, 3) in metres, texture coordinates (F, 3, 2), and texture (H, W, 3)."""
+
+LONGEST = ("service/test_workers.py", "pages/test_pages.py", "pages/test_orbit.py", "e2e/test_service.py")
+"""Files of more than a minute and a half."""
 
 INSTALLABLE = re.compile("install|NOT TESTED")
 """Matches the reason of a test skipped because something is not installed."""
@@ -47,6 +51,12 @@ def pytest_configure() -> None:
 def pytest_xdist_auto_num_workers() -> int:
     """Two processes more than cores: many tests wait for other processes."""
     return len(os.sched_getaffinity(0)) + 2
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that take longest first, then those with most tests: a long file that begins last works alone."""
+    tests = Counter(item.path for item in items)
+    items.sort(key=lambda item: (not item.path.as_posix().endswith(LONGEST), -tests[item.path], item.path))
 
 
 def share_the_cores(processes: int) -> None:
