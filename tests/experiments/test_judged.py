@@ -1,7 +1,6 @@
 """Judgements of the results of an experiment: what is judged, with which options, and that rows are kept."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,12 +13,11 @@ from trompe_experiments.baselines import baselines_markdown
 from trompe_experiments.figures import read_data
 from trompe_experiments.judged import JUDGEMENTS, NOISE, NOTHING, JudgedRow, judge_all, noised
 from trompe_experiments.table import read_table
-from trompe_server.api.examples import MANIFEST
+from trompe_server.api.examples import MANIFEST as EXAMPLE
 from trompe_shared.api import Job, JudgementRequest, Manifest
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
-EXAMPLE: dict[str, Any] = MANIFEST["content"]["application/json"]["example"]
 FILE = {
     "name": "small",
     "objects": {"mug": {"elevation": [5, 15]}, "ball": {}},

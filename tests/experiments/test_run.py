@@ -36,11 +36,9 @@ from trompe_experiments.service import Service
 from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, RowId, read_table
 from trompe_experiments.terminal import compared, differences, failures, read_results
 from trompe_experiments.tracking import Tracked
-from trompe_server.api.examples import RESULT
+from trompe_server.api.examples import RESULT as EXAMPLE
 from trompe_shared.api import Job, JobRequest, JobSpec, JobState, Problem, Progress, Result
 from trompe_shared.errors import SpecError
-
-EXAMPLE = RESULT["content"]["application/json"]["example"]
 
 
 def result_of(request: JobRequest) -> Result:

@@ -2,22 +2,21 @@
 
 from typing import Any, Final
 
-Content = dict[str, Any]
 Answers = dict[int | str, dict[str, Any]]
 
 
-def _json(example: Any) -> Content:
-    return {"content": {"application/json": {"example": example}}}
-
-
-def found(content: Content, description: str = "Found") -> Answers:
+def found(example: Any) -> Answers:
     """The answer 200 with this example."""
-    return {200: {"description": description, **content}}
+    return _answer(200, "Found", example)
 
 
-def made(content: Content, description: str = "Created") -> Answers:
+def made(example: Any) -> Answers:
     """The answer 201 with this example."""
-    return {201: {"description": description, **content}}
+    return _answer(201, "Created", example)
+
+
+def _answer(status: int, description: str, example: Any) -> Answers:
+    return {status: {"description": description, "content": {"application/json": {"example": example}}}}
 
 
 JOB_REQUESTS: Final[dict[str, Any]] = {
@@ -59,7 +58,7 @@ JUDGEMENT_REQUESTS: Final[dict[str, Any]] = {
     },
 }
 
-_JOB: Final[dict[str, Any]] = {
+JOB: Final[dict[str, Any]] = {
     "id": "8f14e45fceea167a",
     "state": "running",
     "spec": {"object": "mug", "goal": {"label": ["mug"]}, "victim": {"classifier": "tiny"}, "paint": {"epsilon": 0.02}},
@@ -86,7 +85,7 @@ _JOB: Final[dict[str, Any]] = {
     "note": None,
     "artifacts": [],
 }
-_OBJECT: Final = {
+OBJECT: Final = {
     "id": "2c624232cdd221771294dfbb310aca000a0df6ac8b66b696d90ef06fdefb64a3",
     "name": "vase",
     "materials": ["glaze"],
@@ -95,7 +94,7 @@ _OBJECT: Final = {
     "radius": 0.11,
     "shipped": False,
 }
-_CLASSIFIER: Final = {
+CLASSIFIER: Final = {
     "id": "tiny",
     "name": "tiny",
     "white_box": True,
@@ -104,8 +103,8 @@ _CLASSIFIER: Final = {
     "classes": ["ball", "bottle", "mug"],
     "shipped": True,
 }
-_BACKGROUND: Final = {"id": "19581e27de7ced00ff1ce50b2047e7a567c76b1cbaebabe5ef03f7c3017bb5b7", "name": "beach"}
-_WORKER: Final = {
+BACKGROUND: Final = {"id": "19581e27de7ced00ff1ce50b2047e7a567c76b1cbaebabe5ef03f7c3017bb5b7", "name": "beach"}
+WORKER: Final = {
     "id": "gpu-1-3f29c1",
     "host": "gpu-1",
     "device": "16 CPU, 2 GPU",
@@ -115,34 +114,25 @@ _WORKER: Final = {
     "jobs": ["8f14e45fceea167a"],
     "fault": None,
 }
-_EXPERIMENT: Final = {
+EXPERIMENT: Final = {
     "name": "mugs",
     "jobs": {"succeeded": 11, "running": 1, "queued": 4},
     "created": "2026-01-31T11:00:00Z",
 }
 
-JOB: Final = _json(_JOB)
-JUDGEMENT: Final = _json(_JOB | {"spec": {"before": "mug", "after": "mug", "label": ["mug"], "epsilon": 0.05}})
-JOB_LIST: Final = _json({"jobs": [_JOB], "next_cursor": "41"})
-OBJECT: Final = _json(_OBJECT)
-OBJECT_LIST: Final = _json([_OBJECT])
-CLASSIFIER: Final = _json(_CLASSIFIER)
-CLASSIFIER_LIST: Final = _json([_CLASSIFIER])
-BACKGROUND: Final = _json(_BACKGROUND)
-BACKGROUND_LIST: Final = _json([_BACKGROUND])
-CLASSIFICATIONS: Final = _json(
-    [
-        {"index": 5, "name": "mug", "confidence": 0.97, "true_confidence": 0.97, "correct": True},
-        {"index": 1, "name": "bottle", "confidence": 0.81, "true_confidence": 0.09, "correct": False},
-    ]
-)
-WORKER_LIST: Final = _json([_WORKER])
-RENDERER_LIST: Final = _json(
-    [{"address": "127.0.0.1:8085", "alive": True, "engine": "pyrender", "version": "0.1.45", "settings": ""}]
-)
-EXPERIMENT_LIST: Final = _json([_EXPERIMENT])
-HEALTHY: Final = _json({"status": "ok"})
-READY: Final = _json({"status": "ready"})
+JUDGEMENT: Final = JOB | {"spec": {"before": "mug", "after": "mug", "label": ["mug"], "epsilon": 0.05}}
+JOB_LIST: Final = {"jobs": [JOB], "next_cursor": "41"}
+CLASSIFICATIONS: Final = [
+    {"index": 5, "name": "mug", "confidence": 0.97, "true_confidence": 0.97, "correct": True},
+    {"index": 1, "name": "bottle", "confidence": 0.81, "true_confidence": 0.09, "correct": False},
+]
+RENDERER: Final = {
+    "address": "127.0.0.1:8085",
+    "alive": True,
+    "engine": "pyrender",
+    "version": "0.1.45",
+    "settings": "",
+}
 
 EVENT_STREAM: Final = (
     'id: 3\nevent: progress\ndata: {"id": 3, "time": "2026-01-31T12:00:00Z", "state": "running", '
@@ -175,67 +165,63 @@ _VIEW: Final = {
     "after_confidence": 0.81,
     "after_true_confidence": 0.09,
 }
-RESULT: Final = _json(
-    {
-        "spec": {"object": "mug", "goal": {"label": ["mug"]}},
-        "object": "mug",
-        "label": 2,
-        "label_name": "mug",
-        "labels": [2],
-        "label_names": ["mug"],
-        "classifier": "tiny",
-        "epsilon": 0.05,
-        "alpha": 0.01,
-        "tau": 0.05,
-        "surrogate_model": "curve",
-        "surrogate_reason": "the cheapest within tolerance",
-        "seed": 0,
-        "steps": 30,
-        "image_size": [128, 128],
-        "surrogate": _ACCURACY,
-        "target": _ACCURACY,
-        "held_out": _ACCURACY,
-        "transfer_gap": 0.0,
-        "disagreement": 0.0,
-        "margin_error": 0.02,
-        "texels_altered": 0.62,
-        "mean_texel_change": 0.031,
-        "max_view_change": 0.049,
-        "seconds": {"open": 0.4, "prepare": 3.1, "calibrate": 6.4, "attack": 21.0, "judge": 3.0, "report": 2.2},
-        "probe_renders": 304,
-        "attacked_views": 75,
-        "further_renders": 105,
-        "versions": {"trompe": "0.2.0"},
-        "views": [_VIEW],
-        "held_out_views": [_VIEW],
-    }
-)
+RESULT: Final[dict[str, Any]] = {
+    "spec": {"object": "mug", "goal": {"label": ["mug"]}},
+    "object": "mug",
+    "label": 2,
+    "label_name": "mug",
+    "labels": [2],
+    "label_names": ["mug"],
+    "classifier": "tiny",
+    "epsilon": 0.05,
+    "alpha": 0.01,
+    "tau": 0.05,
+    "surrogate_model": "curve",
+    "surrogate_reason": "the cheapest within tolerance",
+    "seed": 0,
+    "steps": 30,
+    "image_size": [128, 128],
+    "surrogate": _ACCURACY,
+    "target": _ACCURACY,
+    "held_out": _ACCURACY,
+    "transfer_gap": 0.0,
+    "disagreement": 0.0,
+    "margin_error": 0.02,
+    "texels_altered": 0.62,
+    "mean_texel_change": 0.031,
+    "max_view_change": 0.049,
+    "seconds": {"open": 0.4, "prepare": 3.1, "calibrate": 6.4, "attack": 21.0, "judge": 3.0, "report": 2.2},
+    "probe_renders": 304,
+    "attacked_views": 75,
+    "further_renders": 105,
+    "versions": {"trompe": "0.2.0"},
+    "views": [_VIEW],
+    "held_out_views": [_VIEW],
+}
 
 _FILE: Final = {"source": "mug", "sha256": "2c624232cdd221771294dfbb310aca00", "bytes": 400_000}
-MANIFEST: Final = _json(
-    {
-        "suite": "standard-1",
-        "label": ["mug"],
-        "epsilon": 0.05,
-        "before": _FILE,
-        "after": _FILE | {"source": "after.zip"},
-        "networks": [{"name": "tiny", "reference": "tiny", "image_size": [128, 128], "labels": [2]}],
-        "renderers": [{"name": "pyrender"}],
-        "image_size": [128, 128],
-        "seed": 0,
-        "views": [],
-        "findings": [{"kind": "size", "text": "The texture is 512 x 512 texels before and 256 x 256 after."}],
-        "textures": [],
-        "cells": [{"renderer": "pyrender", "network": "tiny", "pipeline": "as rendered", "accuracy": _ACCURACY}],
-        "predictions": [],
-        "seconds": 12.5,
-        "versions": {"trompe": "0.2.0"},
-    }
-)
+MANIFEST: Final[dict[str, Any]] = {
+    "suite": "standard-1",
+    "label": ["mug"],
+    "epsilon": 0.05,
+    "before": _FILE,
+    "after": _FILE | {"source": "after.zip"},
+    "networks": [{"name": "tiny", "reference": "tiny", "image_size": [128, 128], "labels": [2]}],
+    "renderers": [{"name": "pyrender"}],
+    "image_size": [128, 128],
+    "seed": 0,
+    "views": [],
+    "findings": [{"kind": "size", "text": "The texture is 512 x 512 texels before and 256 x 256 after."}],
+    "textures": [],
+    "cells": [{"renderer": "pyrender", "network": "tiny", "pipeline": "as rendered", "accuracy": _ACCURACY}],
+    "predictions": [],
+    "seconds": 12.5,
+    "versions": {"trompe": "0.2.0"},
+}
 
 _BYTES: Final = {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}
-FILE: Final = _BYTES
 PART_ANSWERS: Final[Answers] = {
     206: {"description": "The requested range.", **_BYTES},
     304: {"description": "Unchanged (If-None-Match)."},
 }
+FILE_ANSWERS: Final[Answers] = {200: {"description": "Found", **_BYTES}} | PART_ANSWERS

@@ -16,7 +16,7 @@ router = APIRouter(prefix="/v1/experiments", tags=["experiments"], responses=PRO
 LABEL: Final = "experiment"
 
 
-@router.get("", responses=examples.found(examples.EXPERIMENT_LIST))
+@router.get("", responses=examples.found([examples.EXPERIMENT]))
 def list_experiments(store: StoreDep) -> list[ExperimentInfo]:
     """Experiments with the number of their jobs by state, newest first."""
     return [

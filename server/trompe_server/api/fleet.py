@@ -10,13 +10,13 @@ from trompe_shared.api import RendererInfo, WorkerInfo
 router = APIRouter(prefix="/v1", tags=["workers"], responses=PROBLEMS)
 
 
-@router.get("/workers", responses=examples.found(examples.WORKER_LIST))
+@router.get("/workers", responses=examples.found([examples.WORKER]))
 def list_workers(store: StoreDep) -> list[WorkerInfo]:
     """Attack workers, by their latest heartbeats."""
     return store.workers()
 
 
-@router.get("/renderers", responses=examples.found(examples.RENDERER_LIST))
+@router.get("/renderers", responses=examples.found([examples.RENDERER]))
 def list_renderers(services: ServicesDep) -> list[RendererInfo]:
     """Renderer workers of this server: whether they accept connections, and their engines."""
     return services.renderers()

@@ -10,13 +10,13 @@ from trompe_server.api.services import ServicesDep
 router = APIRouter(tags=["health"], responses=PROBLEMS)
 
 
-@router.get("/healthz", responses=examples.found(examples.HEALTHY))
+@router.get("/healthz", responses=examples.found({"status": "ok"}))
 def health() -> dict[str, str]:
     """The process answers."""
     return {"status": "ok"}
 
 
-@router.get("/readyz", responses=examples.found(examples.READY))
+@router.get("/readyz", responses=examples.found({"status": "ready"}))
 def readiness(services: ServicesDep, request: Request) -> Response:
     """Database, worker and renderer are up; 503 names the missing ones."""
     services.store.page(limit=1)

@@ -26,7 +26,11 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=PROBLEMS)
 RESULT: Final = "result.json"
 
 NEW_OR_KNOWN: Final[dict[int | str, dict[str, Any]]] = {
-    200: {"model": Job, "description": "The job of an earlier request with the same key", **examples.JOB},
+    200: {
+        **examples.found(examples.JOB)[200],
+        "model": Job,
+        "description": "The job of an earlier request with the same key",
+    },
     **examples.made(examples.JOB),
 }
 
@@ -138,9 +142,7 @@ def read_result(services: ServicesDep, digests: DigestsDep, request: Request, jo
 
 
 @router.head("/{job}/artifacts/{name}", include_in_schema=False)
-@router.get(
-    "/{job}/artifacts/{name}", response_class=Response, responses=examples.found(examples.FILE) | examples.PART_ANSWERS
-)
+@router.get("/{job}/artifacts/{name}", response_class=Response, responses=examples.FILE_ANSWERS)
 def read_artifact(services: ServicesDep, digests: DigestsDep, request: Request, job: str, name: str) -> Response:
     """One of the job's ``artifacts``, or a range of its bytes. The ETag is the file's SHA-256."""
     found = services.store.get(job)

@@ -54,7 +54,7 @@ async def add_object(
     return await _in_turn(turn, lambda: library.add_object(file.file, filename, name=name, max_texture=max_texture))
 
 
-@router.get("/objects", responses=examples.found(examples.OBJECT_LIST), tags=["objects"])
+@router.get("/objects", responses=examples.found([examples.OBJECT]), tags=["objects"])
 def list_objects(library: LibraryDep) -> list[ObjectInfo]:
     """All objects, the shipped ones first."""
     return library.objects()
@@ -81,7 +81,7 @@ async def add_classifier(
     )
 
 
-@router.get("/classifiers", responses=examples.found(examples.CLASSIFIER_LIST), tags=["classifiers"])
+@router.get("/classifiers", responses=examples.found([examples.CLASSIFIER]), tags=["classifiers"])
 def list_classifiers(library: LibraryDep) -> list[ClassifierInfo]:
     """All classifiers, the shipped one first."""
     return library.classifiers()
@@ -99,7 +99,7 @@ async def add_background(library: LibraryDep, turn: TurnDep, file: UploadFile) -
     return await _in_turn(turn, lambda: library.add_background(file.file.read(), file.filename or "background"))
 
 
-@router.get("/backgrounds", responses=examples.found(examples.BACKGROUND_LIST), tags=["backgrounds"])
+@router.get("/backgrounds", responses=examples.found([examples.BACKGROUND]), tags=["backgrounds"])
 def list_backgrounds(library: LibraryDep) -> list[BackgroundInfo]:
     """All uploaded backgrounds."""
     return library.backgrounds()
