@@ -7,14 +7,10 @@ from fastapi import APIRouter, File, Form, HTTPException, Request, UploadFile
 
 from trompe_server.api import examples
 from trompe_server.api.problems import PROBLEMS
-from trompe_server.api.rate import RateLimit
-from trompe_server.api.services import LibraryDep
-from trompe_server.library.classification import Networks
+from trompe_server.api.services import Services, ServicesDep
 from trompe_server.spec.labels import resolve_labels
 from trompe_shared.api import Classification
 
-RATE: Final = 20.0
-"""Requests per second of each token, or of each address without one."""
 MOST_BYTES: Final = 4 * 2**20
 """Size of an image."""
 
@@ -38,7 +34,7 @@ Gain = Annotated[float | None, Form(description="factor of the levels", gt=0, le
 @router.post("/classify", responses=examples.found(examples.CLASSIFICATIONS))
 def classify(
     request: Request,
-    library: LibraryDep,
+    services: ServicesDep,
     images: Images,
     label: Label,
     classifier: Annotated[str, Form(max_length=200)] = "tiny",
@@ -51,13 +47,12 @@ def classify(
 
     Stores nothing; a token that may only read is enough.
     """
-    _check_rate(request)
-    info = library.classifier(classifier)
+    _check_rate(services, request)
+    info = services.library.classifier(classifier)
     labels = resolve_labels(label, info.classes, info.n_classes, info.name)
-    networks: Networks = request.app.state.networks
     given = {"resize": resize, "blur": blur, "gain": gain, "jpeg": jpeg}
-    found = networks.classify(
-        library.classifier_path(classifier),
+    found = services.networks.classify(
+        services.library.classifier_path(classifier),
         [_read(each) for each in images],
         labels=labels,
         strengths={name: value for name, value in given.items() if value is not None},
@@ -74,10 +69,9 @@ def classify(
     ]
 
 
-def _check_rate(request: Request) -> None:
-    limit: RateLimit = request.app.state.classifications
+def _check_rate(services: Services, request: Request) -> None:
     client = request.scope.get("token") or (request.client.host if request.client else "unknown")
-    if wait := limit.wait(client):
+    if wait := services.classifications.wait(client):
         detail = f"Too many images to classify; retry in {wait:.2f} s."
         raise HTTPException(429, detail, {"Retry-After": str(math.ceil(wait))})
 

@@ -3,9 +3,9 @@
 import hashlib
 import re
 import zipfile
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from datetime import datetime
+from functools import lru_cache
 from mimetypes import guess_type
 from typing import BinaryIO, Final, cast
 
@@ -22,25 +22,14 @@ _PACKED: Final = frozenset({".gif", ".jpg", ".npz", ".png", ".webp", ".zip"})
 """Suffixes of compressed files."""
 
 
-class Digests:
-    """SHA-256 of files, cached for files that no longer change."""
+def digest_of(artifacts: JobArtifacts, name: str) -> str:
+    """SHA-256 of a file in hexadecimal."""
+    with artifacts.open(name) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
 
-    def __init__(self) -> None:
-        self._known: OrderedDict[tuple[str, str], str] = OrderedDict()
 
-    def of(self, artifacts: JobArtifacts, job: str, name: str, *, lasting: bool) -> str:
-        """Hash of a job's file in hexadecimal; cached if ``lasting``."""
-        if lasting and (job, name) in self._known:
-            return self._known[job, name]
-        hashed = hashlib.sha256()
-        for part in _parts(artifacts.open(name), range(artifacts.size(name))):
-            hashed.update(part)
-        digest = hashed.hexdigest()
-        if lasting:
-            self._known[job, name] = digest
-            while len(self._known) > REMEMBERED:
-                self._known.popitem(last=False)
-        return digest
+lasting_digest: Final = lru_cache(REMEMBERED)(digest_of)
+"""The same for files that no longer change."""
 
 
 def send_file(request: Request, artifacts: JobArtifacts, name: str, *, digest: str) -> Response:

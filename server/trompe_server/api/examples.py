@@ -224,4 +224,4 @@ PART_ANSWERS: Final[Answers] = {
     206: {"description": "The requested range.", **_BYTES},
     304: {"description": "Unchanged (If-None-Match)."},
 }
-FILE_ANSWERS: Final[Answers] = {200: {"description": "Found", **_BYTES}} | PART_ANSWERS
+FILE_ANSWERS: Final[Answers] = {200: {"description": "Found", **_BYTES}, **PART_ANSWERS}

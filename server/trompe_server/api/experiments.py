@@ -7,7 +7,7 @@ from fastapi import APIRouter
 from trompe_server.api import examples
 from trompe_server.api.jobs import Cursor, Limit
 from trompe_server.api.problems import PROBLEMS
-from trompe_server.api.services import StoreDep
+from trompe_server.api.services import ServicesDep
 from trompe_server.errors import NotFoundError
 from trompe_shared.api import ExperimentInfo, JobList
 
@@ -17,18 +17,18 @@ LABEL: Final = "experiment"
 
 
 @router.get("", responses=examples.found([examples.EXPERIMENT]))
-def list_experiments(store: StoreDep) -> list[ExperimentInfo]:
+def list_experiments(services: ServicesDep) -> list[ExperimentInfo]:
     """Experiments with the number of their jobs by state, newest first."""
     return [
         ExperimentInfo(name=group.value, jobs=dict(group.counts), created=group.created)
-        for group in store.groups(LABEL)
+        for group in services.store.groups(LABEL)
     ]
 
 
 @router.get("/{name:path}", responses=examples.found(examples.JOB_LIST))
-def read_experiment(store: StoreDep, name: str, limit: Limit = 50, cursor: Cursor = None) -> JobList:
+def read_experiment(services: ServicesDep, name: str, limit: Limit = 50, cursor: Cursor = None) -> JobList:
     """Jobs of an experiment, newest first."""
-    page = store.page(labels={LABEL: name}, limit=limit, cursor=cursor)
+    page = services.store.page(labels={LABEL: name}, limit=limit, cursor=cursor)
     if not page.jobs and cursor is None:
         raise NotFoundError(f"There is no experiment {name!r}. List the experiments to find its name.")
     return page

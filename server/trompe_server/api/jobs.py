@@ -10,14 +10,13 @@ from fastapi.responses import Response, StreamingResponse
 from sse_starlette import EventSourceResponse
 
 from trompe_server.api import examples
-from trompe_server.api.downloads import send_file, zip_stream
+from trompe_server.api.downloads import digest_of, lasting_digest, send_file, zip_stream
 from trompe_server.api.following import follow
 from trompe_server.api.problems import PROBLEMS
-from trompe_server.api.services import DigestsDep, Services, ServicesDep, StoreDep
+from trompe_server.api.services import Services, ServicesDep
 from trompe_server.api.submission import checked_spec
 from trompe_server.errors import ConflictError, NotFoundError
 from trompe_server.queue import retention
-from trompe_server.queue.store import JobStore
 from trompe_shared.api import Job, JobList, JobRequest, JobState, JudgementRequest, JudgementSpec, Result
 from trompe_shared.errors import SpecError
 
@@ -58,7 +57,7 @@ def submit(
 ) -> Job:
     """Queue an attack. Objects and networks must exist. The job keeps their ids: later uploads do not change it."""
     spec, names = checked_spec(request, services.library)
-    return create(services.store, spec, names, response, idempotency_key)
+    return create(services, spec, names, response, idempotency_key)
 
 
 @router.post("/check", status_code=204)
@@ -71,7 +70,7 @@ def check_job(
 
 @router.get("", responses=examples.found(examples.JOB_LIST))
 def list_jobs(
-    store: StoreDep,
+    services: ServicesDep,
     state: JobState | None = None,
     labels: LabelFilters = [],  # noqa: B006
     object: Annotated[str | None, Query(description="id of the object, or name of a shipped one")] = None,
@@ -81,13 +80,15 @@ def list_jobs(
 ) -> JobList:
     """Jobs, newest first."""
     wanted = labels_of(labels)
-    return store.page(state=state, labels=wanted, object=object, classifier=classifier, limit=limit, cursor=cursor)
+    return services.store.page(
+        state=state, labels=wanted, object=object, classifier=classifier, limit=limit, cursor=cursor
+    )
 
 
 @router.get("/{job}", responses=examples.found(examples.JOB))
-def read_job(store: StoreDep, job: str) -> Job:
+def read_job(services: ServicesDep, job: str) -> Job:
     """One job."""
-    return store.get(job)
+    return services.store.get(job)
 
 
 @router.delete("/{job}", status_code=204)
@@ -97,9 +98,9 @@ def delete_job(services: ServicesDep, job: str) -> None:
 
 
 @router.post("/{job}/cancel", responses=examples.found(examples.JOB))
-def cancel_job(store: StoreDep, job: str) -> Job:
+def cancel_job(services: ServicesDep, job: str) -> Job:
     """Cancel a job: a queued one at once, a running one within seconds. An ended job stays as it is."""
-    return store.request_cancel(job)
+    return services.store.request_cancel(job)
 
 
 @router.post("/{job}/retry", status_code=201, responses=NEW_OR_KNOWN)
@@ -111,7 +112,7 @@ def retry_job(services: ServicesDep, job: str, response: Response, idempotency_k
     queued = {"priority": old.priority, "labels": old.labels, "needs": old.needs}
     kind = JudgementRequest if isinstance(old.spec, JudgementSpec) else JobRequest
     request = kind.model_validate(old.spec.model_dump() | queued)
-    return create(services.store, request, old.names, response, idempotency_key)
+    return create(services, request, old.names, response, idempotency_key)
 
 
 @router.get(
@@ -125,31 +126,31 @@ def retry_job(services: ServicesDep, job: str, response: Response, idempotency_k
     },
 )
 def follow_job(
-    store: StoreDep,
+    services: ServicesDep,
     job: str,
     last_event_id: Annotated[str | None, Header(description="resume after this event")] = None,
 ) -> EventSourceResponse:
     """Events of a job from the first, or after ``Last-Event-ID``, to the last."""
-    store.get(job)
+    services.store.get(job)
     seen = re.fullmatch(r"\d+", last_event_id or "", re.ASCII)
-    return follow(store, job, after=min(int(seen[0][:10]), 2**31 - 1) if seen else 0)
+    return follow(services.store, job, after=min(int(seen[0][:10]), 2**31 - 1) if seen else 0)
 
 
 @router.get("/{job}/result", response_model=Result, responses=examples.found(examples.RESULT) | examples.PART_ANSWERS)
-def read_result(services: ServicesDep, digests: DigestsDep, request: Request, job: str) -> Response:
+def read_result(services: ServicesDep, request: Request, job: str) -> Response:
     """Result of a successful attack."""
-    return send(services, digests, request, with_result(services, job, RESULT), RESULT)
+    return send(services, request, with_result(services, job, RESULT), RESULT)
 
 
 @router.head("/{job}/artifacts/{name}", include_in_schema=False)
 @router.get("/{job}/artifacts/{name}", response_class=Response, responses=examples.FILE_ANSWERS)
-def read_artifact(services: ServicesDep, digests: DigestsDep, request: Request, job: str, name: str) -> Response:
+def read_artifact(services: ServicesDep, request: Request, job: str, name: str) -> Response:
     """One of the job's ``artifacts``, or a range of its bytes. The ETag is the file's SHA-256."""
     found = services.store.get(job)
     if name not in found.artifacts:
         known = ", ".join(found.artifacts) or "none yet"
         raise NotFoundError(f"Job {job} has no artifact {name!r}. It has: {known}.")
-    return send(services, digests, request, found, name)
+    return send(services, request, found, name)
 
 
 @router.get("/{job}/archive", response_class=StreamingResponse, responses={200: examples.ARCHIVE})
@@ -164,14 +165,14 @@ def read_archive(services: ServicesDep, job: str) -> StreamingResponse:
 
 
 def create(
-    store: JobStore,
+    services: Services,
     request: JobRequest | JudgementRequest,
     names: Mapping[str, str],
     response: Response,
     key: str | None,
 ) -> Job:
     """Queue a job, and answer with its place."""
-    job, new = store.create(request, names=names, idempotency_key=key)
+    job, new = services.store.create(request, names=names, idempotency_key=key)
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
@@ -201,11 +202,11 @@ def labels_of(texts: list[str]) -> dict[str, str]:
     return labels
 
 
-def send(services: ServicesDep, digests: DigestsDep, request: Request, job: Job, name: str) -> Response:
+def send(services: Services, request: Request, job: Job, name: str) -> Response:
     """Answer with a file of a job."""
     artifacts = services.artifacts(job.id)
     try:
-        digest = digests.of(artifacts, job.id, name, lasting=job.state.final)
+        digest = (lasting_digest if job.state.final else digest_of)(artifacts, name)
         return send_file(request, artifacts, name, digest=digest)
     except FileNotFoundError as error:
         raise NotFoundError(f"The file {name!r} of job {job.id} is no longer in the store.") from error

@@ -8,7 +8,7 @@ from fastapi.responses import Response
 from trompe_server.api import examples
 from trompe_server.api.jobs import NEW_OR_KNOWN, IdempotencyKey, create, send, with_result
 from trompe_server.api.problems import PROBLEMS
-from trompe_server.api.services import DigestsDep, ServicesDep
+from trompe_server.api.services import ServicesDep
 from trompe_server.api.submission import checked_judgement
 from trompe_server.errors import NotFoundError
 from trompe_shared.api import MANIFEST, MANIFEST_PAGE, Job, JudgementRequest, JudgementSpec, Manifest
@@ -31,7 +31,7 @@ def submit_judgement(
 ) -> Job:
     """Queue a judgement of stored objects. Follow it by the job's id at `/v1/jobs/{job}/events`."""
     checked, names = checked_judgement(request, services)
-    return create(services.store, checked, names, response, idempotency_key)
+    return create(services, checked, names, response, idempotency_key)
 
 
 @router.get("/{job}", responses=examples.found(examples.JUDGEMENT))
@@ -46,9 +46,9 @@ def read_judgement(services: ServicesDep, job: str) -> Job:
 @router.get(
     "/{job}/manifest", response_model=Manifest, responses=examples.found(examples.MANIFEST) | examples.PART_ANSWERS
 )
-def read_manifest(services: ServicesDep, digests: DigestsDep, request: Request, job: str) -> Response:
+def read_manifest(services: ServicesDep, request: Request, job: str) -> Response:
     """Manifest of an ended judgement, `judgement.json`."""
-    return send(services, digests, request, with_result(services, read_judgement(services, job).id, MANIFEST), MANIFEST)
+    return send(services, request, with_result(services, read_judgement(services, job).id, MANIFEST), MANIFEST)
 
 
 @router.get(

@@ -1,18 +1,25 @@
 """Services behind the routes, and their dependencies."""
 
+import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, field
+from typing import Annotated, Final
 
 from fastapi import Depends, Request
 
-from trompe_server.api.downloads import Digests
+from trompe_server.api.rate import RateLimit
 from trompe_server.library import Library
+from trompe_server.library.classification import Networks
 from trompe_server.queue.store import JobStore
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import Folder, JobArtifacts, job_artifacts
 from trompe_server.storage.tokens import Tokens
 from trompe_shared.api import RendererInfo
+
+UPLOADS: Final = 2
+"""Uploads that are read at the same time, since each may take a lot of memory. The others wait on disk."""
+CLASSIFICATIONS: Final = 20.0
+"""Requests for a classification per second of each token, or of each address without one."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +33,9 @@ class Services:
     tokens: Tokens
     renderers: Callable[[], list[RendererInfo]]
     missing: Callable[[], list[str]]
+    networks: Networks = field(default_factory=Networks)
+    classifications: RateLimit = field(default_factory=lambda: RateLimit(CLASSIFICATIONS))
+    uploads: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(UPLOADS))
 
     def artifacts(self, job: str) -> JobArtifacts:
         """The files of a job, for reading."""
@@ -37,20 +47,4 @@ def _services(request: Request) -> Services:
     return services
 
 
-def _library(request: Request) -> Library:
-    return _services(request).library
-
-
-def _store(request: Request) -> JobStore:
-    return _services(request).store
-
-
-def _digests(request: Request) -> Digests:
-    digests: Digests = request.app.state.digests
-    return digests
-
-
 ServicesDep = Annotated[Services, Depends(_services)]
-LibraryDep = Annotated[Library, Depends(_library)]
-StoreDep = Annotated[JobStore, Depends(_store)]
-DigestsDep = Annotated[Digests, Depends(_digests)]

@@ -1,21 +1,17 @@
 """The web application: routes, errors and documentation."""
 
-import asyncio
 from importlib.metadata import version
 from typing import Final
 
 from fastapi import FastAPI
 
-from trompe_server.api import classify, experiments, fleet, health, jobs, judgements, library, metrics
+from trompe_server.api import classify, experiments, health, jobs, judgements, library, metrics
 from trompe_server.api.contract import contract
-from trompe_server.api.downloads import Digests
 from trompe_server.api.guard import Guard
 from trompe_server.api.metrics import HttpMetrics
 from trompe_server.api.middleware import BodyLimit, Envelope, Failures
 from trompe_server.api.problems import answer_with_problems
-from trompe_server.api.rate import RateLimit
 from trompe_server.api.services import Services
-from trompe_server.library.classification import Networks
 from trompe_server.pages import add_pages
 
 DESCRIPTION: Final = """Crafts adversarial 3D objects. Upload an object and a classifier (or use the shipped ones),
@@ -28,7 +24,6 @@ ROUTERS: Final = (
     jobs.router,
     judgements.router,
     experiments.router,
-    fleet.router,
     health.router,
     metrics.router,
 )
@@ -37,9 +32,7 @@ ROUTERS: Final = (
 def create_app(services: Services) -> FastAPI:
     """Build the application on ``services``."""
     app = FastAPI(title="Trompe", version=version("trompe"), description=DESCRIPTION, docs_url=None, redoc_url=None)
-    app.state.services, app.state.metrics, app.state.digests = services, HttpMetrics(), Digests()
-    app.state.uploads = asyncio.Semaphore(library.UPLOADS)
-    app.state.networks, app.state.classifications = Networks(), RateLimit(classify.RATE)
+    app.state.services, app.state.metrics = services, HttpMetrics()
     _wrap(app, services)
     answer_with_problems(app)
     for router in ROUTERS:

@@ -78,7 +78,7 @@ def test_a_token_that_may_read_classifies_until_its_rate_is_spent(
 ) -> None:
     api.headers = api.token("reader", "read")
     assert classify(api, [encode_png(pictures[0])]).status_code == 200
-    monkeypatch.setattr(api.app.state.classifications, "wait", lambda client: 1.5 if client == "reader" else 0.0)
+    monkeypatch.setattr(api.services.classifications, "wait", lambda client: 1.5 if client == "reader" else 0.0)
     refused = classify(api, [encode_png(pictures[0])])
     assert "retry in 1.50 s" in api.problem(refused, 429)["detail"]
     assert refused.headers["retry-after"] == "2"

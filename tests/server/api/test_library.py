@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from tests.server.api.conftest import CLASSES, GIF, Api
-from trompe_server.api.library import UPLOADS
+from trompe_server.api.services import UPLOADS
 from trompe_server.classifiers.registry import LOADERS
 from trompe_server.library import Library
 from trompe_shared.api import ObjectInfo
