@@ -19,8 +19,8 @@ from PIL import Image
 from trompe_experiments.in_process import run_job
 from trompe_experiments.table import ResultRow, RowId
 from trompe_server.library import Library
-from trompe_server.pages.pictures import Kind, Pictures
 from trompe_server.pages.present import command, viewer_record
+from trompe_server.pages.results import Kind, picture_png
 from trompe_server.renderers import local_renderer
 from trompe_server.storage.folders import LocalArtifacts
 from trompe_shared.api import ClassifierInfo, JobSpec, Result
@@ -73,12 +73,12 @@ def write_gallery(result: Result, artifacts: LocalArtifacts, classifier: Classif
     assert classes is not None
     around = sorted(range(len(result.held_out_views)), key=lambda k: result.held_out_views[k].azimuth)
     chosen = around[:: len(around) // SHOWN][:SHOWN]
-    pictures, views = Pictures(), []
+    views = []
     for number, view in enumerate(chosen):
         place = PAGES / "static" / "gallery" / str(number)
         place.mkdir(parents=True, exist_ok=True)
         for kind in KINDS:
-            (place / f"{kind}.png").write_bytes(pictures.one(artifacts, "held_out", view, kind))
+            (place / f"{kind}.png").write_bytes(picture_png(artifacts, "held_out", view, kind))
         address = f"/static/gallery/{number}"
         views.append(viewer_record(result.held_out_views[view], result.labels, classes.__getitem__, address))
     gallery = {

@@ -5,7 +5,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from trompe_server.pages.estimate import Effort, estimate
-from trompe_server.pages.outcomes import Outcome
+from trompe_server.pages.results import Outcome
 from trompe_shared.api import Job, JobSpec, JobState
 
 EFFORT = Effort(pool=60, steps=25, epsilon=0.05)

@@ -5,8 +5,6 @@ from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
 
 from trompe_server.pages.errors import HtmlProblems
-from trompe_server.pages.outcomes import Outcomes
-from trompe_server.pages.pictures import Pictures
 from trompe_server.pages.routes import router
 from trompe_server.pages.serving import STATIC
 from trompe_shared.three import FOLDER
@@ -16,7 +14,6 @@ __all__ = ["add_pages"]
 
 def add_pages(app: FastAPI) -> None:
     """Add the pages to ``app``, which serves the API. Problem details become pages for browsers."""
-    app.state.pictures, app.state.outcomes = Pictures(), Outcomes()
     app.include_router(router)
     for path, folder in {"/static/three": FOLDER, "/static": STATIC}.items():
         app.mount(path, GZipMiddleware(StaticFiles(directory=folder)), name=folder.name)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Final
 
-from trompe_server.pages.outcomes import Outcome
 from trompe_server.pages.present import span
+from trompe_server.pages.results import Outcome
 from trompe_shared.api import Job
 
 CLOSE: Final = 1.5

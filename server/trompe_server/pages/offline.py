@@ -13,8 +13,8 @@ from trompe_server.api.services import Services
 from trompe_server.errors import NotFoundError
 from trompe_server.formats import write_glb
 from trompe_server.pages.orbit import orbit, painted
-from trompe_server.pages.pictures import Kind, Pictures
 from trompe_server.pages.present import TERMS, ClassNames, JobRow, present
+from trompe_server.pages.results import Kind, target_image
 from trompe_server.pages.serving import STATIC, render
 from trompe_server.pages.sphere import sphere
 from trompe_server.storage.folders import JobArtifacts
@@ -38,13 +38,11 @@ SAID: Final = ("says", "kept", "truth")
 Record = Mapping[str, Any]
 
 
-def offline_page(
-    services: Services, images: Pictures, job: Job, row: JobRow, result: Result, *, names: ClassNames
-) -> str:
+def offline_page(services: Services, job: Job, row: JobRow, result: Result, *, names: ClassNames) -> str:
     """HTML of the result of ``job``. Raises ``FileNotFoundError`` if its images are not stored any more."""
     shown = present(result, row, names=names)
     views: Sequence[Record] = shown.viewer[0]["views"]
-    pictured = _pictured(images, services, job, views)
+    pictured = _pictured(services, job, views)
     return render(
         "offline.html",
         job=row,
@@ -56,12 +54,12 @@ def offline_page(
     )
 
 
-def _pictured(images: Pictures, services: Services, job: Job, views: Sequence[Record]) -> list[Record]:
+def _pictured(services: Services, job: Job, views: Sequence[Record]) -> list[Record]:
     """Records of the views with their images inside; of many views, some at equal steps."""
     artifacts, step, number = services.artifacts(job.id), 1, 0
     pictured: list[Record] = []
     while number < len(views):
-        before, after = (_image(images, artifacts, views[number][side]) for side in ("before", "after"))
+        before, after = (_image(artifacts, views[number][side]) for side in ("before", "after"))
         if number == 0:
             step = -(-len(views) * (len(before) + len(after)) // PICTURE_BYTES)
         pictured.append({**views[number], "before": before, "after": after, "difference": None})
@@ -69,11 +67,11 @@ def _pictured(images: Pictures, services: Services, job: Job, views: Sequence[Re
     return pictured
 
 
-def _image(images: Pictures, artifacts: JobArtifacts, path: str) -> str:
+def _image(artifacts: JobArtifacts, path: str) -> str:
     """The image with this path on the pages, as an address that holds it."""
     *_, view_set, index, file = path.split("/")
     kind: Kind = "after" if file == "after.png" else "before"
-    return _address(_packed(Image.fromarray(images.image(artifacts, view_set, int(index), kind)), "WEBP"), "image/webp")
+    return _address(_packed(Image.fromarray(target_image(artifacts, view_set, int(index), kind)), "WEBP"), "image/webp")
 
 
 def _orbit(services: Services, job: Job, result: Result, views: Sequence[Record]) -> Record | None:

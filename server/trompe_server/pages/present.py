@@ -7,7 +7,7 @@ from datetime import datetime
 from typing import Any, Final
 
 from trompe_server.job.protocol import THUMBNAIL, numbered
-from trompe_server.pages.outcomes import Outcome
+from trompe_server.pages.results import Outcome
 from trompe_server.pages.sphere import Sphere, sphere
 from trompe_shared.api import (
     MANIFEST_PAGE,

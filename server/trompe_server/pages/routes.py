@@ -27,8 +27,8 @@ from trompe_server.pages.form import form_fields
 from trompe_server.pages.naming import Names
 from trompe_server.pages.offline import offline_page
 from trompe_server.pages.orbit import orbit, painted
-from trompe_server.pages.pictures import Kind, ViewSet
 from trompe_server.pages.present import PHASES, TERMS, JobRow, Shown, differences, present
+from trompe_server.pages.results import Kind, ViewSet, outcome_of, picture_png
 from trompe_server.pages.serving import page, render
 from trompe_server.pages.turntable import TURNS, turntable
 from trompe_server.storage.database import DatabaseDownError
@@ -57,7 +57,7 @@ Label = Annotated[str, Query(max_length=264)]
 @router.get("/")
 def home(request: Request, services: ServicesDep) -> HTMLResponse:
     """Example, latest jobs and explanation."""
-    return page(request, "home.html", gallery=GALLERY, rows=_rows(request, services, limit=LATEST)[0])
+    return page(request, "home.html", gallery=GALLERY, rows=_rows(services, limit=LATEST)[0])
 
 
 @router.get("/jobs")
@@ -65,7 +65,7 @@ def jobs(
     request: Request, services: ServicesDep, state: State = "", label: Label = "", cursor: Cursor = None
 ) -> HTMLResponse:
     """The list of jobs."""
-    rows, older = _rows(request, services, state=state, label=label, cursor=cursor)
+    rows, older = _rows(services, state=state, label=label, cursor=cursor)
     filters = {"state": state, "label": label}
     given = {name: value for name, value in filters.items() if value}
     # Older pages show the same jobs, updated.
@@ -86,14 +86,14 @@ def jobs(
 
 @router.get("/jobs/stream")
 def follow_list(
-    request: Request, services: ServicesDep, state: State = "", label: Label = "", ids: str = "", limit: int = PAGE
+    services: ServicesDep, state: State = "", label: Label = "", ids: str = "", limit: int = PAGE
 ) -> EventSourceResponse:
     """Stream of changed rows as HTML, newest first."""
 
     def look() -> list[JobRow]:
         if ids:
-            return [_row(request, services, job) for each in ids.split(",")[:PAGE] if (job := _found(services, each))]
-        return _rows(request, services, state=state, label=label, limit=min(max(limit, 1), PAGE))[0]
+            return [_row(services, job) for each in ids.split(",")[:PAGE] if (job := _found(services, each))]
+        return _rows(services, state=state, label=label, limit=min(max(limit, 1), PAGE))[0]
 
     return EventSourceResponse(_changes(look), ping=15)
 
@@ -113,7 +113,6 @@ def new_job(request: Request, services: ServicesDep) -> HTMLResponse:
 
 @router.get("/jobs/estimate")
 def show_estimate(
-    request: Request,
     services: ServicesDep,
     classifier: str,
     pool: int,
@@ -123,8 +122,7 @@ def show_estimate(
     """Seconds and drop of stored jobs of this effort against this classifier, in words."""
     reference = services.library.classifier(classifier).reference
     found = services.store.page(state=JobState.succeeded, classifier=reference, limit=RECENT).jobs
-    outcomes = request.app.state.outcomes
-    ended = [(job, outcome) for job in found if (outcome := outcomes.of(services.artifacts(job.id)))]
+    ended = [(job, outcome) for job in found if (outcome := outcome_of(services.artifacts(job.id)))]
     return {"text": estimate(Effort(pool, steps, epsilon), ended)}
 
 
@@ -170,7 +168,7 @@ def compare(
 def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
     """One job: its progress, or its result."""
     found = services.store.get(job)
-    row, result = _row(request, services, found), _result(services, found)
+    row, result = _row(services, found), _result(services, found)
     if result is None:
         return page(request, "job.html", job=row, shown=None, phases=PHASES)
     turned = orbit(result, job, services.library.classifiers())
@@ -178,14 +176,14 @@ def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
 
 
 @router.get("/jobs/{job}/result.html")
-def result_file(request: Request, services: ServicesDep, job: str) -> Response:
+def result_file(services: ServicesDep, job: str) -> Response:
     """The result as one HTML file to keep. It has scripts of its own, so it is not to be opened on this server."""
     found = services.store.get(job)
     result, text = _result(services, found), ""
     if result is not None:
         names = Names(services.library)
         known = names.classes(result.spec.victim.classifier)
-        text = offline_page(services, request.app.state.pictures, found, names.row(found), result, names=known)
+        text = offline_page(services, found, names.row(found), result, names=known)
     elif MANIFEST_PAGE in found.artifacts:
         text = services.artifacts(job).read(MANIFEST_PAGE).decode()
     else:
@@ -213,7 +211,6 @@ def preview(services: ServicesDep, job: str) -> Response:
 
 @router.get("/jobs/{job}/pictures/{view_set}/{index}/{kind}.png")
 def picture(
-    request: Request,
     services: ServicesDep,
     job: str,
     view_set: ViewSet,
@@ -223,7 +220,7 @@ def picture(
     """One target image of an ended job."""
     services.store.get(job)
     try:
-        data = request.app.state.pictures.one(services.artifacts(job), view_set, index, kind)
+        data = picture_png(services.artifacts(job), view_set, index, kind)
     except (FileNotFoundError, IndexError, KeyError) as error:
         raise NotFoundError(f"Job {job} has no picture {view_set} {index} {kind}.") from error
     return Response(data, media_type="image/png", headers=LASTING)
@@ -335,7 +332,6 @@ def _choices(services: Services) -> dict[str, Any]:
 
 
 def _rows(
-    request: Request,
     services: Services,
     *,
     state: str = "",
@@ -350,11 +346,11 @@ def _rows(
         cursor=cursor,
     )
     names = Names(services.library)
-    return [_row(request, services, job, names) for job in found.jobs], found.next_cursor
+    return [_row(services, job, names) for job in found.jobs], found.next_cursor
 
 
-def _row(request: Request, services: Services, job: Job, names: Names | None = None) -> JobRow:
-    outcome = request.app.state.outcomes.of(services.artifacts(job.id)) if RESULT in job.artifacts else None
+def _row(services: Services, job: Job, names: Names | None = None) -> JobRow:
+    outcome = outcome_of(services.artifacts(job.id)) if RESULT in job.artifacts else None
     return replace((names or Names(services.library)).row(job), outcome=outcome)
 
 
