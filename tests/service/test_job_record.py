@@ -109,14 +109,14 @@ def test_filters_are_met_all_at_once(store: JobStore) -> None:
     assert found(object="cup", state=JobState.running) == []
 
 
-def test_groups_count_jobs_by_the_value_of_a_label(store: JobStore) -> None:
-    for run in ("old", "new", "new"):
-        create(store, labels={"run": run})
+def test_experiments_count_jobs_by_state(store: JobStore) -> None:
+    for name in ("old", "new", "new"):
+        create(store, labels={"experiment": name})
     create(store)
     taken = claim(store)
-    groups = store.groups("run")
-    assert [(group.value, sum(group.counts.values())) for group in groups] == [("new", 2), ("old", 1)]
-    assert groups[1].counts == {JobState.running: 1}
+    groups = store.experiments()
+    assert [(group.name, sum(group.jobs.values())) for group in groups] == [("new", 2), ("old", 1)]
+    assert groups[1].jobs == {JobState.running: 1}
     assert groups[1].created == taken.job.created
 
 
@@ -404,15 +404,15 @@ def test_workers_are_listed_with_what_they_do(store: JobStore) -> None:
     assert store.workers() == []
 
 
-def test_statistics_count_jobs_and_tell_how_long_the_oldest_waits(store: JobStore) -> None:
-    assert store.statistics().oldest_queued == 0
-    assert store.statistics().jobs == dict.fromkeys(JobState, 0)
+def test_the_store_counts_jobs_and_tells_how_long_the_oldest_waits(store: JobStore) -> None:
+    assert store.oldest_queued() == 0
+    assert store.counts() == dict.fromkeys(JobState, 0)
     create(store)
     create(store)
     claim(store)
-    statistics = store.statistics()
-    assert (statistics.jobs[JobState.queued], statistics.jobs[JobState.running]) == (1, 1)
-    assert 0 <= statistics.oldest_queued < 60
+    counts = store.counts()
+    assert (counts[JobState.queued], counts[JobState.running]) == (1, 1)
+    assert 0 <= store.oldest_queued() < 60
 
 
 def test_only_jobs_that_have_ended_are_deleted_and_nothing_of_them_stays(store: JobStore) -> None:

@@ -1,20 +1,17 @@
 """Metrics: requests of this process, the queue, and counters of the workers."""
 
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
 from fastapi import APIRouter, Request, Response
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Histogram, generate_latest
-from prometheus_client.metrics_core import GaugeMetricFamily, Metric
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.multiprocess import MultiProcessCollector
 from prometheus_client.process_collector import ProcessCollector
-from prometheus_client.registry import Collector
 from starlette.types import Scope
 
 from trompe_server.api.problems import PROBLEMS
 from trompe_server.api.services import ServicesDep
-from trompe_server.queue.store import Statistics
+from trompe_server.queue.store import JobStore
 
 router = APIRouter(tags=["health"], responses=PROBLEMS)
 
@@ -48,24 +45,14 @@ class HttpMetrics:
         self._seconds.labels(method, route).observe(seconds)
 
 
-class _QueueCollector(Collector):
-    """Metrics of the queue from one query, made at a scrape."""
-
-    def __init__(self, statistics: Callable[[], Statistics]) -> None:
-        self._statistics = statistics
-
-    def describe(self) -> list[Metric]:
-        """Nothing: registering must not query the database."""
-        return []
-
-    def collect(self) -> Iterator[Metric]:
-        """The current metrics."""
-        figures = self._statistics()
-        jobs = GaugeMetricFamily("trompe_jobs", "Jobs by state.", labels=["state"])
-        for state, count in figures.jobs.items():
-            jobs.add_metric([state.value], count)
-        yield jobs
-        yield GaugeMetricFamily("trompe_queue_age_seconds", "Wait of the oldest queued job.", figures.oldest_queued)
+def _of_queue(store: JobStore) -> CollectorRegistry:
+    registry = CollectorRegistry()
+    jobs = Gauge("trompe_jobs", "Jobs by state.", ["state"], registry=registry)
+    for state, count in store.counts().items():
+        jobs.labels(state.value).set(count)
+    age = Gauge("trompe_queue_age_seconds", "Wait of the oldest queued job.", registry=registry)
+    age.set(store.oldest_queued())
+    return registry
 
 
 def _of_workers(folder: Path) -> CollectorRegistry:
@@ -83,8 +70,6 @@ def _of_workers(folder: Path) -> CollectorRegistry:
 )
 def metrics(services: ServicesDep, request: Request) -> Response:
     """Metrics for Prometheus: requests of this process, the queue, and the counters of this machine's workers."""
-    queue = CollectorRegistry()
-    queue.register(_QueueCollector(services.store.statistics))
     http: HttpMetrics = request.app.state.metrics
-    registries = (http.registry, queue, _of_workers(services.settings.data / "metrics"))
+    registries = (http.registry, _of_queue(services.store), _of_workers(services.settings.metrics_folder))
     return Response(b"".join(map(generate_latest, registries)), media_type=CONTENT_TYPE_LATEST)

@@ -13,7 +13,6 @@ from fastapi import Path as PathParam
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
-from trompe_server.api.experiments import LABEL
 from trompe_server.api.guard import COOKIE
 from trompe_server.api.jobs import RESULT, Cursor, labels_of
 from trompe_server.api.services import Services, ServicesDep
@@ -31,6 +30,7 @@ from trompe_server.pages.present import PHASES, TERMS, JobRow, Shown, difference
 from trompe_server.pages.results import Kind, ViewSet, outcome_of, picture_png
 from trompe_server.pages.serving import page, render
 from trompe_server.pages.turntable import TURNS, turntable
+from trompe_server.queue.store import EXPERIMENT
 from trompe_server.storage.database import DatabaseDownError
 from trompe_server.storage.tokens import hash_secret
 from trompe_shared.api import JOB_RESULT, MANIFEST_PAGE, Job, JobSpec, JobState, Result, in_parts
@@ -229,17 +229,13 @@ def picture(
 @router.get("/experiments")
 def experiments(request: Request, services: ServicesDep) -> HTMLResponse:
     """All experiments."""
-    found = [
-        {"name": group.value, "jobs": {state.value: n for state, n in group.counts.items()}, "created": group.created}
-        for group in services.store.groups(LABEL)
-    ]
-    return page(request, "experiments.html", experiments=found)
+    return page(request, "experiments.html", experiments=services.store.experiments())
 
 
 @router.get("/experiments/{name:path}")
 def show_experiment(request: Request, services: ServicesDep, name: str, cursor: Cursor = None) -> HTMLResponse:
     """Jobs of an experiment, and a chart of seconds and accuracy."""
-    found = services.store.page(labels={LABEL: name}, limit=500, cursor=cursor)
+    found = services.store.page(labels={EXPERIMENT: name}, limit=500, cursor=cursor)
     if not found.jobs:
         raise NotFoundError(f"There is no experiment {name!r}.")
     names = Names(services.library)

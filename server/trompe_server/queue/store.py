@@ -2,8 +2,6 @@
 
 import secrets
 from collections.abc import Mapping
-from dataclasses import dataclass
-from datetime import datetime
 from typing import Any, Final
 
 import sqlalchemy as sa
@@ -28,27 +26,23 @@ from trompe_server.queue.tables import (
     workers,
 )
 from trompe_server.storage.database import clock, connect, write
-from trompe_shared.api import Event, Job, JobList, JobRequest, JobState, JudgementRequest, Progress, WorkerInfo
+from trompe_shared.api import (
+    Event,
+    ExperimentInfo,
+    Job,
+    JobList,
+    JobRequest,
+    JobState,
+    JudgementRequest,
+    Progress,
+    WorkerInfo,
+)
 from trompe_shared.errors import SpecError
 
 AnyRequest = JobRequest | JudgementRequest
 
-
-@dataclass(frozen=True)
-class Statistics:
-    """Number of jobs by state, and the wait of the oldest queued job in seconds (0 without one)."""
-
-    jobs: Mapping[JobState, int]
-    oldest_queued: float
-
-
-@dataclass(frozen=True)
-class JobGroup:
-    """Jobs with the same value of a label: their number by state, and the creation time of the first."""
-
-    value: str
-    counts: Mapping[JobState, int]
-    created: datetime
+EXPERIMENT: Final = "experiment"
+"""Label of the jobs of an experiment, with its name."""
 
 
 class JobStore:
@@ -131,18 +125,21 @@ class JobStore:
             jobs=[job_of(row) for row in page], next_cursor=str(page[-1].number) if len(rows) > limit else None
         )
 
-    def groups(self, key: str) -> list[JobGroup]:
-        """Jobs grouped by the value of the label ``key``, newest group first."""
+    def experiments(self) -> list[ExperimentInfo]:
+        """Jobs grouped by the value of the label ``EXPERIMENT``, newest group first."""
         first = sa.func.min(jobs.c.created).label("first")
         query = sa.select(labels.c.value, jobs.c.state, sa.func.count().label("amount"), first)
-        query = query.join(jobs, jobs.c.number == labels.c.number).where(labels.c.key == key)
+        query = query.join(jobs, jobs.c.number == labels.c.number).where(labels.c.key == EXPERIMENT)
         found: dict[str, tuple[dict[JobState, int], float]] = {}
         with self.engine.connect() as connection:
             for row in connection.execute(query.group_by(labels.c.value, jobs.c.state)):
                 counts, created = found.get(row.value, ({}, row.first))
                 found[row.value] = counts | {JobState(row.state): row.amount}, min(created, row.first)
         newest = sorted(found.items(), key=lambda item: item[1][1], reverse=True)
-        return [JobGroup(value, counts, time_of(created)) for value, (counts, created) in newest]  # type: ignore[arg-type]
+        return [
+            ExperimentInfo.model_validate({"name": value, "jobs": counts, "created": time_of(created)})
+            for value, (counts, created) in newest
+        ]
 
     def counts(self) -> dict[JobState, int]:
         """Number of jobs by state."""
@@ -207,12 +204,12 @@ class JobStore:
             for row in rows
         ]
 
-    def statistics(self) -> Statistics:
-        """Statistics of the queue."""
+    def oldest_queued(self) -> float:
+        """Wait of the oldest queued job, seconds; 0 without one."""
         oldest = sa.select(clock() - jobs.c.created).where(jobs.c.state == JobState.queued.value)
         with self.engine.connect() as connection:
             waits = connection.execute(oldest.order_by(jobs.c.number).limit(1)).scalar_one_or_none()
-        return Statistics(self.counts(), max(0.0, waits or 0.0))
+        return max(0.0, waits or 0.0)
 
 
 def _check_ended(row: Row) -> None:
