@@ -68,7 +68,7 @@ def test_a_file_is_read_as_it_was_written_last(folder: Folder, tmp_path: Path) -
     folder.write("a.bin", b"one")
     folder.write("a.bin", b"two")
     (tmp_path / "large").write_bytes(b"0123456789" * 300_000)
-    folder.write_file("b.bin", tmp_path / "large")
+    folder.write("b.bin", tmp_path / "large")
     assert folder.read("a.bin") == b"two"
     assert (folder.size("a.bin"), folder.size("b.bin")) == (3, 3_000_000)
     assert folder.names() == ["a.bin", "b.bin"]
@@ -120,7 +120,7 @@ def test_a_store_that_cannot_be_reached_is_told_in_words(monkeypatch: pytest.Mon
     def unreachable(*_: Any, **__: Any) -> bytes:
         raise ConnectionError("nobody there")
 
-    monkeypatch.setattr(type(folder.system), "cat_file", unreachable)  # type: ignore[attr-defined]
+    monkeypatch.setattr(type(folder.system), "cat_file", unreachable)  # type: ignore[union-attr]
     with pytest.raises(ServiceError, match=r"is not available.*TROMPE_STORE"):
         folder.read("a")
 
@@ -258,7 +258,7 @@ def test_a_job_whose_files_cannot_be_deleted_stays_until_they_can(
         raise ConnectionError("nobody there")
 
     with monkeypatch.context() as patch:
-        patch.setattr(type(files.system), "rm", away)  # type: ignore[attr-defined]
+        patch.setattr(type(files.system), "rm", away)  # type: ignore[union-attr]
         with pytest.raises(ServiceError, match="not available"):
             delete_job(store, files, job)
         assert store.get(job).state is JobState.succeeded

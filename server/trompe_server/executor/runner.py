@@ -2,13 +2,13 @@
 
 import logging
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
+from prometheus_client import Counter
+
 from trompe_server.errors import NotFoundError
-from trompe_server.executor.metrics import count_phase
 from trompe_server.job.protocol import DamagedFileError, PhasedJob, PhaseReport, number_after
 from trompe_server.queue.claims import Claim, Claims, Ending, LostJobError
 from trompe_server.storage.database import RETRY_WAITS, DatabaseDownError, patiently
@@ -19,6 +19,17 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+PHASE_SECONDS: Final = Counter("trompe_phase_seconds", "Seconds spent in phases of jobs.", ["phase"])
+COUNTERS: Final = {
+    "attack_steps": Counter("trompe_attack_steps", "Attack steps."),
+    "classifier_images": Counter("trompe_classifier_images", "Images shown to classifiers by attacks."),
+    "target_renders": Counter("trompe_target_renders", "Images rendered by the target."),
+}
+"""Prometheus counters of ``PhaseReport.counts``.
+
+Workers of this machine write them to files in the folder ``PROMETHEUS_MULTIPROC_DIR``, which the API or
+``trompe worker`` sums up. Those of Ray nodes stay there.
+"""
 MAX_DAMAGES: Final = 2
 """Times a phase may find its input damaged and have it made again."""
 
@@ -127,7 +138,7 @@ class _Phases:
     def run_all(self) -> Ending:
         """Run the remaining phases. After a phase finds damaged files, the phase before runs again."""
         names, number = self._open().phases(), self._claim.done
-        damages: Counter[int] = Counter()
+        damages = [0] * len(names)
         while number < len(names):
             try:
                 report = self._run(names[number])
@@ -162,7 +173,9 @@ class _Phases:
     def _run_once(self, phase: str) -> PhaseReport:
         job, started = self._open(), time.perf_counter()
         report = job.run(phase, self._on_progress)
-        count_phase(phase, time.perf_counter() - started, report.counts)
+        PHASE_SECONDS.labels(phase.partition("-")[0]).inc(time.perf_counter() - started)  # of attack-003: attack
+        for name, amount in report.counts.items():
+            COUNTERS[name].inc(amount)
         return report
 
     def _record(self, report: PhaseReport, *, done: int) -> None:

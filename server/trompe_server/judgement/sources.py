@@ -15,7 +15,7 @@ from trompe_server.formats import import_file
 from trompe_server.job.protocol import Artifacts
 from trompe_server.judging.judge import Judge
 from trompe_server.library import Library
-from trompe_server.library.intake import identity_of
+from trompe_server.library.catalogue import identity_of
 from trompe_server.renderers import SailenvTarget, TargetRenderer, local_renderer
 from trompe_server.renderers.local import COMMAND
 from trompe_server.spec.labels import resolve_label

@@ -1,5 +1,6 @@
 """Catalogue of things of one kind: uploaded ones in a folder, shipped ones in the package."""
 
+import hashlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +15,11 @@ _INFO: Final = "info.json"
 _ID: Final = re.compile(r"[0-9a-f]{64}")
 
 Info = TypeVar("Info", ObjectInfo, ClassifierInfo, BackgroundInfo)
+
+
+def identity_of(data: bytes) -> str:
+    """SHA-256 in hex: the id of an upload."""
+    return hashlib.sha256(data).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -73,7 +79,7 @@ class Catalogue(Generic[Info]):
         """Store ``file``. If the same bytes are stored already, only the info is replaced."""
         folder = self.folder.within(info.id)
         if not folder.exists(_INFO):
-            folder.write_file(file.name, file)
+            folder.write(file.name, file)
         folder.write(_INFO, info.model_dump_json().encode())
         return info
 

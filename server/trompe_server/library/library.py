@@ -1,19 +1,21 @@
 """The library: objects, classifiers and backgrounds that jobs can name, uploaded or shipped."""
 
+import hashlib
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO, Final
 
 from trompe_server.formats import import_file
-from trompe_server.library.catalogue import Catalogue
-from trompe_server.library.inspection import Inspect, check_classes, inspect_classifier, named_classifier
-from trompe_server.library.intake import copy, identity_of, intake
+from trompe_server.library.catalogue import Catalogue, identity_of
 from trompe_server.library.shipped import list_shipped_classifiers, list_shipped_objects
 from trompe_server.storage.folders import Folder, LocalArtifacts
-from trompe_server.system.files import write_whole
+from trompe_server.system.files import no_space, write_whole
+from trompe_server.system.sandbox import run_limited
 from trompe_shared.api import BackgroundInfo, ClassifierInfo, ObjectInfo
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError
 from trompe_shared.local_files import CLASSIFIER_SUFFIXES, LOOKED_UP
@@ -22,6 +24,22 @@ from trompe_shared.shipped import shipped_objects
 
 _UPLOAD: Final = "upload"
 """File of an object as uploaded, beside ``data.zip``."""
+_PART: Final = 2**20
+_SECONDS: Final = 300.0
+_MEMORY: Final = 8 * 2**30
+"""Bytes of address space to inspect a classifier; networks for ImageNet take less than half."""
+
+Inspect = Callable[[str], dict[str, object]]
+"""Maps a file or a name to the fields of ``ClassifierInfo`` that depend on the network."""
+
+
+def inspect_classifier(path_or_name: str) -> dict[str, object]:
+    """Load a classifier in a child process and describe it. Raises ``ClassifierError``.
+
+    So this process stays free of torch and safe from the file.
+    """
+    module = "trompe_server.classifiers.inspect"
+    return dict(run_limited(module, [path_or_name], memory=_MEMORY, seconds=_SECONDS, failure=ClassifierError))
 
 
 class Library:
@@ -79,9 +97,9 @@ class Library:
         Textures are shrunk to at most ``max_texture`` texels a side. Raises ``ObjectError`` for an unreadable file and
         stores nothing then.
         """
-        with intake() as folder:
+        with _intake() as folder:
             upload = folder / _UPLOAD
-            identity = copy(file, upload)
+            identity = _copy(file, upload)
             made = import_file(upload, name=filename, max_texture=max_texture)
             info = ObjectInfo(
                 id=identity if max_texture is None else identity_of(f"{identity} at most {max_texture}".encode()),
@@ -95,7 +113,7 @@ class Library:
             )
             payload = folder / "data.zip"
             write_whole(payload, made.archive)
-            self._objects.folder.within(info.id).write_file(_UPLOAD, upload)
+            self._objects.folder.within(info.id).write(_UPLOAD, upload)
             return self._objects.put(info, payload)
 
     def classifiers(self) -> list[ClassifierInfo]:
@@ -110,7 +128,7 @@ class Library:
         """
         if reference.startswith(LOOKED_UP):
             self._check_allowed(reference)
-            return named_classifier(reference, self._inspect)
+            return _named_classifier(reference, self._inspect)
         return self._classifiers.find(reference)
 
     def _check_allowed(self, reference: str) -> None:
@@ -137,7 +155,7 @@ class Library:
         path = self._cache / identity / name
         if not path.exists():
             with folder.open(name) as source, tempfile.NamedTemporaryFile() as target:
-                if copy(source, Path(target.name)) != identity:
+                if _copy(source, Path(target.name)) != identity:
                     raise ClassifierError(f"The stored file {identity[:12]} is damaged. Upload the classifier again.")
                 write_whole(path, Path(target.name))
         return path
@@ -155,14 +173,18 @@ class Library:
             raise ClassifierError(
                 f"{filename!r} is not a supported classifier: upload a .pt2 (torch.export) or .onnx file."
             )
-        with intake() as folder:
+        with _intake() as folder:
             payload = folder / f"data{suffix}"
-            identity = copy(file, payload)
+            identity = _copy(file, payload)
             before = self._classifiers.stored(identity)
             found = self._inspect(str(payload)) if before is None else before.model_dump()
-            check_classes(classes, found["n_classes"])
             if classes is None:
                 classes = found.get("classes")  # type: ignore[assignment]
+            elif len(classes) != found["n_classes"]:
+                raise ClassifierError(
+                    f"{len(classes)} class names for a classifier of {found['n_classes']} classes: send one name per "
+                    "logit, in order."
+                )
             info = ClassifierInfo.model_validate(
                 found | {"id": identity, "name": name or Path(filename).stem, "classes": classes}
             )
@@ -186,7 +208,33 @@ class Library:
             decode_rgb(data, name)
         except ObjectError as error:
             raise SpecError(f"The background {name!r} is not a readable image. Send a PNG or a JPEG.") from error
-        with intake() as folder:
+        with _intake() as folder:
             payload = folder / f"data{Path(name).suffix.lower()}"
             write_whole(payload, data)
             return self._backgrounds.put(BackgroundInfo(id=identity_of(data), name=Path(name).stem), payload)
+
+
+@contextmanager
+def _intake() -> Iterator[Path]:
+    """A temporary folder for an upload until it is checked."""
+    with no_space(tempfile.gettempdir()), tempfile.TemporaryDirectory(prefix="trompe-intake-") as folder:
+        yield Path(folder)
+
+
+def _copy(source: BinaryIO, path: Path) -> str:
+    """Copy a file to ``path`` and return its id."""
+    digest = hashlib.sha256()
+    with path.open("wb") as target:
+        while part := source.read(_PART):
+            digest.update(part)
+            target.write(part)
+        target.flush()
+        os.fsync(target.fileno())
+    return digest.hexdigest()
+
+
+@cache
+def _named_classifier(reference: str, inspect: Inspect) -> ClassifierInfo:
+    """A network by name, such as ``timm:NAME``. Raises ``ClassifierError`` if it cannot be loaded."""
+    name = reference.partition(":")[2]
+    return ClassifierInfo.model_validate(inspect(reference) | {"id": reference, "name": name})

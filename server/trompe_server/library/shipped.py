@@ -2,7 +2,7 @@
 
 from functools import cache
 
-from trompe_server.library.intake import identity_of
+from trompe_server.library.catalogue import identity_of
 from trompe_shared.api import ClassifierInfo, ObjectInfo
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import ShippedObject, shipped_objects

@@ -198,7 +198,8 @@ def _take(connection: sa.Connection, row: Row, worker: str) -> Claim:
     message = "started" if row.attempts == 0 else f"continued by {worker}"
     values = {"state": JobState.running.value, "worker": worker, "attempts": row.attempts + 1}
     times = {"started": sa.func.coalesce(jobs.c.started, clock()), "seen": clock() + START_ALLOWANCE}
-    return _claim(update_job(connection, row.id, message=message, note=None, **times, **values))
+    taken = update_job(connection, row.id, message=message, note=None, **times, **values)
+    return Claim(job_of(taken), taken.attempts, taken.done)
 
 
 def _lose(connection: sa.Connection, row: Row, reason: str, counter: sa.Column[int]) -> None:
@@ -236,7 +237,3 @@ def _held(connection: sa.Connection, claim: Claim) -> Row:
 
 def _is_held(row: Row, claim: Claim) -> bool:
     return bool(row.state == JobState.running.value and row.attempts == claim.attempt)
-
-
-def _claim(row: Row) -> Claim:
-    return Claim(job_of(row), row.attempts, row.done)

@@ -142,25 +142,12 @@ def time_of(seconds: float | None) -> datetime | None:
     return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
 
 
-_SAME: Final = (
-    "id",
-    "state",
-    "spec",
-    "names",
-    "labels",
-    "worker",
-    "progress",
-    "attempts",
-    "error",
-    "note",
-    "artifacts",
-)
 _PRIORITY_NAMES: Final = {number: name for name, number in PRIORITIES.items()}
 
 
 def job_of(row: Row) -> Job:
     """Convert a row of ``jobs`` to the API's model. Raises pydantic's ``ValidationError`` for a malformed row."""
-    same = {name: getattr(row, name) for name in _SAME}
+    same = {name: getattr(row, name) for name in Job.model_fields}
     times = {name: time_of(getattr(row, name)) for name in ("created", "started", "finished")}
     asked = {"priority": _PRIORITY_NAMES.get(row.priority, row.priority), "needs": json.loads(row.needs)}
     return Job.model_validate(same | times | asked)
@@ -168,6 +155,4 @@ def job_of(row: Row) -> Job:
 
 def event_of(row: Row) -> Event:
     """Convert a row of ``job_events`` to the API's model."""
-    return Event.model_validate(
-        {"id": row.id, "time": time_of(row.time), "state": row.state, "progress": row.progress, "message": row.message}
-    )
+    return Event.model_validate({name: getattr(row, name) for name in Event.model_fields} | {"time": time_of(row.time)})

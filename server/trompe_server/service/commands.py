@@ -72,11 +72,6 @@ def settings_of(data: Path | None, **others: object) -> Settings:
         ) from error
 
 
-def _announce(line: str) -> None:
-    click.echo(line)
-    sys.stdout.flush()
-
-
 @click.command()
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option("--port", default=8000, show_default=True, type=click.IntRange(0, 65535), help="Port; 0: a free one.")
@@ -117,7 +112,7 @@ def serve(
 
     log_to_stderr()
     settings = settings_of(data, engine_options=engine_options or None, **options)
-    run_service(settings, _renderers_at(listed, names), host=host, port=port, announce=_announce)
+    run_service(settings, _renderers_at(listed, names), host=host, port=port)
 
 
 @click.command()
@@ -140,7 +135,7 @@ def worker(data: Path | None, listed: tuple[str, ...], names: tuple[str, ...], *
     if not listed and not names:
         raise click.UsageError("Name the renderer workers by --renderer HOST:PORT or --renderers-dns NAME:PORT.")
     log_to_stderr()
-    run_worker(settings_of(data, **options), _renderers_at(listed, names), announce=_announce)
+    run_worker(settings_of(data, **options), _renderers_at(listed, names))
 
 
 @click.command()
@@ -152,7 +147,7 @@ def migrate(data: Path | None, database: str | None) -> None:
 
     log_to_stderr()
     prepare_data(settings_of(data, database=database))
-    _announce("the database is up to date")
+    click.echo("the database is up to date")
 
 
 def _renderers_at(listed: tuple[str, ...], names: tuple[str, ...]) -> "RendererAddresses":
@@ -190,7 +185,7 @@ def doctor(data: Path | None, as_json: bool, **options: str | None) -> None:
     for finding in check_all(settings_of(data, **options)):
         findings.append(finding)
         if not as_json:
-            _announce(in_words(finding))
+            click.echo(in_words(finding))
     if as_json:
-        _announce(in_json(findings))
+        click.echo(in_json(findings))
     sys.exit(0 if all(finding.ok for finding in findings) else 1)

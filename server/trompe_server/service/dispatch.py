@@ -2,11 +2,12 @@
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from functools import partial
 from typing import Final
 
+import click
 import prometheus_client
 from prometheus_client import CollectorRegistry
 from prometheus_client.multiprocess import MultiProcessCollector
@@ -29,17 +30,15 @@ READY: Final = "trompe worker ready"
 
 def prepare_data(settings: Settings) -> None:
     """Create the data folder, and create or upgrade the database. Raises ``ServiceError``."""
-    store = JobStore(settings.database_url)
     try:
         settings.data.mkdir(parents=True, exist_ok=True)
-        store.migrate()
+        with closing(JobStore(settings.database_url)) as store:
+            store.migrate()
     except (OSError, SQLAlchemyError, DatabaseDownError) as error:
         raise ServiceError(
             f"The data folder {settings.data} or the database cannot be written ({error}). Choose another folder with "
             "--data or TROMPE_DATA, another database with --database or TROMPE_DATABASE."
         ) from error
-    finally:
-        store.close()
 
 
 @contextmanager
@@ -60,8 +59,8 @@ def dispatching(settings: Settings, renderers: RendererAddresses) -> Iterator[Di
             yield dispatcher
 
 
-def run_worker(settings: Settings, renderers: RendererAddresses, *, announce: Callable[[str], None]) -> None:
-    """Dispatch jobs until SIGTERM or SIGINT. Calls ``announce`` with ``READY`` once it does, or waits for the lease.
+def run_worker(settings: Settings, renderers: RendererAddresses) -> None:
+    """Dispatch jobs until SIGTERM or SIGINT. Prints ``READY`` once it does, or waits for the lease.
 
     Raises ``ServiceError`` if there is nothing to run them.
     """
@@ -74,7 +73,7 @@ def run_worker(settings: Settings, renderers: RendererAddresses, *, announce: Ca
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     with dispatching(settings, renderers):
-        announce(READY)
+        click.echo(READY)
         stop.wait()
 
 

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -141,16 +141,15 @@ def _check_database(settings: Settings) -> str:
     from trompe_server.queue.store import JobStore
 
     remedy = "Start the database or correct its URL (--database, TROMPE_DATABASE). Without tables: trompe migrate"
-    with _or(remedy, TrompeError, sa.exc.SQLAlchemyError, words="the jobs cannot be read"):
-        store = JobStore(settings.database_url, silence=settings.silence)
+    with (
+        _or(remedy, TrompeError, sa.exc.SQLAlchemyError, words="the jobs cannot be read"),
+        closing(JobStore(settings.database_url, silence=settings.silence)) as store,
+    ):
         path = store.engine.url.database if store.engine.dialect.name == "sqlite" else None
         if path is not None and not Path(path).exists():
             return f"{store.engine.url!r} will be created by the first `trompe serve`"
-        try:
-            jobs = ", ".join(f"{count} {state.value}" for state, count in store.counts().items() if count) or "none"
-            alive = sum(worker.alive for worker in store.workers())
-        finally:
-            store.close()
+        jobs = ", ".join(f"{count} {state.value}" for state, count in store.counts().items() if count) or "none"
+        alive = sum(worker.alive for worker in store.workers())
     return f"{store.engine.url!r} answers; jobs: {jobs}; attack workers alive: {alive}"
 
 

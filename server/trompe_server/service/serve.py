@@ -5,10 +5,11 @@ import resource
 import signal
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from types import FrameType
 from typing import Any, Final, NoReturn
 
+import click
 import sqlalchemy as sa
 import uvicorn
 
@@ -35,12 +36,10 @@ CHECKPOINT_PAGES: Final = 10_000
 """Pages of 4 KiB in SQLite's log at which the API checkpoints; the workers do at 1000."""
 
 
-def run_service(
-    settings: Settings, elsewhere: RendererAddresses, *, host: str, port: int, announce: Callable[[str], None]
-) -> None:
+def run_service(settings: Settings, elsewhere: RendererAddresses, *, host: str, port: int) -> None:
     """Serve until SIGTERM or SIGINT, with own renderers and those ``elsewhere``. Port 0 takes a free one.
 
-    Calls ``announce`` with one line once everything is ready. Raises ``ServiceError`` if the address is in use, the
+    Prints one line once everything is ready. Raises ``ServiceError`` if the address is in use, the
     data folder cannot be used, or a child does not start.
     """
     _refuse_without_renderers(settings, elsewhere)
@@ -51,11 +50,11 @@ def run_service(
     with (
         exclusive(settings.data / "serve.lock", _in_use(settings)),
         _listen(host, port) as listener,
-        Supervisor(settings, elsewhere) as supervisor,
+        closing(Supervisor(settings, elsewhere)) as supervisor,
     ):
         supervisor.start()
         with _attack_workers(settings, supervisor.addresses) as missing:
-            _serve_http(settings, supervisor, lambda: [*supervisor.missing(), *missing()], listener, announce)
+            _serve_http(settings, supervisor, lambda: [*supervisor.missing(), *missing()], listener)
 
 
 @contextmanager
@@ -73,7 +72,6 @@ def _serve_http(
     supervisor: Supervisor,
     missing: Callable[[], list[str]],
     listener: socket.socket,
-    announce: Callable[[str], None],
 ) -> None:
     store, files = JobStore(settings.database_url, silence=settings.silence), open_folder(settings.store_url)
     if store.engine.dialect.name == "sqlite":
@@ -93,7 +91,7 @@ def _serve_http(
         server_header=False,
     )
     try:
-        _Server(config, lambda: announce(f"trompe serving on {_url(listener)}")).run(sockets=[listener])
+        _Server(config).run(sockets=[listener])
     finally:
         store.close()
 
@@ -114,13 +112,10 @@ def _avoid_checkpoints(connection: Any, _record: Any) -> None:
 class _Server(uvicorn.Server):
     """A server that announces its start."""
 
-    def __init__(self, config: uvicorn.Config, announce: Callable[[], None]) -> None:
-        super().__init__(config)
-        self._announce = announce
-
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
-        self._announce()
+        for listener in sockets or ():
+            click.echo(f"trompe serving on {_url(listener)}")
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -145,11 +140,8 @@ def _url(listener: socket.socket) -> str:
 def _refuse_public(host: str, settings: Settings) -> None:
     if _is_loopback(host):
         return
-    store = JobStore(settings.database_url)
-    try:
+    with closing(JobStore(settings.database_url)) as store:
         closed = any(token.revoked is None for token in Tokens(store.engine).all())
-    finally:
-        store.close()
     if not closed:
         raise ServiceError(
             f"{host} is reachable from other machines, and without a token anybody could use the service. "

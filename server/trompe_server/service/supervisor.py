@@ -11,8 +11,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from trompe_server.errors import ServiceError
 from trompe_server.renderers.discovery import MAX_PROBES, Address, RendererAddresses
@@ -127,7 +126,7 @@ class Child:
 
 
 class Supervisor:
-    """The renderers of ``trompe serve``; a context manager. A restarted one keeps its port.
+    """The renderers of ``trompe serve``, which ``close`` ends. A restarted one keeps its port.
 
     RendererAddresses ``elsewhere`` are used and probed, but not supervised.
     """
@@ -140,14 +139,6 @@ class Supervisor:
             Child("renderer worker", partial(self._render, number), listening) for number in range(settings.renderers)
         ]
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
-
     def start(self, *, timeout: float = 90.0) -> None:
         """Start all children and wait until they are ready. Raises ``ServiceError`` after ``timeout`` seconds."""
         deadline = time.monotonic() + timeout
@@ -155,7 +146,7 @@ class Supervisor:
             renderer.start()
         self._ports = [int(renderer.wait_ready(deadline)[2]) for renderer in self.renderers]
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """End all children."""
         with ThreadPoolExecutor(max(1, len(self.renderers))) as pool:
             list(pool.map(Child.stop, self.renderers))

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -82,11 +82,8 @@ def _tokens(settings: Settings) -> Iterator[Tokens]:
     from trompe_server.service.dispatch import prepare_data
 
     prepare_data(settings)
-    store = JobStore(settings.database_url)
-    try:
+    with closing(JobStore(settings.database_url)) as store:
         yield Tokens(store.engine)
-    finally:
-        store.close()
 
 
 def _row(each: Token) -> dict[str, str | None]:

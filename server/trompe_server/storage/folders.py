@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Protocol, cast
+from typing import Any, BinaryIO, Final, cast
 
 from trompe_server.errors import ServiceError
 from trompe_server.system.files import no_space, write_whole
@@ -18,63 +18,7 @@ _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]{0,199}")
 _JOBS: Final = "jobs"
 
 
-class Folder(Protocol):
-    """Files by name, and subfolders."""
-
-    def read(self, name: str) -> bytes:
-        """Bytes of a file. Raises ``FileNotFoundError``."""
-        ...
-
-    def write(self, name: str, data: bytes) -> None:
-        """Store a file, atomically replacing one of the same name. Raises ``ServiceError`` without space."""
-        ...
-
-    def write_file(self, name: str, file: Path) -> None:
-        """Store a copy of a local file of any size."""
-        ...
-
-    def open(self, name: str) -> BinaryIO:
-        """Open a file for reading; it is seekable. Raises ``FileNotFoundError``."""
-        ...
-
-    def exists(self, name: str) -> bool:
-        """Whether the file exists."""
-        ...
-
-    def size(self, name: str) -> int:
-        """Bytes of a file. Raises ``FileNotFoundError``."""
-        ...
-
-    def touched(self, name: str) -> float:
-        """Time of the last write or touch, seconds since 1970. Raises ``FileNotFoundError``."""
-        ...
-
-    def touch(self, name: str) -> None:
-        """Mark a file as used now."""
-        ...
-
-    def names(self) -> list[str]:
-        """Names of the files, sorted."""
-        ...
-
-    def folders(self) -> list[str]:
-        """Names of the subfolders, sorted."""
-        ...
-
-    def within(self, name: str) -> "Folder":
-        """The subfolder ``name``, created with its first file."""
-        ...
-
-    def delete(self, name: str) -> None:
-        """Delete a file if it exists."""
-        ...
-
-    def delete_all(self) -> None:
-        """Delete the folder with its content. Raises ``ServiceError`` if that fails."""
-        ...
-
-
-def open_folder(url: str | Path) -> Folder:
+def open_folder(url: str | Path) -> "Folder":
     """The folder at a path or URL (``s3://bucket/prefix``). Raises ``ServiceError`` for an unsupported URL."""
     text = str(url)
     scheme, _, rest = text.partition("://")
@@ -94,7 +38,7 @@ def open_folder(url: str | Path) -> Folder:
     return RemoteArtifacts(system, root.rstrip("/"))
 
 
-def job_artifacts(store: Folder, job: str, *, attempt: int | None = None) -> "JobArtifacts":
+def job_artifacts(store: "Folder", job: str, *, attempt: int | None = None) -> "JobArtifacts":
     """The files of one job in the store, read-only without ``attempt``."""
     return JobArtifacts(store.within(_JOBS).within(job), attempt)
 
@@ -111,7 +55,7 @@ def checked(name: str) -> str:
 
 @dataclass(frozen=True)
 class LocalArtifacts:
-    """A ``Folder`` on this machine, created with its first file."""
+    """Files by name, and subfolders: a folder on this machine, created with its first file."""
 
     folder: Path
 
@@ -120,42 +64,54 @@ class LocalArtifacts:
         return self.folder / checked(name)
 
     def read(self, name: str) -> bytes:
+        """Bytes of a file. Raises ``FileNotFoundError``."""
         return self.path(name).read_bytes()
 
-    def write(self, name: str, data: bytes) -> None:
+    def write(self, name: str, data: bytes | Path) -> None:
+        """Store bytes, or a copy of a local file, atomically in place of a file of the same name.
+
+        Raises ``ServiceError`` without space.
+        """
         write_whole(self.path(name), data)
 
-    def write_file(self, name: str, file: Path) -> None:
-        write_whole(self.path(name), file)
-
     def open(self, name: str) -> BinaryIO:
+        """Open a file for reading; it is seekable. Raises ``FileNotFoundError``."""
         return self.path(name).open("rb")
 
     def exists(self, name: str) -> bool:
+        """Whether the file exists."""
         return self.path(name).is_file()
 
     def size(self, name: str) -> int:
+        """Bytes of a file. Raises ``FileNotFoundError``."""
         return self.path(name).stat().st_size
 
     def touched(self, name: str) -> float:
+        """Time of the last write or touch, seconds since 1970. Raises ``FileNotFoundError``."""
         return self.path(name).stat().st_mtime
 
     def touch(self, name: str) -> None:
+        """Mark a file as used now."""
         os.utime(self.path(name))
 
     def names(self) -> list[str]:
+        """Names of the files, sorted."""
         return sorted(each.name for each in self._entries() if each.is_file())
 
     def folders(self) -> list[str]:
+        """Names of the subfolders, sorted."""
         return sorted(each.name for each in self._entries() if each.is_dir())
 
     def within(self, name: str) -> "LocalArtifacts":
+        """The subfolder ``name``, created with its first file."""
         return LocalArtifacts(self.path(name))
 
     def delete(self, name: str) -> None:
+        """Delete a file if it exists."""
         self.path(name).unlink(missing_ok=True)
 
     def delete_all(self) -> None:
+        """Delete the folder with its content. Raises ``ServiceError`` if that fails."""
         try:
             shutil.rmtree(self.folder)
         except FileNotFoundError:
@@ -173,7 +129,7 @@ class LocalArtifacts:
 
 @dataclass(frozen=True)
 class RemoteArtifacts:
-    """A ``Folder`` at ``root`` of an fsspec file system. Object stores write atomically."""
+    """The same at ``root`` of an fsspec file system. Object stores write atomically."""
 
     system: Any
     root: str
@@ -182,15 +138,13 @@ class RemoteArtifacts:
         with self._translated():
             return bytes(self.system.cat_file(self._path(name)))
 
-    def write(self, name: str, data: bytes) -> None:
+    def write(self, name: str, data: bytes | Path) -> None:
         with self._translated():
             self.system.makedirs(self.root, exist_ok=True)
-            self.system.pipe_file(self._path(name), data)
-
-    def write_file(self, name: str, file: Path) -> None:
-        with self._translated():
-            self.system.makedirs(self.root, exist_ok=True)
-            self.system.put_file(str(file), self._path(name))
+            if isinstance(data, bytes):
+                self.system.pipe_file(self._path(name), data)
+            else:
+                self.system.put_file(str(data), self._path(name))
 
     def open(self, name: str) -> BinaryIO:
         with self._translated():
@@ -256,6 +210,9 @@ class RemoteArtifacts:
                 f"The store at {self.root} is not available ({type(error).__name__}: {error}). "
                 "Check its URL (--store or TROMPE_STORE), its credentials and the network."
             ) from error
+
+
+Folder = LocalArtifacts | RemoteArtifacts
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import pytest
 from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE
 from trompe_server.errors import AmbiguousError, NotFoundError
 from trompe_server.library import Library
-from trompe_server.library.inspection import inspect_classifier
+from trompe_server.library.library import inspect_classifier
 from trompe_server.storage.folders import open_folder
 from trompe_shared.errors import ClassifierError, ObjectError
 from trompe_shared.object3d import load_object
