@@ -6,7 +6,6 @@ from trompe_server.api.services import Services
 from trompe_server.errors import ConflictError
 from trompe_server.judgement.suites import suite_of
 from trompe_server.library import Library
-from trompe_server.queue.store import JobStore
 from trompe_server.spec.checks import (
     check_gradients,
     check_keep,
@@ -22,7 +21,6 @@ from trompe_shared.api import (
     JOB_RESULT,
     BackgroundInfo,
     ClassifierInfo,
-    Job,
     JobSpec,
     JudgementRequest,
     ObjectInfo,
@@ -88,21 +86,15 @@ def checked_judgement(spec: JudgementRequest, services: Services) -> tuple[Judge
 
 
 def _judged(reference: str, services: Services) -> ObjectInfo:
-    """A stored object, or the painted object of a job, which is stored."""
+    """A stored object, or the painted object of a job, which is stored. Raises ``ConflictError`` without one."""
     if not reference.startswith(JOB_RESULT):
         return services.library.object(reference)
-    job, name = painted_archive(services.store, reference)
-    with services.artifacts(job.id).open(name) as painted:
-        return services.library.add_object(painted, name)
-
-
-def painted_archive(store: JobStore, reference: str) -> tuple[Job, str]:
-    """The job of a ``job:ID`` and the name of its painted object's archive. Raises ``ConflictError`` without one."""
-    job = store.get(reference.removeprefix(JOB_RESULT))
+    job = services.store.get(reference.removeprefix(JOB_RESULT))
     name = next((each for each in job.artifacts if each.endswith(f"{ADVERSARIAL}.zip")), None)
     if name is None:
         raise ConflictError(f"Job {job.id} is {job.state} and has no painted object to judge.")
-    return job, name
+    with services.artifacts(job.id).open(name) as painted:
+        return services.library.add_object(painted, name)
 
 
 def _check_goal(spec: JobSpec, classifier: ClassifierInfo) -> None:

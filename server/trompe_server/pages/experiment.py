@@ -1,7 +1,6 @@
 """The page of an experiment: rows of its table and jobs of its chart."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 from trompe_server.pages.chart import Point
@@ -15,28 +14,15 @@ Entry = tuple[JobRow, Mapping[str, Any], Result | None]
 OUTCOME: Final = ("A_drop", "held-out A_drop", "seconds")
 
 
-@dataclass(frozen=True)
-class Line:
-    """A job in the table; a cell for each column."""
-
-    job: str
-    object: str
-    state: str
-    cells: Sequence[str]
-
-
 def differing_options(entries: Sequence[Entry]) -> list[str]:
     """Options in which jobs on the same object differ; epsilon in any case."""
     return comparison.differing_options([(row.object, options) for row, options, _ in entries])
 
 
-def columns_and_lines(entries: Sequence[Entry], options: Sequence[str]) -> tuple[list[str], list[Line]]:
-    """Columns (``options`` and the outcome) and lines of the table."""
-    lines = [
-        Line(row.id, row.object, row.state, [*(value_text(asked[name]) for name in options), *_outcome(result)])
-        for row, asked, result in entries
-    ]
-    return [*options, *OUTCOME], lines
+def cells_of(entry: Entry, options: Sequence[str]) -> list[str]:
+    """A job in the table: its ``options`` and its ``OUTCOME``."""
+    _, asked, result = entry
+    return [*(value_text(asked[name]) for name in options), *_outcome(result)]
 
 
 def points_of(entries: Sequence[Entry], options: Sequence[str]) -> list[Point]:

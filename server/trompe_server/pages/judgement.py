@@ -2,8 +2,7 @@
 
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from markupsafe import Markup
 
@@ -14,18 +13,6 @@ from trompe_shared.api import Accuracy, Cell, Manifest
 LEFT, RIGHT, TOP, BOTTOM = 50.0, 700.0, 15.0, 250.0
 SPREAD: Final = 8.0
 """Distance of the points of one image pipeline."""
-
-
-@dataclass(frozen=True)
-class _Mark:
-    """A point of the chart with its interval, in SVG units."""
-
-    x: float
-    y: float
-    low: float
-    high: float
-    look: str
-    title: str
 
 
 def judgement_page(manifest: Manifest, pictures: Mapping[str, bytes]) -> str:
@@ -60,7 +47,8 @@ def shares_in_words(found: Accuracy | None) -> tuple[str, str, str]:
     return f"{found.a_before:.2f}", after, "n.a." if drop is None else f"{drop:.2f}{within}"
 
 
-def _marks(cells: Sequence[Cell], columns: Sequence[tuple[str, str]], pipelines: Sequence[str]) -> list[_Mark]:
+def _marks(cells: Sequence[Cell], columns: Sequence[tuple[str, str]], pipelines: Sequence[str]) -> list[dict[str, Any]]:
+    """Points of the chart with their intervals, in SVG units."""
     marks = []
     for cell in cells:
         found = cell.accuracy
@@ -68,12 +56,15 @@ def _marks(cells: Sequence[Cell], columns: Sequence[tuple[str, str]], pipelines:
             continue
         column = columns.index((cell.renderer, cell.network))
         aside = (column - (len(columns) - 1) / 2) * min(SPREAD, 40 / len(columns))
-        low, high = map(_y, found.a_drop_interval)
-        title = f"{cell.network} in {cell.renderer}, {cell.pipeline}: A_drop {shares_in_words(found)[2]}"
         marks.append(
-            _Mark(
-                _x(pipelines.index(cell.pipeline), pipelines) + aside, _y(found.a_drop), low, high, _look(column), title
-            )
+            {
+                "x": _x(pipelines.index(cell.pipeline), pipelines) + aside,
+                "y": _y(found.a_drop),
+                "low": _y(found.a_drop_interval[0]),
+                "high": _y(found.a_drop_interval[1]),
+                "look": _look(column),
+                "title": f"{cell.network} in {cell.renderer}, {cell.pipeline}: A_drop {shares_in_words(found)[2]}",
+            }
         )
     return marks
 

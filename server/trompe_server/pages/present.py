@@ -160,15 +160,12 @@ def span(seconds: float) -> str:
 class Shown:
     """A result as displayed on its page."""
 
+    result: Result
     verdict: str
-    drawn_by: str | None
-    noticed: str | None
     viewer: Sequence[Mapping[str, Any]]
     sphere: Sphere
-    became: str
     accuracies: Sequence[Mapping[str, Any]]
     measures: Sequence[Mapping[str, str]]
-    warnings: Sequence[str]
     pictures: Sequence[Mapping[str, str]]
     times: Sequence[Mapping[str, Any]]
     surrogates: Sequence[str]
@@ -179,15 +176,12 @@ def present(result: Result, job: JobRow, *, names: ClassNames) -> Shown:
     """Prepare a result for its page. ``names`` maps class indices to names."""
     sets = _view_sets(result, names, f"/jobs/{job.id}/pictures")
     return Shown(
+        result=result,
         verdict=_verdict(result, job),
-        drawn_by=result.drawn_by,
-        noticed=result.noticed,
         viewer=sets,
         sphere=sphere([each["views"] for each in sets]),
-        became=result.became,
         accuracies=list(_accuracies(result)),
         measures=list(_measures(result)),
-        warnings=result.warnings,
         pictures=[
             {"title": title, "url": f"/v1/jobs/{job.id}/artifacts/{name}"}
             for name, title in PICTURES.items()

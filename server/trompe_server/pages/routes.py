@@ -21,7 +21,7 @@ from trompe_server.formats import write_glb
 from trompe_server.judgement.suites import SUITES
 from trompe_server.pages.chart import chart
 from trompe_server.pages.estimate import Effort, estimate
-from trompe_server.pages.experiment import columns_and_lines, differing_options, points_of
+from trompe_server.pages.experiment import OUTCOME, cells_of, differing_options, points_of
 from trompe_server.pages.form import form_fields
 from trompe_server.pages.naming import Names
 from trompe_server.pages.offline import offline_page
@@ -243,15 +243,14 @@ def show_experiment(request: Request, services: ServicesDep, name: str, cursor: 
     entries = [(names.row(job), names.options(job), _result(services, job)) for job in attacks]
     states = [row.state for row, _, _ in entries]
     options = differing_options(entries)
-    columns, lines = columns_and_lines(entries, options)
     return page(
         request,
         "experiment.html",
         name=name,
         counts={state: states.count(state) for state in dict.fromkeys(states)},
         chart=chart(points_of(entries, options), measure="A_drop in the target (held-out views, if any)"),
-        columns=columns,
-        lines=lines,
+        columns=[*options, *OUTCOME],
+        lines=[(entry[0], cells_of(entry, options)) for entry in entries],
         older=found.next_cursor and f"?{urlencode({'cursor': found.next_cursor})}",
     )
 

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from trompe_server.api.services import Services
-from trompe_server.api.submission import painted_archive
+from trompe_server.pages.orbit import painted
 from trompe_server.spec.framing import framing_of
 from trompe_shared.api import JOB_RESULT, JobSpec, ViewOptions
 from trompe_shared.colours import colour_of
@@ -49,6 +49,5 @@ def _object(services: Services, reference: str) -> tuple[Object3D, str]:
     """The object, and the stored one that it was."""
     if not reference.startswith(JOB_RESULT):
         return load_object(services.library.object_bytes(reference)), reference
-    job, name = painted_archive(services.store, reference)
-    source = job.spec.object if isinstance(job.spec, JobSpec) else ""
-    return load_object(services.artifacts(job.id).read(name)), source
+    job = services.store.get(reference.removeprefix(JOB_RESULT))
+    return painted(services, job, "after"), job.spec.object if isinstance(job.spec, JobSpec) else ""
