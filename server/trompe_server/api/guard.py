@@ -16,6 +16,7 @@ from urllib.parse import SplitResult, urlsplit
 from fastapi import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from trompe_server.api.middleware import HttpMiddleware
 from trompe_server.api.problems import problem_response
 from trompe_server.api.rate import RateLimit
 from trompe_server.storage.tokens import Right, Token, Tokens, hash_secret
@@ -44,27 +45,27 @@ class _RefusedError(Exception):
         self.headers = {name.replace("_", "-"): value for name, value in headers.items()}
 
 
-class Guard:
+class Guard(HttpMiddleware):
     """Admits requests by token and rate; without tokens, by origin."""
 
     def __init__(self, app: ASGIApp, *, tokens: Tokens, rate: float) -> None:
-        self._app, self._tokens, self._limit = app, tokens, RateLimit(rate)
+        super().__init__(app)
+        self._tokens, self._limit = tokens, RateLimit(rate)
         self._known: Mapping[str, Token] = {}
         self._looked_up = -math.inf
         self._lock = asyncio.Lock()
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request, or refuse it."""
-        if scope["type"] == "http":
-            request = Request(scope)
-            try:
-                await self._admit(request)
-            except _RefusedError as refusal:
-                response = problem_response(request, refusal.status, code=refusal.code, detail=str(refusal))
-                response.headers.update(refusal.headers)
-                await response(scope, receive, send)
-                return
-        await self._app(scope, receive, send)
+        request = Request(scope)
+        try:
+            await self._admit(request)
+        except _RefusedError as refusal:
+            response = problem_response(request, refusal.status, code=refusal.code, detail=str(refusal))
+            response.headers.update(refusal.headers)
+            await response(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
 
     async def _admit(self, request: Request) -> None:
         """Raise ``_RefusedError`` for a request to refuse."""

@@ -1,4 +1,7 @@
-"""Routes for jobs: submit, list, read, cancel, retry, follow, download, delete."""
+"""Routes for jobs: submit, list, read, cancel, retry, follow, download, delete; and for experiments.
+
+An experiment is the jobs with the label ``experiment=<name>``.
+"""
 
 import re
 from collections.abc import Mapping
@@ -17,10 +20,21 @@ from trompe_server.api.services import Services, ServicesDep
 from trompe_server.api.submission import checked_spec
 from trompe_server.errors import ConflictError, NotFoundError
 from trompe_server.queue import retention
-from trompe_shared.api import Job, JobList, JobRequest, JobState, JudgementRequest, JudgementSpec, Result
+from trompe_server.queue.store import EXPERIMENT
+from trompe_shared.api import (
+    ExperimentInfo,
+    Job,
+    JobList,
+    JobRequest,
+    JobState,
+    JudgementRequest,
+    JudgementSpec,
+    Result,
+)
 from trompe_shared.errors import SpecError
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=PROBLEMS)
+experiments = APIRouter(prefix="/v1/experiments", tags=["experiments"], responses=PROBLEMS)
 
 RESULT: Final = "result.json"
 
@@ -162,6 +176,21 @@ def read_archive(services: ServicesDep, job: str) -> StreamingResponse:
     parts = zip_stream(services.artifacts(job), found.artifacts, time=found.finished or found.created)
     disposition = f'attachment; filename="trompe-{PurePath(job).name}.zip"'
     return StreamingResponse(parts, media_type="application/zip", headers={"Content-Disposition": disposition})
+
+
+@experiments.get("", responses=examples.found([examples.EXPERIMENT]))
+def list_experiments(services: ServicesDep) -> list[ExperimentInfo]:
+    """Experiments with the number of their jobs by state, newest first."""
+    return services.store.experiments()
+
+
+@experiments.get("/{name:path}", responses=examples.found(examples.JOB_LIST))
+def read_experiment(services: ServicesDep, name: str, limit: Limit = 50, cursor: Cursor = None) -> JobList:
+    """Jobs of an experiment, newest first."""
+    page = services.store.page(labels={EXPERIMENT: name}, limit=limit, cursor=cursor)
+    if not page.jobs and cursor is None:
+        raise NotFoundError(f"There is no experiment {name!r}. List the experiments to find its name.")
+    return page
 
 
 def create(

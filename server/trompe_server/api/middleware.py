@@ -1,4 +1,4 @@
-"""Middleware, from the outside in: request ids, log and security headers; errors as problem details; body limit."""
+"""Middleware, from the outside in: request ids, log, security headers, errors as problem details; body limit."""
 
 import logging
 import secrets
@@ -11,7 +11,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from trompe_server.api.metrics import HttpMetrics
-from trompe_server.api.problems import REQUEST_ID, failure_response, problem_response
+from trompe_server.api.problems import failure_response, problem_response
 
 logger = logging.getLogger(__name__)
 
@@ -24,26 +24,41 @@ HEADERS: Final = {
     "Cache-Control": "no-store",
 }
 """Default headers of responses."""
+REQUEST_ID: Final = "X-Request-ID"
 
 
-class Envelope:
+class HttpMiddleware:
+    """Hands requests to ``serve``, and anything else straight to the application."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await (self.serve if scope["type"] == "http" else self._app)(scope, receive, send)
+
+    async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        raise NotImplementedError
+
+
+class Envelope(HttpMiddleware):
     """Gives each request an id, in ``scope["request_id"]`` and on the response, counts it and logs it.
 
-    Logged seconds end at the start of the response, since a stream of events may last for hours.
+    Logged seconds end at the start of the response, since a stream of events may last for hours. Exceptions before it
+    are answered with problem details.
     """
 
     def __init__(self, app: ASGIApp, *, metrics: HttpMetrics) -> None:
-        self._app, self._metrics = app, metrics
+        super().__init__(app)
+        self._metrics = metrics
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
+    async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         identity = scope["request_id"] = secrets.token_hex(8)
-        started = time.perf_counter()
+        started, begun = time.perf_counter(), False
 
         async def send_with_headers(message: Message) -> None:
+            nonlocal begun
+            begun = True
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 headers[REQUEST_ID] = identity
@@ -52,7 +67,12 @@ class Envelope:
                 self._note(scope, message["status"], time.perf_counter() - started)
             await send(message)
 
-        await self._app(scope, receive, send_with_headers)
+        try:
+            await self._app(scope, receive, send_with_headers)
+        except Exception as error:
+            if begun:
+                raise
+            await failure_response(Request(scope), error)(scope, receive, send_with_headers)
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
         self._metrics.count(scope, status, seconds)
@@ -64,44 +84,22 @@ class Envelope:
             scope["path"],
             status,
             1000 * seconds,
-            extra={"request": scope["request_id"], "token": scope.get("token"), "job": _job(scope)},
+            extra={
+                "request": scope["request_id"],
+                "token": scope.get("token"),
+                "job": scope.get("path_params", {}).get("job"),
+            },
         )
 
 
-class Failures:
-    """Answers exceptions before the start of the response with problem details."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
-        begun = False
-
-        async def send_and_note(message: Message) -> None:
-            nonlocal begun
-            begun = True
-            await send(message)
-
-        try:
-            await self._app(scope, receive, send_and_note)
-        except Exception as error:
-            if begun or scope["type"] != "http":
-                raise
-            await failure_response(Request(scope), error)(scope, receive, send)
-
-
-class BodyLimit:
+class BodyLimit(HttpMiddleware):
     """Refuses bodies of more than ``limit`` bytes with 413, by announced and by actual size."""
 
     def __init__(self, app: ASGIApp, *, limit: int) -> None:
-        self._app, self._limit = app, limit
+        super().__init__(app)
+        self._limit = limit
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
+    async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         announced = dict(scope["headers"]).get(b"content-length", b"0")
         if announced.isdigit() and int(announced) > self._limit:
             await problem_response(Request(scope), 413, code="too-large", detail=self._refusal())(scope, receive, send)
@@ -120,8 +118,3 @@ class BodyLimit:
 
     def _refusal(self) -> str:
         return f"The upload is larger than {self._limit / 2**20:g} MiB, the limit of this server (TROMPE_MAX_UPLOAD)."
-
-
-def _job(scope: Scope) -> str | None:
-    job: str | None = scope.get("path_params", {}).get("job")
-    return job

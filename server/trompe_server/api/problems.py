@@ -20,7 +20,6 @@ from trompe_shared.faults import faults_of
 
 logger = logging.getLogger(__name__)
 
-REQUEST_ID: Final = "X-Request-ID"
 RETRY_AFTER: Final = 5
 """Seconds until a retry, if a part of the service is down."""
 
@@ -48,8 +47,7 @@ PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
 
 
 def answer_with_problems(app: FastAPI) -> None:
-    """Make ``app`` answer all errors with problem details."""
-    app.add_exception_handler(TrompeError, _trompe_error)
+    """Make ``app`` answer its refusals with problem details. ``Envelope`` does so with all other errors."""
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(HTTPException, _http_error)
 
@@ -76,12 +74,7 @@ def problem_response(
         problem.model_dump(mode="json", exclude_none=True),
         status_code=status,
         media_type="application/problem+json",
-        headers={REQUEST_ID: problem.request_id} if problem.request_id else None,
     )
-
-
-async def _trompe_error(request: Request, error: Exception) -> JSONResponse:
-    return failure_response(request, error)
 
 
 async def _validation_error(request: Request, error: Exception) -> JSONResponse:

@@ -6,22 +6,20 @@ from urllib.parse import quote
 
 from fastapi import Request
 from fastapi.responses import RedirectResponse, Response
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
 
+from trompe_server.api.middleware import HttpMiddleware
 from trompe_server.pages.serving import page
 
 PROBLEM = b"application/problem+json"
 
 
-class HtmlProblems:
+class HtmlProblems(HttpMiddleware):
     """Turns problem details into pages for requests that accept HTML."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
-        if scope["type"] != "http" or not _wants_a_page(Request(scope)):
+    async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+        request = Request(scope)
+        if "text/html" not in request.headers.get("accept", "") or request.url.path.startswith("/v1/"):
             await self._app(scope, receive, send)
             return
         begin: Message | None = None
@@ -36,13 +34,9 @@ class HtmlProblems:
             else:
                 body += message.get("body", b"")
                 if not message.get("more_body"):
-                    await _as_page(Request(scope), begin["status"], body)(scope, receive, send)
+                    await _as_page(request, begin["status"], body)(scope, receive, send)
 
         await self._app(scope, receive, send_page)
-
-
-def _wants_a_page(request: Request) -> bool:
-    return "text/html" in request.headers.get("accept", "") and not request.url.path.startswith("/v1/")
 
 
 def _is_problem(message: Message) -> bool:

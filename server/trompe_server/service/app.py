@@ -5,11 +5,11 @@ from typing import Final
 
 from fastapi import FastAPI
 
-from trompe_server.api import classify, experiments, health, jobs, judgements, library, metrics
+from trompe_server.api import classify, health, jobs, judgements, library, metrics
 from trompe_server.api.contract import contract
 from trompe_server.api.guard import Guard
 from trompe_server.api.metrics import HttpMetrics
-from trompe_server.api.middleware import BodyLimit, Envelope, Failures
+from trompe_server.api.middleware import BodyLimit, Envelope
 from trompe_server.api.problems import answer_with_problems
 from trompe_server.api.services import Services
 from trompe_server.pages import add_pages
@@ -23,7 +23,7 @@ ROUTERS: Final = (
     classify.router,
     jobs.router,
     judgements.router,
-    experiments.router,
+    jobs.experiments,
     health.router,
     metrics.router,
 )
@@ -33,19 +33,13 @@ def create_app(services: Services) -> FastAPI:
     """Build the application on ``services``."""
     app = FastAPI(title="Trompe", version=version("trompe"), description=DESCRIPTION, docs_url=None, redoc_url=None)
     app.state.services, app.state.metrics = services, HttpMetrics()
-    _wrap(app, services)
+    # the last middleware is the outermost
+    app.add_middleware(BodyLimit, limit=services.settings.max_upload)
+    app.add_middleware(Guard, tokens=services.tokens, rate=services.settings.rate_limit)
+    app.add_middleware(Envelope, metrics=app.state.metrics)
     answer_with_problems(app)
     for router in ROUTERS:
         app.include_router(router)
     add_pages(app)
     app.openapi = lambda: contract(app)  # type: ignore[method-assign]
     return app
-
-
-def _wrap(app: FastAPI, services: Services) -> None:
-    """Add the middleware; the last one is the outermost."""
-    settings = services.settings
-    app.add_middleware(BodyLimit, limit=settings.max_upload)
-    app.add_middleware(Guard, tokens=services.tokens, rate=settings.rate_limit)
-    app.add_middleware(Failures)
-    app.add_middleware(Envelope, metrics=app.state.metrics)
