@@ -1,36 +1,28 @@
 """Seconds and drop to expect of a job, from earlier ones like it. No I/O."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from statistics import median
 from typing import Final
 
 from trompe_server.pages.present import span
 from trompe_server.pages.results import Outcome
-from trompe_shared.api import Job
+from trompe_shared.api import Job, JobSpec
 
 CLOSE: Final = 1.5
 """Largest ratio of the epsilons of jobs that are alike."""
 
 
-@dataclass(frozen=True)
-class Effort:
-    """Options that decide the time and the drop of a job against one classifier."""
+def estimate(ended: Sequence[tuple[Job, Outcome]], *, pool: int, steps: int, epsilon: float) -> str | None:
+    """Medians over the jobs among ``ended`` with these views and steps and about this epsilon, in words.
 
-    pool: int
-    steps: int
-    epsilon: float
+    ``None`` if there are none. ``ended`` are against one classifier.
+    """
 
-    def is_like(self, job: Job) -> bool:
-        """Whether ``job`` has the same views and steps, and about the same epsilon."""
-        spec = job.attack
-        ratio = max(spec.paint.epsilon, self.epsilon) / max(min(spec.paint.epsilon, self.epsilon), 1e-6)
-        return (spec.views.pool, spec.search.steps) == (self.pool, self.steps) and ratio <= CLOSE
+    def is_like(spec: JobSpec) -> bool:
+        ratio = max(spec.paint.epsilon, epsilon) / max(min(spec.paint.epsilon, epsilon), 1e-6)
+        return (spec.views.pool, spec.search.steps) == (pool, steps) and ratio <= CLOSE
 
-
-def estimate(effort: Effort, ended: Sequence[tuple[Job, Outcome]]) -> str | None:
-    """Medians over the jobs among ``ended`` that are like ``effort``, in words; ``None`` if there are none."""
-    like = [(job, outcome.drop) for job, outcome in ended if effort.is_like(job) and outcome.drop is not None]
+    like = [(job, outcome.drop) for job, outcome in ended if is_like(job.attack) and outcome.drop is not None]
     took = [(job.finished - job.started).total_seconds() for job, _ in like if job.started and job.finished]
     drops = [drop for _, drop in like if drop is not None]
     if not took:

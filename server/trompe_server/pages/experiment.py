@@ -22,7 +22,12 @@ def differing_options(entries: Sequence[Entry]) -> list[str]:
 def cells_of(entry: Entry, options: Sequence[str]) -> list[str]:
     """A job in the table: its ``options`` and its ``OUTCOME``."""
     _, asked, result = entry
-    return [*(value_text(asked[name]) for name in options), *_outcome(result)]
+    cells = [value_text(asked[name]) for name in options]
+    if result is None:
+        return cells + [value_text(None)] * len(OUTCOME)
+    drops = [judged.a_drop if judged else None for judged in (result.target, result.held_out)]
+    told = [value_text(None) if drop is None else f"{drop:.2f}" for drop in drops]
+    return [*cells, *told, f"{sum(result.seconds.values()):.0f}"]
 
 
 def points_of(entries: Sequence[Entry], options: Sequence[str]) -> list[Point]:
@@ -44,12 +49,3 @@ def points_of(entries: Sequence[Entry], options: Sequence[str]) -> list[Point]:
         )
         points.append(Point(row.id, job))
     return points
-
-
-def _outcome(result: Result | None) -> list[str]:
-    nothing = value_text(None)
-    if result is None:
-        return [nothing] * len(OUTCOME)
-    drops = [judged.a_drop if judged else None for judged in (result.target, result.held_out)]
-    told = [nothing if drop is None else f"{drop:.2f}" for drop in drops]
-    return [*told, f"{sum(result.seconds.values()):.0f}"]

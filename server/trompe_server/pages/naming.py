@@ -6,7 +6,7 @@ from typing import Any
 
 from trompe_server.errors import NotFoundError
 from trompe_server.library import Library
-from trompe_server.pages.present import ClassNames, JobRow, job_row
+from trompe_server.pages.present import ClassNames, JobRow
 from trompe_shared.api import OPTIONS, Job, JobSpec, JudgementSpec
 
 
@@ -21,14 +21,14 @@ class Names:
         spec = job.spec
         if isinstance(spec, JudgementSpec):
             before, after = (_named(job, each) for each in (spec.before, spec.after))
-            return job_row(
+            return JobRow.of(
                 job,
                 object=after if after == before else f"{after}, judged beside {before}",
                 classifier=", ".join(_named(job, spec.networks)) or spec.suite or "tiny",
                 label=" or ".join(map(str, spec.label)),
                 epsilon=spec.epsilon,
             )
-        return job_row(
+        return JobRow.of(
             job,
             object=_named(job, spec.object),
             classifier=_named(job, spec.victim.classifier),

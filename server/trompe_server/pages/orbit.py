@@ -21,7 +21,8 @@ PLAIN: Final = "#ffffff"
 def orbit(result: Result, job: str, classifiers: Sequence[ClassifierInfo]) -> Mapping[str, Any] | None:
     """The orbit's JSON, which begins at a fooled view; ``None`` without an attack."""
     views = result.held_out_views or result.views
-    start = next((view for view in views if _fooled(view, result.labels)), views[0])
+    fooled = (view for view in views if view.before in result.labels and view.after not in result.labels)
+    start = next(fooled, views[0])
     if start.after is None:
         return None
     own = result.spec.victim.classifier
@@ -48,10 +49,6 @@ def painted(services: Services, job: Job, side: str) -> Object3D:
             if name.endswith(ending):
                 return load_object(services.artifacts(job.id).read(name))
     raise NotFoundError(f"Job {job.id} has no repainted object.")
-
-
-def _fooled(view: ViewPrediction, labels: Sequence[int]) -> bool:
-    return view.before in labels and view.after not in labels
 
 
 def _choices(classifiers: Sequence[ClassifierInfo], own: str) -> list[dict[str, str]]:

@@ -3,8 +3,7 @@
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from trompe_server.job.protocol import THUMBNAIL, numbered
 from trompe_server.pages.results import Outcome
@@ -18,7 +17,6 @@ from trompe_shared.api import (
     JobSpec,
     JobState,
     Option,
-    Progress,
     Result,
     ViewPrediction,
 )
@@ -64,26 +62,49 @@ PHASES: Final = {
 }
 
 
-@dataclass(frozen=True)
-class JobRow:
-    """A job in a list. ``version`` changes with the displayed values. ``outcome``: of an ended job with a result."""
+class JobRow(Job):
+    """A job in a list, with names in place of ids. ``outcome``: of an ended job with a result."""
 
-    id: str
     object: str
     label: str
     classifier: str
     epsilon: str
-    state: str
-    live: bool
-    fraction: float
-    phase: str
-    eta: str | None
-    words: str
-    error: str | None
-    note: str | None
-    created: datetime
-    artifacts: Sequence[str]
     outcome: Outcome | None = None
+
+    @classmethod
+    def of(cls, job: Job, *, epsilon: float | None, **names: str) -> Self:
+        """A stored job with the names of its object, label and classifier."""
+        told = "none stated" if epsilon is None else f"{epsilon:g}"
+        return cls.model_construct(None, **dict(job), **names, epsilon=told)
+
+    @property
+    def live(self) -> bool:
+        """Whether the job has not ended."""
+        return not self.state.final
+
+    @property
+    def phase(self) -> str:
+        """The present phase in words; a running job that has reported none is being opened."""
+        kind = self.progress.phase.partition("-")[0]
+        kind = "open" if self.state is JobState.running and kind == JobState.queued else kind
+        return PHASES.get(kind, kind)
+
+    @property
+    def eta(self) -> str | None:
+        """Estimated time left, as a range if the attack may end early."""
+        if not self.live or self.progress.eta_seconds is None:
+            return None
+        most, least = self.progress.eta_seconds, self.progress.eta_least_seconds or self.progress.eta_seconds
+        return span(most) if span(least) == span(most) else f"{span(least)} to {span(most)}"
+
+    @property
+    def words(self) -> str:
+        """How the job ended."""
+        if self.error:
+            return self.error.partition(". ")[0]
+        if self.started and self.finished:
+            return f"took {span((self.finished - self.started).total_seconds())}"
+        return ""
 
     @property
     def thumbnail(self) -> str | None:
@@ -98,57 +119,12 @@ class JobRow:
     @property
     def percent(self) -> int:
         """Progress in per cent."""
-        return round(100 * self.fraction)
+        return round(100 * self.progress.fraction)
 
     @property
     def version(self) -> str:
         """Changes with the displayed values."""
-        return f"{self.state}-{self.fraction:.3f}-{self.phase}-{self.eta}"
-
-
-def job_row(job: Job, *, object: str, classifier: str, label: str, epsilon: float | None) -> JobRow:
-    """A job with names in place of ids."""
-    progress, live = job.progress, not job.state.final
-    kind = _phase(job)
-    return JobRow(
-        id=job.id,
-        object=object,
-        label=label,
-        classifier=classifier,
-        epsilon="none stated" if epsilon is None else f"{epsilon:g}",
-        state=job.state.value,
-        live=live,
-        fraction=progress.fraction,
-        phase=PHASES.get(kind, kind),
-        eta=_left(progress) if live else None,
-        words=_how_it_ended(job),
-        error=job.error,
-        note=job.note,
-        created=job.created,
-        artifacts=job.artifacts,
-    )
-
-
-def _phase(job: Job) -> str:
-    """Kind of the present phase; a running job that has reported none is being opened."""
-    kind = job.progress.phase.partition("-")[0]
-    return "open" if job.state is JobState.running and kind == JobState.queued else kind
-
-
-def _how_it_ended(job: Job) -> str:
-    if job.error:
-        return job.error.partition(". ")[0]
-    if job.started and job.finished:
-        return f"took {span((job.finished - job.started).total_seconds())}"
-    return ""
-
-
-def _left(progress: Progress) -> str | None:
-    """Estimated time left, as a range if the attack may end early."""
-    if progress.eta_seconds is None:
-        return None
-    most, least = span(progress.eta_seconds), span(progress.eta_least_seconds or progress.eta_seconds)
-    return most if least == most else f"{least} to {most}"
+        return f"{self.state}-{self.progress.fraction:.3f}-{self.phase}-{self.eta}"
 
 
 def span(seconds: float) -> str:

@@ -3,7 +3,6 @@
 import asyncio
 import json
 from collections.abc import AsyncIterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 from urllib.parse import urlencode
@@ -20,7 +19,7 @@ from trompe_server.errors import NotFoundError
 from trompe_server.formats import write_glb
 from trompe_server.judgement.suites import SUITES
 from trompe_server.pages.chart import chart
-from trompe_server.pages.estimate import Effort, estimate
+from trompe_server.pages.estimate import estimate
 from trompe_server.pages.experiment import OUTCOME, cells_of, differing_options, points_of
 from trompe_server.pages.form import form_fields
 from trompe_server.pages.naming import Names
@@ -123,7 +122,7 @@ def show_estimate(
     reference = services.library.classifier(classifier).reference
     found = services.store.page(state=JobState.succeeded, classifier=reference, limit=RECENT).jobs
     ended = [(job, outcome) for job in found if (outcome := outcome_of(services.artifacts(job.id)))]
-    return {"text": estimate(Effort(pool, steps, epsilon), ended)}
+    return {"text": estimate(ended, pool=pool, steps=steps, epsilon=epsilon)}
 
 
 @router.get("/judgements/new")
@@ -346,7 +345,7 @@ def _rows(
 
 def _row(services: Services, job: Job, names: Names | None = None) -> JobRow:
     outcome = outcome_of(services.artifacts(job.id)) if RESULT in job.artifacts else None
-    return replace((names or Names(services.library)).row(job), outcome=outcome)
+    return (names or Names(services.library)).row(job).model_copy(update={"outcome": outcome})
 
 
 def _found(services: Services, job: str) -> Job | None:
