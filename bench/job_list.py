@@ -92,7 +92,7 @@ def cases(store: JobStore, count: int) -> Iterator[tuple[str, Callable[[], objec
     yield "label and state", lambda: store.page(labels={"seed": "3"}, state=JobState.failed)
     yield "object", lambda: store.page(object="object-7")
     yield "counts", store.counts
-    yield "statistics", store.statistics
+    yield "oldest queued", store.oldest_queued
     claims = Claims(store.engine)
     yield "claim and finish", lambda: take(claims)
     yield "submit", lambda: store.create(JobRequest.of("mug", label="mug"))

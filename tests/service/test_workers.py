@@ -312,7 +312,7 @@ class TestOutage:
     def test_the_api_s_side_says_so_and_goes_on(self, service: Service, postgres: Any) -> None:
         job = service.submit("fine")
         postgres.stop()
-        for call in (lambda: service.state(job), lambda: service.submit("fine"), service.store.statistics):
+        for call in (lambda: service.state(job), lambda: service.submit("fine"), service.store.counts):
             with pytest.raises(ServiceError, match="is not available"):
                 call()
         postgres.start()

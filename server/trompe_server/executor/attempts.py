@@ -82,7 +82,8 @@ def fault_here(settings: Settings, mark: str) -> str | None:
     try:
         settings.data.mkdir(parents=True, exist_ok=True)
         if not _is_dispatcher(settings, mark):
-            return f"it sees another database at {_place(settings)}; all nodes must reach the same one (PostgreSQL)"
+            place = connect(settings.database_url).url.render_as_string(hide_password=True)
+            return f"it sees another database at {place}; all nodes must reach the same one (PostgreSQL)"
         folder = open_folder(settings.store_url)
         if not folder.exists(MARK) or folder.read(MARK) != mark.encode():
             return f"it does not see the store {settings.store_url}; mount it there, or use an object store"
@@ -98,7 +99,3 @@ def _is_dispatcher(settings: Settings, mark: str) -> bool:
         return (file is None or Path(file).exists()) and lease_holder(engine, DISPATCHER) == mark
     finally:
         engine.dispose()
-
-
-def _place(settings: Settings) -> str:
-    return connect(settings.database_url).url.render_as_string(hide_password=True)

@@ -61,12 +61,6 @@ class _Node:
     checked: float = 0.0
 
 
-@dataclass
-class _Attempt:
-    claim: Claim
-    cancelled: bool = False
-
-
 class RayExecutor:
     """An ``Executor`` on the cluster named by the settings. ``mark``: name of the dispatcher with the lease.
 
@@ -77,7 +71,8 @@ class RayExecutor:
 
     def __init__(self, setup: Setup, *, mark: str) -> None:
         self._setup, self._mark = setup, mark
-        self._setups = {device: pickle.dumps(_on(device, setup)) for device in ("cpu", "cuda")}
+        devices = {device: setup.settings.model_copy(update={"device": device}) for device in ("cpu", "cuda")}
+        self._setups = {device: pickle.dumps(replace(setup, settings=own)) for device, own in devices.items()}
         self._address = setup.settings.executor
         self._ray = _connected(self._address, setup.settings.workers)
         open_folder(setup.settings.store_url).write(MARK, mark.encode())
@@ -85,7 +80,8 @@ class RayExecutor:
         self._forks = self._ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(Forks)
         self._demand = self._ray.remote(max_retries=0, num_cpus=0)(_request)
         self._nodes: dict[str, _Node] = {}
-        self._attempts: dict[Any, _Attempt] = {}
+        self._attempts: dict[Any, Claim] = {}
+        self._cancelled: set[Any] = set()
         self._demanded: list[dict[str, float]] = []
         self._looked = 0.0
         with self._translated():
@@ -110,12 +106,12 @@ class RayExecutor:
                 memory=needs.memory * GIB or None,
                 scheduling_strategy=self._at(node.id),
             ).remote(node.forks, setup, pickle.dumps(claim))
-        self._attempts[task] = _Attempt(claim)
+        self._attempts[task] = claim
 
     def cancel(self, claim: Claim) -> None:
         for task, attempt in self._attempts.items():
-            if attempt.claim == claim:
-                attempt.cancelled = True  # a frozen one holds its room until it wakes
+            if attempt == claim:
+                self._cancelled.add(task)  # a frozen one holds its room until it wakes
                 with self._translated():
                     self._ray.cancel(task, force=True)
 
@@ -147,8 +143,7 @@ class RayExecutor:
             self._ray.shutdown()
 
     def _left(self, node: _Node) -> Needs:
-        claims = (attempt.claim for attempt in self._attempts.values())
-        return left_in(node.room, (claim for claim in claims if claim.job.worker == node.name))
+        return left_in(node.room, (claim for claim in self._attempts.values() if claim.job.worker == node.name))
 
     def _look(self) -> None:
         """Learn which nodes live, and check new ones, and faulty ones again."""
@@ -198,17 +193,18 @@ class RayExecutor:
         return list(done)
 
     def _end(self, task: Any) -> Ended | None:
-        attempt = self._attempts.pop(task)
+        claim, cancelled = self._attempts.pop(task), task in self._cancelled
+        self._cancelled.discard(task)
         try:
             reason: str | None = self._ray.get(task)
-            reason = reason and f"{attempt.claim.job.worker}: {reason}"
+            reason = reason and f"{claim.job.worker}: {reason}"
         except self._ray.exceptions.RayError as error:
-            reason = f"{attempt.claim.job.worker} died ({_first_line(error)})"
-            self._doubt(attempt.claim.job.worker)
-        return None if attempt.cancelled else Ended(attempt.claim, reason)
+            reason = f"{claim.job.worker} died ({_first_line(error)})"
+            self._doubt(claim.job.worker)
+        return None if cancelled else Ended(claim, reason)
 
     def _tell_autoscaler(self, waiting: Mapping[Needs, int]) -> None:
-        running = [_bundle(each.claim.job.needs) for each in self._attempts.values()]
+        running = [_bundle(claim.job.needs) for claim in self._attempts.values()]
         wanted = [_bundle(needs) for needs, count in waiting.items() for _ in range(min(count, MOST_DEMANDED))]
         if (demand := running + wanted) != self._demanded:
             self._demanded = demand
@@ -278,10 +274,6 @@ def _check_there(address: str, place: str) -> None:
             f"No Ray cluster answers at {address} ({error}). Start its head with: ray start --head "
             "--ray-client-server-port 10001; or name another one by TROMPE_EXECUTOR."
         ) from error
-
-
-def _on(device: str, setup: Setup) -> Setup:
-    return replace(setup, settings=setup.settings.model_copy(update={"device": device}))
 
 
 def _request(bundles: list[dict[str, float]]) -> None:

@@ -47,8 +47,11 @@ def run_service(settings: Settings, elsewhere: RendererAddresses, *, host: str, 
         signal.signal(number, _leave)
     prepare_data(settings)
     _refuse_public(host, settings)
+    in_use = (
+        f"Another `trompe serve` uses the data folder {settings.data}; stop it, or choose another folder with --data."
+    )
     with (
-        exclusive(settings.data / "serve.lock", _in_use(settings)),
+        exclusive(settings.data / "serve.lock", in_use),
         _listen(host, port) as listener,
         closing(Supervisor(settings, elsewhere)) as supervisor,
     ):
@@ -162,12 +165,6 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
-
-
-def _in_use(settings: Settings) -> str:
-    return (
-        f"Another `trompe serve` uses the data folder {settings.data}; stop it, or choose another folder with --data."
-    )
 
 
 def _leave(_number: int, _frame: FrameType | None) -> NoReturn:

@@ -94,13 +94,13 @@ class Tokens:
 
     def all(self) -> list[Token]:
         """All tokens, revoked ones included, oldest first."""
-        with self._engine.connect() as connection:
-            return [_token(row) for row in connection.execute(sa.select(_tokens).order_by(_tokens.c.created))]
+        return list(self.by_hash().values())
 
     def by_hash(self) -> Mapping[str, Token]:
-        """All tokens, by the hash of their secret."""
+        """The same by the hash of their secret."""
         with self._engine.connect() as connection:
-            return {row.sha256: _token(row) for row in connection.execute(sa.select(_tokens))}
+            rows = connection.execute(sa.select(_tokens).order_by(_tokens.c.created))
+            return {row.sha256: _token(row) for row in rows}
 
     def revoke(self, name: str) -> None:
         """Revoke a token; no effect on a revoked one. Raises ``NotFoundError``."""

@@ -8,8 +8,9 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Final
 
+PLAIN: Final = "%(asctime)s %(levelname)s %(name)s%(about)s: %(message)s"
 CHATTY: Final = ("httpx", "PIL", "OpenGL", "botocore", "s3fs", "fsspec")
-_STANDARD: Final = set(vars(logging.makeLogRecord({}))) | {"message", "asctime", "job"}
+_STANDARD: Final = set(vars(logging.makeLogRecord({}))) | {"message", "asctime", "job", "about"}
 
 _job: str | None = None
 
@@ -28,7 +29,7 @@ def about_job(job: str) -> Iterator[None]:
 def log_to_stderr() -> None:
     """Log to standard error in the format of TROMPE_LOG."""
     handler = logging.StreamHandler()
-    handler.setFormatter(_Json() if os.environ.get("TROMPE_LOG") == "json" else _Plain())
+    handler.setFormatter(_Json() if os.environ.get("TROMPE_LOG") == "json" else logging.Formatter(PLAIN))
     handler.addFilter(_name_job)
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     for chatty in CHATTY:
@@ -36,19 +37,9 @@ def log_to_stderr() -> None:
 
 
 def _name_job(record: logging.LogRecord) -> bool:
-    if _job is not None and not hasattr(record, "job"):
-        record.job = _job
+    job = getattr(record, "job", _job)
+    vars(record).update(job=job, about=f" [job {job}]" if job else "")
     return True
-
-
-class _Plain(logging.Formatter):
-    def __init__(self) -> None:
-        super().__init__("%(asctime)s %(levelname)s %(name)s%(about)s: %(message)s", defaults={"about": ""})
-
-    def format(self, record: logging.LogRecord) -> str:
-        job = getattr(record, "job", None)
-        record.about = f" [job {job}]" if job else ""
-        return super().format(record)
 
 
 class _Json(logging.Formatter):
@@ -61,7 +52,7 @@ class _Json(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
             "process": record.process,
-            "job": getattr(record, "job", None),
+            "job": vars(record)["job"],
         }
         line |= {name: value for name, value in vars(record).items() if name not in _STANDARD}
         if record.exc_info:
