@@ -8,9 +8,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Final
 
 from trompe_server.errors import ServiceError
@@ -35,20 +34,19 @@ PROBE_PATIENCE: Final = 1.0
 """Seconds a probed renderer has to answer."""
 
 
-class Child:
-    """One supervised process. ``command`` returns its arguments at each start.
+LISTENING: Final = re.compile(r"^trompe renderer listening on \S+:(\d+)\b")
+"""The line a renderer worker prints once it is ready; its other lines are logged."""
 
-    ``ready`` matches the line it prints once it is up; its other lines are logged.
-    """
 
-    def __init__(self, name: str, command: Callable[[], list[str]], ready: re.Pattern[str]) -> None:
-        self.name, self._command, self._ready = name, command, ready
-        self.match: re.Match[str] | None = None
-        self.failures = 0
+class _Renderer:
+    """One supervised renderer worker, with an engine by ``flags``. ``port``: its own once it was ready, first 0."""
+
+    def __init__(self, flags: Sequence[str]) -> None:
+        self._flags, self.port, self._failures = flags, 0, 0
         self._process: subprocess.Popen[str] | None = None
         self._stopping = threading.Event()
         self._up = threading.Event()
-        self._thread = threading.Thread(target=self._supervise, name=f"supervise-{name}", daemon=True)
+        self._thread = threading.Thread(target=self._supervise, name="supervise-renderer", daemon=True)
 
     @property
     def up(self) -> bool:
@@ -59,19 +57,14 @@ class Child:
         """Start the process, and restart it whenever it dies, until ``stop``."""
         self._thread.start()
 
-    def wait_ready(self, deadline: float) -> re.Match[str]:
-        """Wait for the ready line and return its match.
-
-        Raises ``ServiceError`` at ``deadline`` (monotonic), or earlier if the process keeps dying.
-        """
+    def wait_ready(self, deadline: float) -> None:
+        """Raise ``ServiceError`` if it is not up at ``deadline`` (monotonic), or earlier if the process keeps dying."""
         while not self._up.wait(0.1):
-            if time.monotonic() > deadline or (self.match is None and self.failures >= GIVE_UP):
+            if time.monotonic() > deadline or (not self.port and self._failures >= GIVE_UP):
                 raise ServiceError(
-                    f"The {self.name} does not start (it died {self.failures} times); see its messages above. "
+                    f"The renderer worker does not start (it died {self._failures} times); see its messages above. "
                     "`trompe doctor` looks for the cause."
                 )
-        assert self.match is not None
-        return self.match
 
     def stop(self) -> None:
         """End the process by SIGTERM, then by SIGKILL."""
@@ -92,9 +85,9 @@ class Child:
             status = self._run_once()
             if self._stopping.is_set():
                 return
-            self.failures = 1 if time.monotonic() - started > STEADY else self.failures + 1
-            wait = BACKOFF[min(self.failures, len(BACKOFF)) - 1]
-            logger.warning("the %s ended (status %s); restart in %.1f s", self.name, status, wait)
+            self._failures = 1 if time.monotonic() - started > STEADY else self._failures + 1
+            wait = BACKOFF[min(self._failures, len(BACKOFF)) - 1]
+            logger.warning("the renderer worker ended (status %s); restart in %.1f s", status, wait)
             self._stopping.wait(wait)
 
     def _run_once(self) -> int:
@@ -102,7 +95,8 @@ class Child:
 
         It has its own process group: Ctrl-C reaches only us, and we end it in order.
         """
-        command = [sys.executable, "-m", "trompe_server.system.child", *self._command()]
+        place = ["--host", "127.0.0.1", "--port", str(self.port)]
+        command = [sys.executable, "-m", "trompe_server.system.child", "render", *place, *self._flags]
         pipe = subprocess.PIPE
         with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, process_group=0) as process:
             self._process = process
@@ -117,12 +111,11 @@ class Child:
         return status
 
     def _read(self, line: str) -> None:
-        match = self._ready.search(line)
-        if match:
-            self.match = match
+        if match := LISTENING.search(line):
+            self.port = int(match[1])
             self._up.set()
         elif line:
-            logger.info("%s: %s", self.name, line)
+            logger.info("renderer worker: %s", line)
 
 
 class Supervisor:
@@ -132,31 +125,28 @@ class Supervisor:
     """
 
     def __init__(self, settings: Settings, elsewhere: RendererAddresses) -> None:
-        self._settings, self._elsewhere = settings, elsewhere
-        self._ports = [0] * settings.renderers
-        listening = re.compile(r"^trompe renderer listening on (\S+):(\d+)\b")
-        self.renderers = [
-            Child("renderer worker", partial(self._render, number), listening) for number in range(settings.renderers)
-        ]
+        self._elsewhere = elsewhere
+        self._renderers = [_Renderer(settings.engine_flags) for _ in range(settings.renderers)]
 
     def start(self, *, timeout: float = 90.0) -> None:
         """Start all children and wait until they are ready. Raises ``ServiceError`` after ``timeout`` seconds."""
         deadline = time.monotonic() + timeout
-        for renderer in self.renderers:
+        for renderer in self._renderers:
             renderer.start()
-        self._ports = [int(renderer.wait_ready(deadline)[2]) for renderer in self.renderers]
+        for renderer in self._renderers:
+            renderer.wait_ready(deadline)
 
     def close(self) -> None:
         """End all children."""
-        with ThreadPoolExecutor(max(1, len(self.renderers))) as pool:
-            list(pool.map(Child.stop, self.renderers))
+        with ThreadPoolExecutor(max(1, len(self._renderers))) as pool:
+            list(pool.map(_Renderer.stop, self._renderers))
 
     def missing(self) -> list[str]:
         """Faults of the renderers right now, in words; empty if they are ready."""
-        words = [f"the {child.name} is not running" for child in self.renderers if not child.up]
-        if not words and not all(_accepts("127.0.0.1", port) for port in self._ports):
+        words = ["the renderer worker is not running" for renderer in self._renderers if not renderer.up]
+        if not words and not all(_accepts(*address) for address in self._here()):
             words.append("a renderer worker does not answer")
-        elsewhere = not self._ports and self._elsewhere != RendererAddresses()
+        elsewhere = not self._renderers and self._elsewhere != RendererAddresses()
         if elsewhere and not any(info.alive for info in self.renderer_infos()):
             words.append("no renderer worker elsewhere answers")
         return words
@@ -164,7 +154,10 @@ class Supervisor:
     def renderer_infos(self) -> list[RendererInfo]:
         """The renderer workers with their engines, ``alive`` if they accept connections."""
         with ThreadPoolExecutor(MAX_PROBES) as pool:
-            return list(pool.map(_info, [*(("127.0.0.1", port) for port in self._ports), *self._addresses_elsewhere()]))
+            return list(pool.map(_info, [*self._here(), *self._addresses_elsewhere()]))
+
+    def _here(self) -> list[Address]:
+        return [("127.0.0.1", renderer.port) for renderer in self._renderers]
 
     def _addresses_elsewhere(self) -> list[Address]:
         """Addresses of the renderers elsewhere; empty if no name resolves."""
@@ -176,11 +169,7 @@ class Supervisor:
     @property
     def addresses(self) -> RendererAddresses:
         """The renderers here and elsewhere."""
-        here = tuple(("127.0.0.1", port) for port in self._ports)
-        return RendererAddresses((*here, *self._elsewhere.listed), self._elsewhere.dns)
-
-    def _render(self, number: int) -> list[str]:
-        return ["render", "--host", "127.0.0.1", "--port", str(self._ports[number]), *self._settings.engine_flags]
+        return RendererAddresses((*self._here(), *self._elsewhere.listed), self._elsewhere.dns)
 
 
 def _info(address: Address) -> RendererInfo:
