@@ -1,14 +1,22 @@
-"""State of the service: attack workers, renderer workers, liveness and readiness."""
+"""State of the service: attack workers, renderer workers, liveness, readiness, metrics."""
+
+from pathlib import Path
+from typing import Final
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, generate_latest
+from prometheus_client.multiprocess import MultiProcessCollector
 
 from trompe_server.api import examples
 from trompe_server.api.problems import PROBLEMS, problem_response
 from trompe_server.api.services import ServicesDep
+from trompe_server.queue.store import JobStore
 from trompe_shared.api import RendererInfo, WorkerInfo
 
 router = APIRouter(responses=PROBLEMS)
+
+_EXAMPLE: Final = '# TYPE trompe_jobs gauge\ntrompe_jobs{state="running"} 2.0\n'
 
 
 @router.get("/v1/workers", tags=["workers"], responses=examples.found([examples.WORKER]))
@@ -37,3 +45,37 @@ def readiness(services: ServicesDep, request: Request) -> Response:
     if missing:
         return problem_response(request, 503, code="not-ready", detail="; ".join(missing))
     return JSONResponse({"status": "ready"})
+
+
+@router.get(
+    "/metrics",
+    tags=["health"],
+    response_class=Response,
+    responses={200: {"description": "Prometheus text.", "content": {"text/plain": {"example": _EXAMPLE}}}},
+)
+def metrics(services: ServicesDep) -> Response:
+    """Metrics for Prometheus: requests of this process, the queue, and the counters of this machine's workers."""
+    registries = (
+        services.metrics.registry,
+        _of_queue(services.store),
+        _of_workers(services.settings.metrics_folder),
+    )
+    return Response(b"".join(map(generate_latest, registries)), media_type=CONTENT_TYPE_LATEST)
+
+
+def _of_queue(store: JobStore) -> CollectorRegistry:
+    registry = CollectorRegistry()
+    jobs = Gauge("trompe_jobs", "Jobs by state.", ["state"], registry=registry)
+    for state, count in store.counts().items():
+        jobs.labels(state.value).set(count)
+    age = Gauge("trompe_queue_age_seconds", "Wait of the oldest queued job.", registry=registry)
+    age.set(store.oldest_queued())
+    return registry
+
+
+def _of_workers(folder: Path) -> CollectorRegistry:
+    """Counters that the workers of this machine write to ``folder`` in Prometheus' multi-process mode."""
+    registry = CollectorRegistry()
+    if folder.is_dir():
+        MultiProcessCollector(registry, path=str(folder))  # type: ignore[no-untyped-call]
+    return registry

@@ -6,11 +6,12 @@ import time
 from typing import Final
 
 from fastapi import Request
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client.process_collector import ProcessCollector
 from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from trompe_server.api.metrics import HttpMetrics
 from trompe_server.api.problems import failure_response, problem_response
 
 logger = logging.getLogger(__name__)
@@ -25,6 +26,8 @@ HEADERS: Final = {
 }
 """Default headers of responses."""
 REQUEST_ID: Final = "X-Request-ID"
+METHODS: Final = frozenset({"DELETE", "GET", "HEAD", "POST"})
+BUCKETS: Final = (0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.15, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 60.0)
 
 
 class HttpMiddleware:
@@ -39,6 +42,31 @@ class HttpMiddleware:
     async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
         raise NotImplementedError
+
+
+class HttpMetrics:
+    """Counts requests by route and status. One per application, since a process may have several."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        ProcessCollector(registry=self.registry)
+        self._requests = Counter(
+            "trompe_http_requests", "Requests answered.", ["method", "route", "status"], registry=self.registry
+        )
+        self._seconds = Histogram(
+            "trompe_http_request_seconds",
+            "Seconds until the response began.",
+            ["method", "route"],
+            buckets=BUCKETS,
+            registry=self.registry,
+        )
+
+    def count(self, scope: Scope, status: int, seconds: float) -> None:
+        """Count one request by the pattern of its route, not by its path, so that labels stay few."""
+        route = getattr(scope.get("route"), "path", "none")
+        method = scope["method"] if scope["method"] in METHODS else "other"
+        self._requests.labels(method, route, status).inc()
+        self._seconds.labels(method, route).observe(seconds)
 
 
 class Envelope(HttpMiddleware):

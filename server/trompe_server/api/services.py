@@ -7,6 +7,7 @@ from typing import Annotated, Final
 
 from fastapi import Depends, Request
 
+from trompe_server.api.middleware import HttpMetrics
 from trompe_server.api.rate import RateLimit
 from trompe_server.library import Library
 from trompe_server.library.classification import Networks
@@ -33,6 +34,7 @@ class Services:
     tokens: Tokens
     renderers: Callable[[], list[RendererInfo]]
     missing: Callable[[], list[str]]
+    metrics: HttpMetrics = field(default_factory=HttpMetrics)
     networks: Networks = field(default_factory=Networks)
     classifications: RateLimit = field(default_factory=lambda: RateLimit(CLASSIFICATIONS))
     uploads: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(UPLOADS))

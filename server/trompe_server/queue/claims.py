@@ -12,7 +12,7 @@ from typing import Any, Final
 import sqlalchemy as sa
 
 from trompe_server.errors import NotFoundError
-from trompe_server.queue.tables import Row, events, fresh, job_of, jobs, locked, needs_text, update_job
+from trompe_server.queue.tables import Row, events, fresh, job_of, jobs, needs_text, update_job
 from trompe_server.storage.database import clock, write
 from trompe_shared.api import Job, JobState, Needs, Progress
 
@@ -123,7 +123,7 @@ class Claims:
     def finish(self, claim: Claim, ending: Ending) -> list[str]:
         """End the job and return its artifacts. Ending it again in the same attempt changes nothing."""
         with write(self.engine) as connection:
-            row = locked(connection, claim.job.id)
+            row = fresh(connection, claim.job.id, lock=True)
             if JobState(row.state).final and row.attempts == claim.attempt:
                 return list(row.artifacts)
             row = _held(connection, claim)
@@ -144,7 +144,7 @@ class Claims:
     def lose(self, claim: Claim, reason: str) -> None:
         """Take the job from its attempt, which died or stands still, unless the attempt is over."""
         with write(self.engine) as connection:
-            row = locked(connection, claim.job.id)
+            row = fresh(connection, claim.job.id, lock=True)
             if _is_held(row, claim):
                 _lose(connection, row, reason, jobs.c.lost)
 
@@ -156,7 +156,7 @@ class Claims:
             unknown = [row.id for row in connection.execute(running) if ours.get(row.id) != row.attempts]
         for job in unknown:
             with write(self.engine) as connection:
-                row = locked(connection, job)
+                row = fresh(connection, job, lock=True)
                 if row.state == JobState.running and ours.get(job) != row.attempts:
                     _lose(connection, row, reason, jobs.c.orphaned)
         return unknown
@@ -227,7 +227,7 @@ def _first(needs: Needs) -> sa.Select[tuple[int, int, int]]:
 
 
 def _held(connection: sa.Connection, claim: Claim) -> Row:
-    row = locked(connection, claim.job.id)
+    row = fresh(connection, claim.job.id, lock=True)
     if not _is_held(row, claim):
         raise LostJobError(
             f"Attempt {claim.attempt} of job {row.id} is over: the job is {row.state} in attempt {row.attempts}."

@@ -19,7 +19,6 @@ from trompe_server.queue.tables import (
     job_of,
     jobs,
     labels,
-    locked,
     needs_text,
     time_of,
     update_job,
@@ -157,7 +156,7 @@ class JobStore:
     def request_cancel(self, job: str) -> Job:
         """Cancel a queued job at once, and ask the worker of a running one to stop. Raises ``NotFoundError``."""
         with write(self.engine) as connection:
-            row = locked(connection, job)
+            row = fresh(connection, job, lock=True)
             if row.state == JobState.queued:
                 end = {"state": JobState.cancelled.value, "finished": clock()}
                 row = update_job(connection, job, message="cancelled before it started", **end)
@@ -176,7 +175,7 @@ class JobStore:
         Raises ``NotFoundError`` and ``ConflictError``.
         """
         with write(self.engine) as connection:
-            row = locked(connection, job)
+            row = fresh(connection, job, lock=True)
             _check_ended(row)
             connection.execute(labels.delete().where(labels.c.number == row.number))
             connection.execute(events.delete().where(events.c.job == job))
@@ -197,7 +196,7 @@ class JobStore:
             at_work = connection.execute(running.order_by(jobs.c.number)).all()
         return [
             WorkerInfo.model_validate(
-                {name: getattr(row, name) for name in ("id", "host", "device", "alive", "fault")}
+                dict(row._mapping)
                 | {"started": time_of(row.started), "seen": time_of(row.seen)}
                 | {"jobs": [job.id for job in at_work if job.worker == row.id]}
             )

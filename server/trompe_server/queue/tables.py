@@ -101,18 +101,10 @@ leases = sa.Table(
 """Work done by one process at a time. ``until``: end of the holder's lease."""
 
 
-def fresh(connection: sa.Connection, job: str) -> Row:
-    """The row of a job. Raises ``NotFoundError``."""
-    return _one(connection, sa.select(jobs).where(jobs.c.id == job), job)
-
-
-def locked(connection: sa.Connection, job: str) -> Row:
-    """The row of a job, locked until the transaction ends. Raises ``NotFoundError``."""
-    return _one(connection, sa.select(jobs).where(jobs.c.id == job).with_for_update(), job)
-
-
-def _one(connection: sa.Connection, query: sa.Select[Any], job: str) -> Row:
-    row = connection.execute(query).one_or_none()
+def fresh(connection: sa.Connection, job: str, *, lock: bool = False) -> Row:
+    """The row of a job; ``lock`` it until the transaction ends. Raises ``NotFoundError``."""
+    query = sa.select(jobs).where(jobs.c.id == job)
+    row = connection.execute(query.with_for_update() if lock else query).one_or_none()
     if row is None:
         raise NotFoundError(f"There is no job {job!r}. List the jobs to find its id.")
     return row

@@ -5,10 +5,9 @@ from typing import Final
 
 from fastapi import FastAPI
 
-from trompe_server.api import classify, health, jobs, judgements, library, metrics
+from trompe_server.api import classify, health, jobs, judgements, library
 from trompe_server.api.contract import contract
 from trompe_server.api.guard import Guard
-from trompe_server.api.metrics import HttpMetrics
 from trompe_server.api.middleware import BodyLimit, Envelope
 from trompe_server.api.problems import answer_with_problems
 from trompe_server.api.services import Services
@@ -25,18 +24,17 @@ ROUTERS: Final = (
     judgements.router,
     jobs.experiments,
     health.router,
-    metrics.router,
 )
 
 
 def create_app(services: Services) -> FastAPI:
     """Build the application on ``services``."""
     app = FastAPI(title="Trompe", version=version("trompe"), description=DESCRIPTION, docs_url=None, redoc_url=None)
-    app.state.services, app.state.metrics = services, HttpMetrics()
+    app.state.services = services
     # the last middleware is the outermost
     app.add_middleware(BodyLimit, limit=services.settings.max_upload)
     app.add_middleware(Guard, tokens=services.tokens, rate=services.settings.rate_limit)
-    app.add_middleware(Envelope, metrics=app.state.metrics)
+    app.add_middleware(Envelope, metrics=services.metrics)
     answer_with_problems(app)
     for router in ROUTERS:
         app.include_router(router)

@@ -4,8 +4,7 @@ import os
 import re
 import shutil
 import urllib.parse
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
@@ -135,32 +134,26 @@ class RemoteArtifacts:
     root: str
 
     def read(self, name: str) -> bytes:
-        with self._translated():
-            return bytes(self.system.cat_file(self._path(name)))
+        return bytes(self._call("cat_file", self._path(name)))
 
     def write(self, name: str, data: bytes | Path) -> None:
-        with self._translated():
-            self.system.makedirs(self.root, exist_ok=True)
-            if isinstance(data, bytes):
-                self.system.pipe_file(self._path(name), data)
-            else:
-                self.system.put_file(str(data), self._path(name))
+        self._call("makedirs", self.root, exist_ok=True)
+        if isinstance(data, bytes):
+            self._call("pipe_file", self._path(name), data)
+        else:
+            self._call("put_file", str(data), self._path(name))
 
     def open(self, name: str) -> BinaryIO:
-        with self._translated():
-            return cast(BinaryIO, self.system.open(self._path(name), "rb"))
+        return cast(BinaryIO, self._call("open", self._path(name), "rb"))
 
     def exists(self, name: str) -> bool:
-        with self._translated():
-            return bool(self.system.isfile(self._path(name)))
+        return bool(self._call("isfile", self._path(name)))
 
     def size(self, name: str) -> int:
-        with self._translated():
-            return int(self.system.size(self._path(name)))
+        return int(self._call("size", self._path(name)))
 
     def touched(self, name: str) -> float:
-        with self._translated():
-            return float(self.system.modified(self._path(name)).timestamp())
+        return float(self._call("modified", self._path(name)).timestamp())
 
     def touch(self, name: str) -> None:
         # object stores have no other way to change the time of a file
@@ -176,33 +169,29 @@ class RemoteArtifacts:
         return RemoteArtifacts(self.system, self._path(name))
 
     def delete(self, name: str) -> None:
-        with self._translated():
-            if self.system.exists(self._path(name)):
-                self.system.rm_file(self._path(name))
+        if self._call("exists", self._path(name)):
+            self._call("rm_file", self._path(name))
 
     def delete_all(self) -> None:
-        with self._translated():
-            if self.system.exists(self.root):
-                self.system.rm(self.root, recursive=True)
+        if self._call("exists", self.root):
+            self._call("rm", self.root, recursive=True)
 
     def _path(self, name: str) -> str:
         return f"{self.root}/{checked(name)}"
 
     def _listing(self, kind: str) -> list[str]:
-        with self._translated():
-            try:
-                found = self.system.ls(self.root, detail=True, refresh=True)
-            except FileNotFoundError:
-                return []
+        try:
+            found = self._call("ls", self.root, detail=True, refresh=True)
+        except FileNotFoundError:
+            return []
         names = (str(each["name"]).rstrip("/").rpartition("/")[2] for each in found if each["type"] == kind)
         return sorted(name for name in names if _NAME.fullmatch(name))
 
-    @contextmanager
-    def _translated(self) -> Iterator[None]:
-        """Translate fsspec's errors, except ``FileNotFoundError``, to ``ServiceError``."""
+    def _call(self, operation: str, *arguments: Any, **options: Any) -> Any:
+        """Call the file system; translate its errors, except ``FileNotFoundError``, to ``ServiceError``."""
         try:
             with no_space(self.root):
-                yield
+                return getattr(self.system, operation)(*arguments, **options)
         except (FileNotFoundError, TrompeError):
             raise
         except Exception as error:
