@@ -190,13 +190,13 @@ def test_the_library_is_the_same_wherever_it_is(
     net = library.add_classifier(io.BytesIO(b"weights"), "net.pt2", classes=["a", "b", "c"])
     again = Library(folder, cache=tmp_path / "cache")
     assert again.object_bytes("again") == archive
-    assert [each.name for each in again.objects() if not each.shipped] == ["again"]
+    assert [each.name for each in again.objects.all() if not each.shipped] == ["again"]
     assert again.classifier(net.id) == net
     path = Path(again.classifier_path("net"))
     assert (path.read_bytes(), path.suffix) == (b"weights", ".pt2")
     assert again.classifier_path("net") == str(path), "it is fetched once"
     with pytest.raises(NotFoundError):
-        again.object("nothing")
+        again.objects.find("nothing")
 
 
 def test_a_classifier_whose_stored_bytes_are_damaged_is_not_loaded(tmp_path: Path) -> None:

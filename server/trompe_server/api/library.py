@@ -47,13 +47,13 @@ async def add_object(
 @router.get("/objects", responses=examples.found([examples.OBJECT]), tags=["objects"])
 def list_objects(services: ServicesDep) -> list[ObjectInfo]:
     """All objects, the shipped ones first."""
-    return services.library.objects()
+    return services.library.objects.all()
 
 
 @router.get("/objects/{reference}", responses=examples.found(examples.OBJECT), tags=["objects"])
 def read_object(services: ServicesDep, reference: str) -> ObjectInfo:
     """One object, by id, beginning of the id, or name."""
-    return services.library.object(reference)
+    return services.library.objects.find(reference)
 
 
 @router.post("/classifiers", status_code=201, responses=examples.made(examples.CLASSIFIER), tags=["classifiers"])
@@ -73,7 +73,7 @@ async def add_classifier(
 @router.get("/classifiers", responses=examples.found([examples.CLASSIFIER]), tags=["classifiers"])
 def list_classifiers(services: ServicesDep) -> list[ClassifierInfo]:
     """All classifiers, the shipped one first."""
-    return services.library.classifiers()
+    return services.library.classifiers.all()
 
 
 @router.get("/classifiers/{reference}", responses=examples.found(examples.CLASSIFIER), tags=["classifiers"])
@@ -93,7 +93,7 @@ async def add_background(services: ServicesDep, file: UploadFile) -> BackgroundI
 @router.get("/backgrounds", responses=examples.found([examples.BACKGROUND]), tags=["backgrounds"])
 def list_backgrounds(services: ServicesDep) -> list[BackgroundInfo]:
     """All uploaded backgrounds."""
-    return services.library.backgrounds()
+    return services.library.backgrounds.all()
 
 
 def _class_names(text: str | None) -> list[str] | None:

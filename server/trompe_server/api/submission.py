@@ -1,7 +1,5 @@
 """Checks of a submitted job: its objects and networks must exist and fit together."""
 
-from typing import TypeVar
-
 from trompe_server.api.services import Services
 from trompe_server.errors import ConflictError
 from trompe_server.judgement.suites import suite_of
@@ -21,6 +19,7 @@ from trompe_shared.api import (
     JOB_RESULT,
     BackgroundInfo,
     ClassifierInfo,
+    JobRequest,
     JobSpec,
     JudgementRequest,
     ObjectInfo,
@@ -29,15 +28,13 @@ from trompe_shared.colours import colour_of
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import decode_rgb
 
-Spec = TypeVar("Spec", bound=JobSpec)
 
-
-def checked_spec(spec: Spec, library: Library) -> tuple[Spec, dict[str, str]]:
+def checked_spec(spec: JobRequest, library: Library) -> tuple[JobRequest, dict[str, str]]:
     """``spec`` with ids in place of names, and the names of uploads by id.
 
     Raises ``NotFoundError``, ``AmbiguousError``, ``LabelError``, ``ClassifierError`` or ``SpecError``.
     """
-    obj = library.object(spec.object)
+    obj = library.objects.find(spec.object)
     classifier = library.classifier(spec.victim.classifier)
     _check_goal(spec, classifier)
     check_gradients(spec, classifier.name, white_box=classifier.white_box)
@@ -50,7 +47,7 @@ def checked_spec(spec: Spec, library: Library) -> tuple[Spec, dict[str, str]]:
         resolve_labels(spec.goal.label, other.classes or classifier.classes, other.n_classes, other.name)
     victim = {"classifier": classifier.reference, "ensemble": [member.reference for member in members]}
     masks = {texture: _mask(texture, picture, obj, library) for texture, picture in spec.paint.masks.items()}
-    pictures = {name: library.background(name) for name in spec.views.background if colour_of(name) is None}
+    pictures = {name: library.backgrounds.find(name) for name in spec.views.background if colour_of(name) is None}
     background = [pictures[name].id if name in pictures else name for name in spec.views.background]
     stored: list[ObjectInfo | ClassifierInfo] = [obj, classifier, *members, *judges]
     names = {one.id: one.name for one in stored if not one.shipped}
@@ -88,7 +85,7 @@ def checked_judgement(spec: JudgementRequest, services: Services) -> tuple[Judge
 def _judged(reference: str, services: Services) -> ObjectInfo:
     """A stored object, or the painted object of a job, which is stored. Raises ``ConflictError`` without one."""
     if not reference.startswith(JOB_RESULT):
-        return services.library.object(reference)
+        return services.library.objects.find(reference)
     job = services.store.get(reference.removeprefix(JOB_RESULT))
     name = next((each for each in job.artifacts if each.endswith(f"{ADVERSARIAL}.zip")), None)
     if name is None:
@@ -117,6 +114,7 @@ def _check_paint(spec: JobSpec, obj: ObjectInfo) -> None:
 
 def _mask(texture: str, picture: str, obj: ObjectInfo, library: Library) -> BackgroundInfo:
     """A mask picture. Raises ``SpecError`` unless it has the texture's size."""
-    pixels = decode_rgb(library.background_bytes(picture), picture)
+    info = library.backgrounds.find(picture)
+    pixels = decode_rgb(library.backgrounds.read(info), picture)
     check_mask_size(texture, size=obj.textures[texture], mask=pixels.shape[:2])
-    return library.background(picture)
+    return info

@@ -47,7 +47,7 @@ class LocalExecutor:
         return free.name if free is not None and fits(needs, left) else None
 
     def submit(self, claim: Claim) -> None:
-        self._slot(claim.job.worker).run(claim)
+        next(slot for slot in self._slots if slot.name == claim.job.worker).run(claim)
 
     def cancel(self, claim: Claim) -> None:
         for slot in self._slots:
@@ -71,9 +71,6 @@ class LocalExecutor:
     def close(self) -> None:
         for slot in self._slots:
             slot.kill()
-
-    def _slot(self, name: str | None) -> "_Slot":
-        return next(slot for slot in self._slots if slot.name == name)
 
 
 class _Slot:

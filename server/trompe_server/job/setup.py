@@ -157,7 +157,7 @@ def open_setup(
     Raises ``TrompeError`` for names that do not exist and options that do not fit together.
     """
     obj = load_object(library.object_bytes(spec.object))
-    info = library.object(spec.object)
+    info = library.objects.find(spec.object)
     stored = partial(_stored_classifier, library=library, device=device)
     classifier = stored(spec.victim.classifier)
     framing = framing_of(obj, spec.views, shipped=info.name if info.shipped else None)

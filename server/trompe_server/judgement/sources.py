@@ -115,7 +115,7 @@ class StoredSources:
         """See ``Sources``."""
         original = self.library.original(source)
         if original is None:
-            return _shipped(self.library.object(source).name)
+            return _shipped(self.library.objects.find(source).name)
         data, filename = original
         name = f"{role}{Path(filename).suffix.lower()}"
         self.artifacts.write(name, data)

@@ -45,6 +45,8 @@ def inspect_classifier(path_or_name: str) -> dict[str, object]:
 class Library:
     """Uploads in ``folder``, and shipped things. References are ids, unique beginnings of ids, or names.
 
+    ``objects``, ``classifiers`` and ``backgrounds`` list and find them; ``classifier`` finds networks by name too.
+
     ``cache``: local folder for files of a remote store that need a path; default: a temporary one.
     ``inspect`` describes a classifier. ``networks``: allowed networks by name, as patterns (``timm:*``).
     """
@@ -58,36 +60,28 @@ class Library:
         networks: Sequence[str] = (),
     ) -> None:
         folder = LocalArtifacts(folder) if isinstance(folder, Path) else folder
-        self._objects = Catalogue("object", folder.within("objects"), ObjectInfo, list_shipped_objects)
-        self._classifiers = Catalogue(
+        self.objects = Catalogue("object", folder.within("objects"), ObjectInfo, list_shipped_objects)
+        self.classifiers = Catalogue(
             "classifier", folder.within("classifiers"), ClassifierInfo, list_shipped_classifiers
         )
-        self._backgrounds = Catalogue("background", folder.within("backgrounds"), BackgroundInfo, list)
+        self.backgrounds = Catalogue("background", folder.within("backgrounds"), BackgroundInfo, list)
         self.calibrations = folder.within("calibrations")
         """Calibrations of the target, shared by jobs."""
         self._cache = cache or Path(tempfile.gettempdir(), f"trompe-cache-{os.getuid()}")
         self._inspect = inspect
         self._networks = networks
 
-    def objects(self) -> list[ObjectInfo]:
-        """All objects."""
-        return self._objects.all()
-
-    def object(self, reference: str) -> ObjectInfo:
-        """One object. Raises ``NotFoundError`` or ``AmbiguousError``."""
-        return self._objects.find(reference)
-
     def object_bytes(self, reference: str) -> bytes:
         """SAILenv's zip of an object. Raises ``NotFoundError`` or ``AmbiguousError``."""
-        info = self.object(reference)
-        return shipped_objects()[info.name].read() if info.shipped else self._objects.read(info)
+        info = self.objects.find(reference)
+        return shipped_objects()[info.name].read() if info.shipped else self.objects.read(info)
 
     def original(self, reference: str) -> tuple[bytes, str] | None:
         """The uploaded file of an object and its name; ``None`` for a shipped object."""
-        info = self.object(reference)
+        info = self.objects.find(reference)
         if info.shipped:
             return None
-        return self._objects.folder.within(info.id).read(_UPLOAD), info.filename or "object.zip"
+        return self.objects.folder.within(info.id).read(_UPLOAD), info.filename or "object.zip"
 
     def add_object(
         self, file: BinaryIO, filename: str, *, name: str | None = None, max_texture: int | None = None
@@ -113,12 +107,8 @@ class Library:
             )
             payload = folder / "data.zip"
             write_whole(payload, made.archive)
-            self._objects.folder.within(info.id).write(_UPLOAD, upload)
-            return self._objects.put(info, payload)
-
-    def classifiers(self) -> list[ClassifierInfo]:
-        """All classifiers."""
-        return self._classifiers.all()
+            self.objects.folder.within(info.id).write(_UPLOAD, upload)
+            return self.objects.put(info, payload)
 
     def classifier(self, reference: str) -> ClassifierInfo:
         """One classifier, or a network by name (``timm:NAME``).
@@ -129,7 +119,7 @@ class Library:
         if reference.startswith(LOOKED_UP):
             self._check_allowed(reference)
             return _named_classifier(reference, self._inspect)
-        return self._classifiers.find(reference)
+        return self.classifiers.find(reference)
 
     def _check_allowed(self, reference: str) -> None:
         """Raise ``ClassifierError`` unless jobs may use the network by name."""
@@ -147,7 +137,7 @@ class Library:
         info = self.classifier(reference)
         if info.shipped:
             return info.name
-        folder, name = self._classifiers.place(info)
+        folder, name = self.classifiers.place(info)
         return str(folder.path(name) if isinstance(folder, LocalArtifacts) else self._local(info.id, folder, name))
 
     def _local(self, identity: str, folder: Folder, name: str) -> Path:
@@ -176,7 +166,7 @@ class Library:
         with _intake() as folder:
             payload = folder / f"data{suffix}"
             identity = _copy(file, payload)
-            before = self._classifiers.stored(identity)
+            before = self.classifiers.stored(identity)
             found = self._inspect(str(payload)) if before is None else before.model_dump()
             if classes is None:
                 classes = found.get("classes")  # type: ignore[assignment]
@@ -188,19 +178,11 @@ class Library:
             info = ClassifierInfo.model_validate(
                 found | {"id": identity, "name": name or Path(filename).stem, "classes": classes}
             )
-            return self._classifiers.put(info, payload)
-
-    def backgrounds(self) -> list[BackgroundInfo]:
-        """All uploaded backgrounds."""
-        return self._backgrounds.all()
-
-    def background(self, reference: str) -> BackgroundInfo:
-        """One background. Raises ``NotFoundError`` or ``AmbiguousError``."""
-        return self._backgrounds.find(reference)
+            return self.classifiers.put(info, payload)
 
     def background_bytes(self, reference: str) -> bytes:
         """Image file of a background. Raises ``NotFoundError`` or ``AmbiguousError``."""
-        return self._backgrounds.read(self.background(reference))
+        return self.backgrounds.read(self.backgrounds.find(reference))
 
     def add_background(self, data: bytes, name: str) -> BackgroundInfo:
         """Store an image file. Raises ``SpecError`` for anything else and stores nothing then."""
@@ -211,7 +193,7 @@ class Library:
         with _intake() as folder:
             payload = folder / f"data{Path(name).suffix.lower()}"
             write_whole(payload, data)
-            return self._backgrounds.put(BackgroundInfo(id=identity_of(data), name=Path(name).stem), payload)
+            return self.backgrounds.put(BackgroundInfo(id=identity_of(data), name=Path(name).stem), payload)
 
 
 @contextmanager

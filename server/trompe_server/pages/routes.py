@@ -170,7 +170,7 @@ def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
     row, result = _row(services, found), _result(services, found)
     if result is None:
         return page(request, "job.html", job=row, shown=None, phases=PHASES)
-    turned = orbit(result, job, services.library.classifiers())
+    turned = orbit(result, job, services.library.classifiers.all())
     return page(request, "job.html", job=row, shown=_shown(services, row, result), orbit=turned, terms=TERMS)
 
 
@@ -313,11 +313,11 @@ def _choices(services: Services) -> dict[str, Any]:
     return {
         "objects": [
             {"reference": info.reference, "name": info.name, "label": labels.get(info.name, "")}
-            for info in services.library.objects()
+            for info in services.library.objects.all()
         ],
         "classifiers": [
             {"reference": info.reference, "name": info.name, "white_box": info.white_box}
-            for info in services.library.classifiers()
+            for info in services.library.classifiers.all()
         ],
         "endings": ".zip,.glb,.gltf,.fbx,.ply,.stl,.obj",
         "formats": "GLB, FBX, PLY, STL, or a zip of an .obj or .gltf with its textures.",

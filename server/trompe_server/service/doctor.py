@@ -190,7 +190,7 @@ def _check_shipped() -> str:
         tempfile.TemporaryDirectory() as empty,
     ):
         library = Library(Path(empty))
-        return ", ".join(info.name for info in (*library.objects(), *library.classifiers()))
+        return ", ".join(info.name for info in (*library.objects.all(), *library.classifiers.all()))
 
 
 def _check_port(port: int) -> str:

@@ -16,15 +16,11 @@ def judge_here(spec: JudgementSpec, out: Path, on_progress: Callable[[Progress],
     """Judge files, and write manifest and page to ``out``. After an interruption the same call goes on."""
     from trompe_server.judgement.judge_files import judge_files
     from trompe_server.judgement.sources import LocalSources
-    from trompe_server.judgement.work import Work
     from trompe_server.service.judgement_job import written
     from trompe_server.storage.folders import LocalArtifacts
 
-    def tell(work: Work) -> None:
-        on_progress(work.progress)
-
-    began = time.monotonic()
-    judged = judge_files(spec, LocalSources(out), kept=LocalArtifacts(out / KEPT), on_work=tell)
+    began, kept = time.monotonic(), LocalArtifacts(out / KEPT)
+    judged = judge_files(spec, LocalSources(out), kept=kept, on_work=lambda work: on_progress(work.progress))
     manifest, files = written(judged, seconds=time.monotonic() - began)
     for name, data in files.items():
         (out / name).write_bytes(data)

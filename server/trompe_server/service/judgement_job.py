@@ -9,7 +9,6 @@ from trompe_server.judgement.judge_files import judge_files
 from trompe_server.judgement.manifest import Judged, manifest_of
 from trompe_server.judgement.pictures import judgement_pictures
 from trompe_server.judgement.sources import StoredSources
-from trompe_server.judgement.work import Work
 from trompe_server.pages.judgement import judgement_page
 from trompe_shared.api import MANIFEST, MANIFEST_PAGE, JobState, JudgementSpec, Manifest, Progress
 
@@ -35,11 +34,9 @@ class JudgementJob:
     def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
         """See ``PhasedJob.run``."""
         began = time.perf_counter()
-
-        def tell(work: Work) -> None:
-            on_progress(work.progress)
-
-        judged = judge_files(self._spec, self._sources, kept=self._artifacts, on_work=tell)
+        judged = judge_files(
+            self._spec, self._sources, kept=self._artifacts, on_work=lambda work: on_progress(work.progress)
+        )
         manifest, files = written(judged, seconds=time.perf_counter() - began)
         for name, data in files.items():
             self._artifacts.write(name, data)

@@ -80,7 +80,7 @@ def _serve_http(
     if store.engine.dialect.name == "sqlite":
         sa.event.listen(store.engine, "connect", _avoid_checkpoints)
     library = Library(files.within("library"), cache=settings.data / "cache", networks=settings.networks)
-    library.objects()  # reads the shipped ones before the first request
+    library.objects.all()  # reads the shipped ones before the first request
     tokens = Tokens(store.engine)
     services = Services(settings, library, store, files, tokens, supervisor.renderer_infos, missing)
     app = create_app(services)

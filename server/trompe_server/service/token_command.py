@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -87,14 +86,6 @@ def _tokens(settings: Settings) -> Iterator[Tokens]:
 
 
 def _row(each: Token) -> dict[str, str | None]:
-    return {
-        "name": each.name,
-        "right": each.right.value,
-        "created": _when(each.created),
-        "last_used": _when(each.last_used),
-        "revoked": _when(each.revoked),
-    }
-
-
-def _when(time: datetime | None) -> str | None:
-    return None if time is None else time.isoformat(timespec="seconds")
+    times = {"created": each.created, "last_used": each.last_used, "revoked": each.revoked}
+    told = {name: time and time.isoformat(timespec="seconds") for name, time in times.items()}
+    return {"name": each.name, "right": each.right.value, **told}

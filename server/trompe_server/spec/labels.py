@@ -32,7 +32,12 @@ def resolve_label(label: str | int, classes: Sequence[str] | None, n_classes: in
     range, and for a name of no class or of several.
     """
     if isinstance(label, int) or label.strip().isdecimal():
-        return _checked_index(str(label).strip(), n_classes, classifier)
+        digits = str(label).strip()
+        if len(digits) > MOST_DIGITS or not 0 <= int(digits) < n_classes:
+            raise LabelError(
+                f"{digits[:MOST_DIGITS]} is not a class of {classifier!r}; its indices are 0..{n_classes - 1}."
+            )
+        return int(digits)
     if classes is None:
         raise LabelError(
             f"{classifier!r} has no class names to find {label!r} in; give an index in 0..{n_classes - 1}."
@@ -43,14 +48,6 @@ def resolve_label(label: str | int, classes: Sequence[str] | None, n_classes: in
     if len(fits) != 1:
         raise _unclear(label, fits, classes, classifier)
     return fits[0]
-
-
-def _checked_index(digits: str, n_classes: int, classifier: str) -> int:
-    if len(digits) > MOST_DIGITS or not 0 <= int(digits) < n_classes:
-        raise LabelError(
-            f"{digits[:MOST_DIGITS]} is not a class of {classifier!r}; its indices are 0..{n_classes - 1}."
-        )
-    return int(digits)
 
 
 def _synonyms(name: str) -> list[str]:

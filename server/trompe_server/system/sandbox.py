@@ -66,18 +66,15 @@ def start_limited(
 ) -> subprocess.Popen[bytes]:
     """Start ``python -m module arguments`` with ``memory`` bytes of address space and ``seconds`` of CPU time."""
     limits = [str(memory), str(math.ceil(seconds))]
+    seen = {name: value for name, value in os.environ.items() if not name.startswith(_SECRET)}
     return subprocess.Popen(
         [sys.executable, "-m", "trompe_server.system.sandbox", *limits, module, *arguments],
         stdin=stdin,
         stdout=stdout,
         stderr=subprocess.DEVNULL,
-        env=_environment(),
+        env=seen | _ONE_THREAD,
         start_new_session=True,
     )
-
-
-def _environment() -> dict[str, str]:
-    return {name: value for name, value in os.environ.items() if not name.startswith(_SECRET)} | _ONE_THREAD
 
 
 def _answer(out: IO[bytes]) -> dict[str, Any]:

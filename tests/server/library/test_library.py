@@ -31,7 +31,7 @@ torch.export.save(torch.export.export(Net(), (torch.zeros(2, 3, 8, 12),), dynami
 def test_an_object_comes_back_byte_for_byte(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
     info = Library(tmp_path).add_object(io.BytesIO(triangle_zip()), "triangle.zip")
     again = Library(tmp_path)
-    assert again.object("triangle") == info
+    assert again.objects.find("triangle") == info
     assert again.object_bytes(info.id) == again.object_bytes(info.id[:6]) == triangle_zip()
 
 
@@ -49,7 +49,7 @@ def test_the_same_upload_from_many_sides_at_once_is_stored_once(
 def test_short_beginnings_of_ids_are_not_taken(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
     info = Library(tmp_path).add_object(io.BytesIO(triangle_zip()), "triangle.zip")
     with pytest.raises(NotFoundError, match="triangle"):
-        Library(tmp_path).object(info.id[:5])
+        Library(tmp_path).objects.find(info.id[:5])
 
 
 def test_a_beginning_that_fits_two_ids_is_refused(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
@@ -59,7 +59,7 @@ def test_a_beginning_that_fits_two_ids_is_refused(tmp_path: Path, triangle_zip: 
         stored = info.model_copy(update={"id": identity, "name": identity}).model_dump_json()
         open_folder(tmp_path).within("objects").within(identity).write("info.json", stored.encode())
     with pytest.raises(AmbiguousError, match="abcdef1, abcdef2"):
-        library.object("abcdef")
+        library.objects.find("abcdef")
 
 
 def test_an_upload_that_cannot_be_read_leaves_nothing_behind(tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_an_upload_that_cannot_be_read_leaves_nothing_behind(tmp_path: Path) -> 
 
 
 def test_shipped_objects_are_there_from_the_start(tmp_path: Path) -> None:
-    infos = {info.name: info for info in Library(tmp_path).objects()}
+    infos = {info.name: info for info in Library(tmp_path).objects.all()}
     assert list(infos) == list(shipped_objects())
     assert all(info.shipped for info in infos.values())
     assert load_object(Library(tmp_path).object_bytes("mug")).n_texels > 0
