@@ -3,7 +3,7 @@
 import json
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -63,10 +63,8 @@ class Opening:
         self._attempt += 1
         job = SimpleNamespace(id="0123456789abcdef", spec=JobSpec.of("mug", label="mug", **options))
         opener = JobOpener(self._settings, self._files, RendererAddresses(addresses))
-        with ExitStack() as stack:
-            opened = opener.open(Claim(job, self._attempt, 0))  # type: ignore[arg-type]
-            stack.callback(opened.close)
-            parts: Any = opened.job
+        parts: Any
+        with opener.open(Claim(job, self._attempt, 0)) as parts:  # type: ignore[arg-type]
             attacked = [parts.target, *parts.more_targets]
             return [str(each.engine) for each in attacked] + ["|", *(str(each.engine) for each in parts.judge_targets)]
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -9,7 +10,7 @@ from typing import Any, TypeVar
 import pytest
 from prometheus_client import REGISTRY
 
-from trompe_server.executor.runner import JobRunner, OpenedJob
+from trompe_server.executor.runner import JobRunner
 from trompe_server.job.protocol import DamagedFileError, OnProgress, PhaseReport
 from trompe_server.queue.claims import Claims, Ending
 from trompe_server.queue.store import JobStore
@@ -51,7 +52,7 @@ def store(tmp_path: Path) -> Iterator[JobStore]:
 
 def runner_of(claims: Claims, job: Scripted, **options: Any) -> JobRunner:
     """A runner that always opens ``job`` and retries at once."""
-    return JobRunner(claims, lambda _: OpenedJob(job, lambda: None), retry_waits=(0.001, 0.01), **options)
+    return JobRunner(claims, lambda _: nullcontext(job), retry_waits=(0.001, 0.01), **options)
 
 
 def submit(store: JobStore) -> str:

@@ -7,7 +7,7 @@ from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from typing import Any, Final, TypeVar
 
-from trompe_server.executor.runner import OpenedJob
+from trompe_server.job.protocol import PhasedJob
 from trompe_server.library import Library
 from trompe_server.queue.claims import Claim
 from trompe_server.renderers.choice import JobEngines, listed, named
@@ -35,19 +35,21 @@ class JobOpener:
         self._settings, self._files, self._renderers = settings, files, renderers
         self._library = Library(files.within("library"), cache=settings.data / "cache", networks=settings.networks)
 
-    def open(self, claim: Claim) -> OpenedJob:
-        """Open the job of ``claim``. Raises ``TrompeError`` for errors the user can fix."""
+    @contextmanager
+    def open(self, claim: Claim) -> Iterator[PhasedJob]:
+        """The job of ``claim``, opened for the block. Raises ``TrompeError`` for errors the user can fix."""
         artifacts = job_artifacts(self._files, claim.job.id, attempt=claim.attempt)
         if isinstance(claim.job.spec, JudgementSpec):
-            return self._judgement(claim.job.spec, artifacts)
+            yield self._judgement(claim.job.spec, artifacts)
+            return
         engines = self._engines(claim.job.spec, artifacts)
+        attacked = len(engines.attacked)
         with ExitStack() as opened:
-            targets = []
-            for engine in engines.all:
-                targets.append(DiscoveredRenderers(self._renderers, engine, _target))
-                opened.callback(targets[-1].close)
-            attacked = len(engines.attacked)
-            job = load(self._settings.pipeline)(
+            targets = [
+                opened.enter_context(closing(DiscoveredRenderers(self._renderers, engine, _target)))
+                for engine in engines.all
+            ]
+            yield load(self._settings.pipeline)(
                 claim.job.spec,
                 library=self._library,
                 artifacts=artifacts,
@@ -56,12 +58,10 @@ class JobOpener:
                 judge_targets=targets[attacked:],
                 device=self._settings.device,
             )
-            return OpenedJob(job, opened.pop_all().close)
-        raise AssertionError("the block returns or raises")
 
-    def _judgement(self, spec: JudgementSpec, artifacts: JobArtifacts) -> OpenedJob:
+    def _judgement(self, spec: JudgementSpec, artifacts: JobArtifacts) -> PhasedJob:
         first = self._patiently(self._there)[0]
-        job = load(JUDGEMENTS)(
+        job: PhasedJob = load(JUDGEMENTS)(
             spec,
             artifacts=artifacts,
             library=self._library,
@@ -69,7 +69,7 @@ class JobOpener:
             opened=self._opened,
             device=self._settings.device,
         )
-        return OpenedJob(job, lambda: None)
+        return job
 
     @contextmanager
     def _opened(self, name: str) -> Iterator[TargetRenderer]:

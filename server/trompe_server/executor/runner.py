@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
@@ -34,29 +35,17 @@ MAX_DAMAGES: Final = 2
 """Times a phase may find its input damaged and have it made again."""
 
 
-@dataclass(frozen=True)
-class OpenedJob:
-    """A job ready to run. ``close`` releases the connection to the renderers."""
-
-    job: PhasedJob
-    close: Callable[[], None]
-
-
-OpenJob = Callable[[Claim], OpenedJob]
-"""Opens a job. Raises ``TrompeError`` for errors the user can fix."""
+OpenJob = Callable[[Claim], AbstractContextManager[PhasedJob]]
+"""Opens a job, and releases its connection to the renderers. Raises ``TrompeError`` for errors the user can fix."""
 TidyJob = Callable[[Claim, list[str]], None]
 """Deletes all files of an ended job except the named ones."""
 
 
-class _Stop(BaseException):
-    """Unwinds a phase. Not an ``Exception``, so that no phase catches it."""
+class _Cancelled(BaseException):
+    """The job was cancelled. Not an ``Exception``, so that no phase catches it."""
 
 
-class _Cancelled(_Stop):
-    """The job was cancelled."""
-
-
-class _Lost(_Stop):
+class _Lost(BaseException):
     """The job has a newer attempt or has ended."""
 
 
@@ -132,7 +121,8 @@ class _Phases:
 
     def __init__(self, claim: Claim, runner: JobRunner) -> None:
         self._claim, self._runner = claim, runner
-        self._opened: OpenedJob | None = None
+        self._job: PhasedJob | None = None
+        self._opened = ExitStack()
         self._written = 0.0
 
     def run_all(self) -> Ending:
@@ -157,9 +147,8 @@ class _Phases:
 
     def close(self) -> None:
         """Release the connection to the renderers."""
-        if self._opened is not None:
-            self._opened.close()
-            self._opened = None
+        self._job = None
+        self._opened.close()
 
     def _run(self, phase: str) -> PhaseReport:
         """Run a phase, once more if the renderer was lost: its supervisor restarts it."""
@@ -204,6 +193,6 @@ class _Phases:
             raise _Cancelled
 
     def _open(self) -> PhasedJob:
-        if self._opened is None:
-            self._opened = self._runner.open_job(self._claim)
-        return self._opened.job
+        if self._job is None:
+            self._job = self._opened.enter_context(self._runner.open_job(self._claim))
+        return self._job

@@ -87,5 +87,5 @@ def _tokens(settings: Settings) -> Iterator[Tokens]:
 
 def _row(each: Token) -> dict[str, str | None]:
     times = {"created": each.created, "last_used": each.last_used, "revoked": each.revoked}
-    told = {name: time and time.isoformat(timespec="seconds") for name, time in times.items()}
+    told = {name: time.isoformat(timespec="seconds") if time else None for name, time in times.items()}
     return {"name": each.name, "right": each.right.value, **told}
