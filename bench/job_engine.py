@@ -22,12 +22,12 @@ from tests.service.ray_nodes import task_of
 
 import trompe_server.job.texture_attack  # noqa: F401  what an attack imports
 from bench.job_list import size
-from trompe_server.executor.choice import open_executor
 from trompe_server.executor.dispatcher import Dispatcher
 from trompe_server.job.protocol import OnProgress, PhaseReport
 from trompe_server.queue.claims import Claims
 from trompe_server.queue.store import JobStore
 from trompe_server.renderers.discovery import RendererAddresses
+from trompe_server.service.dispatch import open_executor
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import JobArtifacts, LocalArtifacts
 from trompe_shared.api import JobRequest, JobSpec, Progress

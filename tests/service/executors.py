@@ -10,13 +10,13 @@ from typing import Any, Final
 
 from tests.served import FAKE, Queue, wait_until
 from trompe_server.executor.attempts import Attempts
-from trompe_server.executor.choice import open_executor
 from trompe_server.executor.dispatcher import Dispatcher
 from trompe_server.executor.port import Ended, Executor, fits, left_in, too_much
 from trompe_server.executor.process import Setup
 from trompe_server.queue.claims import Claim, Claims
 from trompe_server.queue.workers import Worker
 from trompe_server.renderers.discovery import RendererAddresses
+from trompe_server.service.dispatch import open_executor
 from trompe_server.settings import Settings
 from trompe_shared.api import Job, Needs
 

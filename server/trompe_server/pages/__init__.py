@@ -4,9 +4,8 @@ from fastapi import FastAPI
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
 
-from trompe_server.pages.errors import HtmlProblems
 from trompe_server.pages.routes import router
-from trompe_server.pages.serving import STATIC
+from trompe_server.pages.serving import STATIC, HtmlProblems
 from trompe_shared.three import FOLDER
 
 __all__ = ["add_pages"]

@@ -1,23 +1,30 @@
-"""Templates, static files, and security headers of the pages."""
+"""Templates, static files, and security headers of the pages; problem details as pages."""
 
 import hashlib
+import json
 import re
 from functools import cache
+from http import HTTPStatus
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote
 
 from fastapi import Request
-from fastapi.responses import HTMLResponse
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from fastapi.templating import Jinja2Templates
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
+from starlette.datastructures import Headers
+from starlette.types import Message, Receive, Scope, Send
 
 from trompe_server.api.guard import COOKIE
+from trompe_server.api.middleware import HttpMiddleware
 from trompe_shared import three
 
 _HERE: Final = Path(__file__).parent
 STATIC: Final = _HERE / "static"
+PROBLEM: Final = "application/problem+json"
 
 HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
@@ -60,3 +67,42 @@ def page(request: Request, template: str, /, status: int = 200, **values: Any) -
 def render(template: str, /, **values: Any) -> str:
     """Render a part of a page."""
     return _TEMPLATES.get_template(template).render(values)
+
+
+class HtmlProblems(HttpMiddleware):
+    """Turns problem details into pages for requests that accept HTML; without a token, the sign-in page."""
+
+    async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+        request = Request(scope)
+        if "text/html" not in request.headers.get("accept", "") or request.url.path.startswith("/v1/"):
+            await self._app(scope, receive, send)
+            return
+        begin: Message | None = None
+        body = b""
+
+        async def send_page(message: Message) -> None:
+            nonlocal begin, body
+            if message["type"] == "http.response.start":
+                kind = Headers(raw=message["headers"]).get("content-type", "")
+                begin = message if kind.startswith(PROBLEM) else None
+            if begin is None:
+                await send(message)
+            elif message is not begin:
+                body += message.get("body", b"")
+                if not message.get("more_body"):
+                    await _as_page(request, begin["status"], body)(scope, receive, send)
+
+        await self._app(scope, receive, send_page)
+
+
+def _as_page(request: Request, status: int, body: bytes) -> Response:
+    if status == HTTPStatus.UNAUTHORIZED:
+        return RedirectResponse(f"/login?next={quote(request.url.path)}", status_code=303)
+    problem = json.loads(body)
+    return page(
+        request,
+        "problem.html",
+        status=status,
+        title=problem["title"],
+        detail=problem.get("detail") or "There are no details.",
+    )

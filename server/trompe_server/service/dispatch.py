@@ -14,8 +14,10 @@ from prometheus_client.multiprocess import MultiProcessCollector
 from sqlalchemy.exc import SQLAlchemyError
 
 from trompe_server.errors import ServiceError
-from trompe_server.executor.choice import open_executor
 from trompe_server.executor.dispatcher import Dispatcher, dispatcher_name
+from trompe_server.executor.local import LocalExecutor
+from trompe_server.executor.port import Executor
+from trompe_server.executor.process import Setup
 from trompe_server.queue.claims import Claims
 from trompe_server.queue.retention import Retention
 from trompe_server.queue.store import JobStore
@@ -39,6 +41,19 @@ def prepare_data(settings: Settings) -> None:
             f"The data folder {settings.data} or the database cannot be written ({error}). Choose another folder with "
             "--data or TROMPE_DATA, another database with --database or TROMPE_DATABASE."
         ) from error
+
+
+def open_executor(settings: Settings, renderers: RendererAddresses, *, mark: str) -> Executor:
+    """Start the processes of this machine, or connect to the cluster. ``mark``: name of the dispatcher with the lease.
+
+    Raises ``ServiceError`` if the cluster cannot be used.
+    """
+    setup = Setup(settings, renderers)
+    if settings.executor == "local":
+        return LocalExecutor(setup)
+    from trompe_server.executor.ray_cluster import RayExecutor
+
+    return RayExecutor(setup, mark=mark)
 
 
 @contextmanager
