@@ -28,6 +28,8 @@ LOADED: Final = 2
 MOST_SIDE: Final = 1024
 """Pixels of an image's longer side."""
 
+_network: Final = lru_cache(maxsize=LOADED)(load_classifier)
+
 
 def main() -> None:
     """Answer the requests on standard input."""
@@ -42,17 +44,13 @@ def answer(asked: Mapping[str, Any], source: BinaryIO) -> dict[str, Any]:
     """The answer to one request, whose images follow in ``source``."""
     sent = [source.read(size) for size in asked["sizes"]]
     try:
-        images = _through(_images(sent), asked["strengths"])
+        ranges: dict[str, Any] = {name: (value, value) for name, value in asked["strengths"].items()}
+        images = ImagePipeline(**ranges).shown(_images(sent))
         return {"found": _classified(_network(asked["network"]), images, asked["labels"])}
     except TrompeError as error:
         return {"error": str(error)}
     except Exception as error:  # of a network, which may raise anything
         return {"error": f"The network does not run on these images ({type(error).__name__}: {str(error)[:300]})."}
-
-
-@lru_cache(maxsize=LOADED)
-def _network(path_or_name: str) -> Classifier:
-    return load_classifier(path_or_name)
 
 
 def _images(sent: Sequence[bytes]) -> Texture:
@@ -74,12 +72,6 @@ def _image(data: bytes, number: int) -> Texture:
             f"Image {number} is {image.shape[1]} x {image.shape[0]} pixels; send at most {MOST_SIDE} a side."
         )
     return image
-
-
-def _through(images: Texture, strengths: Mapping[str, float]) -> Texture:
-    """The images through an image pipeline whose operations have these strengths."""
-    ranges: dict[str, Any] = {name: (value, value) for name, value in strengths.items()}
-    return ImagePipeline(**ranges).shown(images)
 
 
 def _classified(network: Classifier, images: Texture, labels: Sequence[int]) -> list[tuple[int, float, float]]:

@@ -13,7 +13,7 @@ from trompe_server.api.services import Services
 from trompe_server.errors import NotFoundError
 from trompe_server.formats import write_glb
 from trompe_server.pages.orbit import orbit, painted
-from trompe_server.pages.present import TERMS, ClassNames, JobRow, present
+from trompe_server.pages.present import TERMS, JobRow, Shown
 from trompe_server.pages.results import Kind, target_image
 from trompe_server.pages.serving import STATIC, render
 from trompe_server.pages.sphere import sphere
@@ -38,9 +38,8 @@ SAID: Final = ("says", "kept", "truth")
 Record = Mapping[str, Any]
 
 
-def offline_page(services: Services, job: Job, row: JobRow, result: Result, *, names: ClassNames) -> str:
+def offline_page(services: Services, job: Job, row: JobRow, shown: Shown) -> str:
     """HTML of the result of ``job``. Raises ``FileNotFoundError`` if its images are not stored any more."""
-    shown = present(result, row, names=names)
     views: Sequence[Record] = shown.viewer[0]["views"]
     pictured = _pictured(services, job, views)
     return render(
@@ -48,7 +47,7 @@ def offline_page(services: Services, job: Job, row: JobRow, result: Result, *, n
         job=row,
         shown=replace(shown, viewer=[{**shown.viewer[0], "views": pictured}], sphere=sphere([pictured])),
         terms=TERMS,
-        orbit=_orbit(services, job, result, views),
+        orbit=_orbit(services, job, shown.result, views),
         style=Markup((STATIC / "trompe.css").read_text()),
         scripts=[Markup((STATIC / name).read_text()) for name in ("viewer.js", "orbit.js")],
     )

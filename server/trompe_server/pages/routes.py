@@ -132,17 +132,7 @@ def new_judgement(request: Request, services: ServicesDep, job: str | None = Non
     return page(request, "new_judgement.html", **_choices(services), given=given, suites=list(SUITES))
 
 
-@router.get("/jobs/turntable/{reference}.png")
-def show_turntable(
-    services: ServicesDep,
-    reference: str,
-    background: str = "white",
-    distance: float | None = None,
-    renderer: str = "",
-) -> Response:
-    """The object from all sides in a renderer: pictures side by side."""
-    shown = turntable(services, reference, background=background, distance=distance, renderer=renderer)
-    return Response(shown, media_type="image/png")
+router.get("/jobs/turntable/{reference}.png")(turntable)
 
 
 @router.get("/jobs/compare")
@@ -180,9 +170,8 @@ def result_file(services: ServicesDep, job: str) -> Response:
     found = services.store.get(job)
     result, text = _result(services, found), ""
     if result is not None:
-        names = Names(services.library)
-        known = names.classes(result.spec.victim.classifier)
-        text = offline_page(services, found, names.row(found), result, names=known)
+        row = Names(services.library).row(found)
+        text = offline_page(services, found, row, _shown(services, row, result))
     elif MANIFEST_PAGE in found.artifacts:
         text = services.artifacts(job).read(MANIFEST_PAGE).decode()
     else:

@@ -3,8 +3,9 @@
 from typing import Final
 
 import numpy as np
+from fastapi import Response
 
-from trompe_server.api.services import Services
+from trompe_server.api.services import Services, ServicesDep
 from trompe_server.pages.orbit import painted
 from trompe_server.spec.framing import framing_of
 from trompe_shared.api import JOB_RESULT, JobSpec, ViewOptions
@@ -20,9 +21,9 @@ ELEVATION: Final = 25.0
 
 
 def turntable(
-    services: Services, reference: str, *, background: str, distance: float | None, renderer: str = ""
-) -> bytes:
-    """``TURNS`` pictures side by side as PNG, of a stored object or of a job's painted one (``job:ID``).
+    services: ServicesDep, reference: str, background: str = "white", distance: float | None = None, renderer: str = ""
+) -> Response:
+    """Route to ``TURNS`` pictures side by side as PNG, of a stored object or of a job's painted one (``job:ID``).
 
     ``renderer``: identity of the engine; default: the first one's. Raises ``RendererError`` if no such renderer is up.
     """
@@ -42,7 +43,7 @@ def turntable(
         images = target.render(obj, views, size=(SIDE, SIDE))
     finally:
         target.close()
-    return encode_png(np.concatenate(list(images), axis=1))
+    return Response(encode_png(np.concatenate(list(images), axis=1)), media_type="image/png")
 
 
 def _object(services: Services, reference: str) -> tuple[Object3D, str]:
