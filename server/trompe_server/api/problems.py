@@ -100,19 +100,15 @@ def failure_response(request: Request, error: Exception) -> JSONResponse:
     if isinstance(error, PoolTimeoutError):
         error = DatabaseDownError("All connections of the database are in use; retry in a few seconds.")
     if isinstance(error, TrompeError):
-        return _refusal(request, error)
+        status = next((status for kind, status in _STATUS.items() if isinstance(error, kind)), 422)
+        response = problem_response(request, status, code=error.code, detail=str(error))
+        if status == 503:
+            logger.warning("request %s: %s", request.scope.get("request_id"), error)
+            response.headers["Retry-After"] = str(RETRY_AFTER)
+        return response
     logger.error("request %s failed", request.scope.get("request_id"), exc_info=error)
     detail = "Internal error; see the server's log for this request id."
     return problem_response(request, 500, code="internal", detail=detail)
-
-
-def _refusal(request: Request, error: TrompeError) -> JSONResponse:
-    status = next((status for kind, status in _STATUS.items() if isinstance(error, kind)), 422)
-    response = problem_response(request, status, code=error.code, detail=str(error))
-    if status == 503:
-        logger.warning("request %s: %s", request.scope.get("request_id"), error)
-        response.headers["Retry-After"] = str(RETRY_AFTER)
-    return response
 
 
 def _disk_full(request: Request, error: Exception) -> JSONResponse:
