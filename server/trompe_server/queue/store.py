@@ -33,7 +33,6 @@ from trompe_shared.api import (
     JobRequest,
     JobState,
     JudgementRequest,
-    Progress,
     WorkerInfo,
 )
 from trompe_shared.errors import SpecError
@@ -218,7 +217,7 @@ def _check_ended(row: Row) -> None:
 
 def _row(request: AnyRequest, names: Mapping[str, str], key: str | None) -> dict[str, Any]:
     spec = request.spec().model_dump(mode="json")
-    return _NEW | {
+    return {
         "id": secrets.token_hex(8),
         "spec": spec,
         "names": dict(names),
@@ -237,19 +236,6 @@ def _network(request: AnyRequest) -> str:
     if isinstance(request, JudgementRequest):
         return next(iter(request.networks), "")
     return request.victim.classifier
-
-
-_NEW: Final = {
-    "state": JobState.queued.value,
-    "progress": Progress().model_dump(mode="json"),
-    "done": 0,
-    "attempts": 0,
-    "lost": 0,
-    "orphaned": 0,
-    "events": 1,
-    "cancel_requested": False,
-    "artifacts": [],
-}
 
 
 def _the_same(job: Job, request: AnyRequest, key: str) -> Job:

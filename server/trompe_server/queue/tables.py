@@ -8,7 +8,7 @@ import sqlalchemy as sa
 
 from trompe_server.errors import NotFoundError
 from trompe_server.storage.database import clock
-from trompe_shared.api import Event, Job, Needs
+from trompe_shared.api import Event, Job, JobState, Needs, Progress
 
 PRIORITIES: Final = {"interactive": 10, "normal": 100, "sweep": 1000}
 """Lower numbers run first."""
@@ -23,7 +23,7 @@ jobs = sa.Table(
     metadata,
     sa.Column("number", _number, primary_key=True, autoincrement=True),
     sa.Column("id", sa.String, unique=True, nullable=False),
-    sa.Column("state", sa.String, nullable=False),
+    sa.Column("state", sa.String, nullable=False, default=JobState.queued.value),
     sa.Column("spec", sa.JSON, nullable=False),
     sa.Column("object", sa.String, nullable=False),
     sa.Column("classifier", sa.String, nullable=False),
@@ -35,15 +35,15 @@ jobs = sa.Table(
     sa.Column("created", sa.Double, nullable=False),
     sa.Column("started", sa.Double),
     sa.Column("finished", sa.Double),
-    sa.Column("progress", sa.JSON, nullable=False),
-    sa.Column("done", sa.Integer, nullable=False),
-    sa.Column("attempts", sa.Integer, nullable=False),
-    sa.Column("lost", sa.Integer, nullable=False),
-    sa.Column("events", sa.Integer, nullable=False),
-    sa.Column("cancel_requested", sa.Boolean, nullable=False),
+    sa.Column("progress", sa.JSON, nullable=False, default=lambda: Progress().model_dump(mode="json")),
+    sa.Column("done", sa.Integer, nullable=False, default=0),
+    sa.Column("attempts", sa.Integer, nullable=False, default=0),
+    sa.Column("lost", sa.Integer, nullable=False, default=0),
+    sa.Column("events", sa.Integer, nullable=False, default=1),
+    sa.Column("cancel_requested", sa.Boolean, nullable=False, default=False),
     sa.Column("error", sa.String),
     sa.Column("note", sa.String),
-    sa.Column("artifacts", sa.JSON, nullable=False),
+    sa.Column("artifacts", sa.JSON, nullable=False, default=list),
     sa.Column("names", sa.JSON, nullable=False, server_default="{}"),
     sa.Column("seen", sa.Double),
     sa.Column("orphaned", sa.Integer, nullable=False, server_default="0"),
