@@ -1,6 +1,7 @@
 """Runs one attempt of a job phase by phase. Each finished phase is recorded: the next attempt continues after it."""
 
 import logging
+import random
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
@@ -12,7 +13,7 @@ from prometheus_client import Counter
 from trompe_server.errors import NotFoundError
 from trompe_server.job.protocol import DamagedFileError, PhasedJob, PhaseReport, number_after
 from trompe_server.queue.claims import Claim, Claims, Ending, LostJobError
-from trompe_server.storage.database import RETRY_WAITS, DatabaseDownError, patiently
+from trompe_server.storage.database import DatabaseDownError
 from trompe_shared.api import JobState, Progress
 from trompe_shared.errors import RendererError, TrompeError
 
@@ -57,7 +58,8 @@ class JobRunner:
     open_job: OpenJob
     tidy_job: TidyJob = lambda _claim, _kept: None
     progress_interval: float = 1.0
-    retry_waits: tuple[float, float] = RETRY_WAITS
+    retry_waits: tuple[float, float] = (0.1, 2.0)
+    """Shortest and longest wait before a call of the database is repeated, seconds."""
 
     def run(self, claim: Claim) -> JobState | None:
         """Run a job, or continue it. Returns its final state, or ``None`` if the attempt was lost.
@@ -71,18 +73,24 @@ class JobRunner:
             return ending.state
         except (_Lost, LostJobError, NotFoundError) as error:
             logger.warning("job %s was lost: %s", claim.job.id, error)
-            self._tidy_after(claim)
+            public = self.patiently(lambda: self.claims.ended_artifacts(claim))
+            if public is not None:  # another attempt has ended the job, and tidied before this one wrote its files
+                self._tidy(claim, public)
             return None
 
     def patiently(self, action: Callable[[], T]) -> T:
-        """Repeat ``action`` while the database cannot be reached."""
-        return patiently(action, waits=self.retry_waits)
+        """Call ``action`` until the database can be reached.
 
-    def _tidy_after(self, claim: Claim) -> None:
-        """Delete the files this attempt wrote after another attempt had ended the job and tidied."""
-        kept = self.patiently(lambda: self.claims.ended_artifacts(claim))
-        if kept is not None:
-            self._tidy(claim, kept)
+        ``action`` must be idempotent: its answer can be lost after the database has committed it.
+        """
+        wait, longest = self.retry_waits
+        while True:
+            try:
+                return action()
+            except DatabaseDownError as error:
+                logger.warning("%s Retrying.", error)
+            time.sleep(wait * random.uniform(0.5, 1.0))
+            wait = min(wait * 2, longest)
 
     def _tidy(self, claim: Claim, kept: list[str]) -> None:
         try:

@@ -4,8 +4,8 @@ import json
 import subprocess
 import threading
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import IO, Any, Final, cast
 
 from trompe_server.errors import ServiceError
@@ -44,22 +44,16 @@ class Networks:
         Raises ``ClassifierError`` with the refusal of the process, and ``ServiceError`` if too many requests wait.
         """
         asked = {"network": network, "labels": list(labels), "strengths": dict(strengths), "sizes": [*map(len, images)]}
-        with self._in_turn():
-            process = self._running()
-            answer = _ask(process, json.dumps(asked).encode() + b"\n" + b"".join(images))
-        if "error" in answer:
-            raise ClassifierError(str(answer["error"]))
-        return [tuple(row) for row in answer["found"]]
-
-    @contextmanager
-    def _in_turn(self) -> Iterator[None]:
         if not self._waiting.acquire(blocking=False):
             raise ServiceError("Too many images wait for classification; send fewer at the same time.")
         try:
             with self._turn:
-                yield
+                answer = _ask(self._running(), json.dumps(asked).encode() + b"\n" + b"".join(images))
         finally:
             self._waiting.release()
+        if "error" in answer:
+            raise ClassifierError(str(answer["error"]))
+        return [tuple(row) for row in answer["found"]]
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None or self._process.poll() is not None:

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Final
 
 from trompe_server.errors import ServiceError
@@ -153,18 +154,14 @@ class Supervisor:
 
     def renderer_infos(self) -> list[RendererInfo]:
         """The renderer workers with their engines, ``alive`` if they accept connections."""
+        addresses = self._here()
+        with suppress(RendererError):  # none of the names resolves
+            addresses += self._elsewhere.addresses()
         with ThreadPoolExecutor(MAX_PROBES) as pool:
-            return list(pool.map(_info, [*self._here(), *self._addresses_elsewhere()]))
+            return list(pool.map(_info, addresses))
 
     def _here(self) -> list[Address]:
         return [("127.0.0.1", renderer.port) for renderer in self._renderers]
-
-    def _addresses_elsewhere(self) -> list[Address]:
-        """Addresses of the renderers elsewhere; empty if no name resolves."""
-        try:
-            return self._elsewhere.addresses()
-        except RendererError:
-            return []
 
     @property
     def addresses(self) -> RendererAddresses:

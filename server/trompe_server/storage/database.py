@@ -5,13 +5,10 @@ it locks rows, and a process frozen within a transaction loses its locks. Every 
 database cannot be reached.
 """
 
-import logging
-import random
 import re
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import sqlalchemy as sa
 from sqlalchemy.engine.interfaces import ExceptionContext
@@ -20,10 +17,6 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 
 from trompe_server.errors import ServiceError
-
-logger = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 BUSY_TIMEOUT: Final = 30_000
 """Milliseconds a writer of SQLite waits for the writer before it."""
@@ -36,8 +29,6 @@ POSTGRES: Final = {
     "options": "-c statement_timeout=30000 -c lock_timeout=15000 -c idle_in_transaction_session_timeout=15000",
 }
 """No call takes longer than half a minute, whatever happens to the server. Timeouts in ``options`` are in ms."""
-RETRY_WAITS: Final = (0.1, 2.0)
-"""Shortest and longest wait before a call is repeated, seconds."""
 
 
 class DatabaseDownError(ServiceError):
@@ -98,21 +89,6 @@ def write(engine: sa.Engine) -> Iterator[sa.Connection]:
         if connection.dialect.name == "sqlite":
             connection.exec_driver_sql("BEGIN IMMEDIATE")
         yield connection
-
-
-def patiently(action: Callable[[], T], *, waits: tuple[float, float] = RETRY_WAITS) -> T:
-    """Call ``action`` until the database can be reached.
-
-    ``action`` must be idempotent: its answer can be lost after the database has committed it.
-    """
-    wait, longest = waits
-    while True:
-        try:
-            return action()
-        except DatabaseDownError as error:
-            logger.warning("%s Retrying.", error)
-        time.sleep(wait * random.uniform(0.5, 1.0))
-        wait = min(wait * 2, longest)
 
 
 def _prepare_sqlite(connection: Any, _record: Any) -> None:
