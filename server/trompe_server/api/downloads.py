@@ -41,9 +41,8 @@ def send_file(request: Request, artifacts: JobArtifacts, name: str, *, digest: s
     asked = _asked_range(request, size, etag)
     if asked is not None and not 0 <= asked.start < asked.stop:
         detail = f"The file has {size} bytes; the range {request.headers['range']!r} is outside."
-        response = problem_response(request, 416, code="no-such-range", detail=detail)
-        response.headers["Content-Range"] = f"bytes */{size}"
-        return response
+        lengths = {"Content-Range": f"bytes */{size}"}
+        return problem_response(request, 416, code="no-such-range", detail=detail, headers=lengths)
     part = asked or range(size)
     headers |= {"Content-Length": str(len(part)), "Content-Disposition": f'inline; filename="{name}"'}
     if asked is not None:

@@ -61,8 +61,9 @@ class Guard(HttpMiddleware):
         try:
             await self._admit(request)
         except _RefusedError as refusal:
-            response = problem_response(request, refusal.status, code=refusal.code, detail=str(refusal))
-            response.headers.update(refusal.headers)
+            response = problem_response(
+                request, refusal.status, code=refusal.code, detail=str(refusal), headers=refusal.headers
+            )
             await response(scope, receive, send)
         else:
             await self._app(scope, receive, send)

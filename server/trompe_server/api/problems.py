@@ -3,6 +3,7 @@
 import errno
 import logging
 import sqlite3
+from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any, Final
 
@@ -59,6 +60,7 @@ def problem_response(
     code: str | None = None,
     detail: str | None = None,
     errors: list[dict[str, Any]] | None = None,
+    headers: Mapping[str, str] | None = None,
 ) -> JSONResponse:
     """A response with problem details. ``code``: the error's short name, for programs."""
     problem = Problem(
@@ -74,6 +76,7 @@ def problem_response(
         problem.model_dump(mode="json", exclude_none=True),
         status_code=status,
         media_type="application/problem+json",
+        headers=headers,
     )
 
 
@@ -88,9 +91,7 @@ async def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     if _is_disk_full(error):
         return _disk_full(request, error)
-    response = problem_response(request, error.status_code, detail=error.detail)
-    response.headers.update(error.headers or {})
-    return response
+    return problem_response(request, error.status_code, detail=error.detail, headers=error.headers)
 
 
 def failure_response(request: Request, error: Exception) -> JSONResponse:

@@ -22,7 +22,7 @@ from trompe_shared.errors import RendererError, RendererLostError
 ENGINES: Final = "engines.json"
 """File with the engines of a job's renderers: later attempts use the same ones."""
 
-JUDGEMENTS: Final = "trompe_server.service.judgement_job:open_judgement"
+JUDGEMENTS: Final = "trompe_server.service.judgement_job:JudgementJob"
 """Opens a judgement."""
 
 T = TypeVar("T")

@@ -16,16 +16,12 @@ PHASE: Final = "judge"
 UNSEEN: Final = "Nothing could be judged. The findings on the page say why."
 
 
-def open_judgement(spec: JudgementSpec, *, artifacts: Artifacts, **sources: Any) -> "JudgementJob":
-    """The phases of a judgement; other arguments as for ``StoredSources``."""
-    return JudgementJob(spec, artifacts, StoredSources(artifacts=artifacts, **sources))
-
-
 class JudgementJob:
-    """A ``PhasedJob``; its manifest, its page and the judged files are public."""
+    """A ``PhasedJob``; its manifest, its page and the judged files are public. Arguments as for ``StoredSources``."""
 
-    def __init__(self, spec: JudgementSpec, artifacts: Artifacts, sources: StoredSources) -> None:
-        self._spec, self._artifacts, self._sources = spec, artifacts, sources
+    def __init__(self, spec: JudgementSpec, *, artifacts: Artifacts, **sources: Any) -> None:
+        self._spec, self._artifacts = spec, artifacts
+        self._sources = StoredSources(artifacts=artifacts, **sources)
 
     def phases(self) -> list[str]:
         """See ``PhasedJob.phases``."""
