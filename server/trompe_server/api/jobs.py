@@ -47,6 +47,7 @@ NEW_OR_KNOWN: Final[dict[int | str, dict[str, Any]]] = {
     **examples.made(examples.JOB),
 }
 
+AskedJob = Annotated[JobRequest, Body(openapi_examples=examples.JOB_REQUESTS)]
 IdempotencyKey = Annotated[
     str | None,
     Header(
@@ -65,7 +66,7 @@ LabelFilters = Annotated[
 @router.post("", status_code=201, responses=NEW_OR_KNOWN)
 def submit(
     services: ServicesDep,
-    request: Annotated[JobRequest, Body(openapi_examples=examples.JOB_REQUESTS)],
+    request: AskedJob,
     response: Response,
     idempotency_key: IdempotencyKey = None,
 ) -> Job:
@@ -75,9 +76,7 @@ def submit(
 
 
 @router.post("/check", status_code=204)
-def check_job(
-    services: ServicesDep, request: Annotated[JobRequest, Body(openapi_examples=examples.JOB_REQUESTS)]
-) -> None:
+def check_job(services: ServicesDep, request: AskedJob) -> None:
     """Check a job without queueing it: 204, or the problem that submitting it would return."""
     checked_spec(request, services.library)
 

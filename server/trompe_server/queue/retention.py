@@ -56,12 +56,9 @@ class Retention:
                 except (NotFoundError, ConflictError):
                     logger.info("job %s was deleted by another process", job)
             deleted += len(jobs)
-        self._delete_calibrations()
+        calibrations = self._files.within("library").within("calibrations")
+        for name in calibrations.names():
+            if time.time() - calibrations.touched(name) > self._kept:
+                calibrations.delete(name)
         logger.info("retention deleted %d jobs", deleted)
         return deleted
-
-    def _delete_calibrations(self) -> None:
-        folder = self._files.within("library").within("calibrations")
-        for name in folder.names():
-            if time.time() - folder.touched(name) > self._kept:
-                folder.delete(name)
