@@ -209,8 +209,8 @@ def page(measured: Mapping[str, Figures]) -> str:
         "`make scoreboard ROW=name` (with `TROMPE_ASSETS`) adds a row. Means over three real objects with MobileNetV2",
         f"({', '.join(REAL)}) and two shipped ones with `tiny` ({', '.join(SHIPPED)}); epsilon 0.05, seed 0.",
         "Drops are `A_drop` on held-out views: plain, at half size and back, on a network left out",
-        f"(real objects only: `{Path(LEFT_OUT).stem}`). Seconds depend on what else the machine did. All rows, and each",
-        "job: [scoreboard.json](scoreboard.json).",
+        f"(real objects only: `{Path(LEFT_OUT).stem}`). Seconds depend on what else the machine did. All rows and",
+        "jobs: [scoreboard.json](scoreboard.json).",
     ]
     for mode in MODES:
         for title, objects in (("real objects", REAL), ("shipped objects", SHIPPED)):

@@ -97,7 +97,8 @@ class HtmlProblems(HttpMiddleware):
 
 def _as_page(request: Request, status: int, body: bytes) -> Response:
     if status == HTTPStatus.UNAUTHORIZED:
-        return RedirectResponse(f"/login?next={quote(request.url.path)}", status_code=303)
+        wanted = str(request.url.replace(scheme="", netloc=""))
+        return RedirectResponse(f"/login?next={quote(wanted)}", status_code=303)
     problem = json.loads(body)
     return page(
         request,
