@@ -1,7 +1,6 @@
 """The blocking and the asynchronous port over httpx, which no other module imports."""
 
 import asyncio
-import ipaddress
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ from trompe_client._errors import ServerUnreachable
 from trompe_client._port import finish
 from trompe_client._retry import Retries
 from trompe_client._settings import Connection
+from trompe_shared.addresses import is_loopback
 
 CONNECT_SECONDS: Final = 10.0
 """Timeout of connecting."""
@@ -145,7 +145,7 @@ def _options(connection: Connection) -> dict[str, Any]:
         "timeout": httpx.Timeout(connection.timeout, connect=min(CONNECT_SECONDS, connection.timeout)),
         "transport": connection.transport,
         # A proxy cannot reach a server on this machine.
-        "trust_env": not _is_loopback(httpx.URL(connection.url).host),
+        "trust_env": not is_loopback(httpx.URL(connection.url).host),
     }
 
 
@@ -185,10 +185,3 @@ def _translated(url: str) -> Iterator[None]:
         raise ServerUnreachable(
             f"The connection to {url} broke ({type(error).__name__}: {error}). Check the server's log."
         ) from error
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -8,6 +8,7 @@ import click
 from trompe_renderer.check.engine_render import EngineRender
 from trompe_renderer.check.questions import Render, check
 from trompe_renderer.engines.loading import engine_maker
+from trompe_shared.addresses import host_and_port
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError
 from trompe_shared.sailenv_client import SailenvTarget
@@ -21,10 +22,13 @@ def check_engine(name: str, settings: Mapping[str, str]) -> bool:
 
 def check_at(address: str) -> bool:
     """Check the renderer at HOST:PORT likewise. Raises ``RendererError`` if there is none."""
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or int(port) > 65535:
-        raise RendererError(f"--check {address}: expected HOST:PORT of a running renderer, or nothing for --engine.")
-    with contextlib.closing(SailenvTarget(host.strip("[]"), int(port))) as target:
+    try:
+        host, port = host_and_port(address)
+    except ValueError as error:
+        raise RendererError(
+            f"--check {address}: expected HOST:PORT of a running renderer, or nothing for --engine."
+        ) from error
+    with contextlib.closing(SailenvTarget(host, port)) as target:
         return _report(target.render, target.engine)
 
 

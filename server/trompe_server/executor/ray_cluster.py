@@ -20,6 +20,7 @@ from trompe_server.executor.task import run_task
 from trompe_server.queue.claims import Claim
 from trompe_server.queue.workers import Worker
 from trompe_server.storage.folders import open_folder
+from trompe_shared.addresses import host_and_port
 from trompe_shared.api import Needs
 
 logger = logging.getLogger(__name__)
@@ -266,10 +267,9 @@ def _connect(address: str) -> None:
 
 
 def _check_there(address: str, place: str) -> None:
-    host, _, port = place.rpartition(":")
     try:
-        socket.create_connection((host, int(port)), timeout=ANSWER).close()
-    except OSError as error:
+        socket.create_connection(host_and_port(place), timeout=ANSWER).close()
+    except (OSError, ValueError) as error:
         raise ServiceError(
             f"No Ray cluster answers at {address} ({error}). Start its head with: ray start --head "
             "--ray-client-server-port 10001; or name another one by TROMPE_EXECUTOR."

@@ -4,8 +4,8 @@ On one machine they are files and names (``LocalSources``), in a service stored 
 """
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -19,6 +19,7 @@ from trompe_server.library.catalogue import identity_of
 from trompe_server.renderers import SailenvTarget, TargetRenderer, local_renderer
 from trompe_server.renderers.local import COMMAND
 from trompe_server.spec.labels import resolve_label
+from trompe_shared.addresses import host_and_port
 from trompe_shared.api import HashedFile, JudgedNetwork
 from trompe_shared.engine import DEFAULT_ENGINE
 from trompe_shared.errors import LabelError
@@ -82,16 +83,12 @@ class LocalSources:
         network = load_classifier(reference, classes=None if path is None else classes_beside(path))
         return _judge(network, label, reference, reference if path is None else self._relative(reference), path is None)
 
-    @contextmanager
-    def running(self, name: str) -> Iterator[TargetRenderer]:
+    def running(self, name: str) -> AbstractContextManager[TargetRenderer]:
         """The renderer at HOST:PORT, or a worker of our own with the engine ``name``. Raises ``RendererError``."""
-        host, _, port = name.rpartition(":")
-        if host and port.isdecimal():
-            with closing(SailenvTarget(host, int(port))) as target:
-                yield target
-            return
-        with local_renderer([*COMMAND, "--engine", name]) as target:
-            yield target
+        try:
+            return closing(SailenvTarget(*host_and_port(name)))
+        except ValueError:
+            return local_renderer([*COMMAND, "--engine", name])
 
     def _relative(self, source: str) -> str:
         return Path(os.path.relpath(Path(source).resolve(), self.folder.resolve())).as_posix()

@@ -1,5 +1,6 @@
 """An object from all sides in the target renderer, for the form."""
 
+from contextlib import closing
 from typing import Final
 
 import numpy as np
@@ -8,6 +9,7 @@ from fastapi import Response
 from trompe_server.api.services import Services, ServicesDep
 from trompe_server.pages.orbit import painted
 from trompe_server.spec.framing import framing_of
+from trompe_shared.addresses import host_and_port
 from trompe_shared.api import JOB_RESULT, JobSpec, ViewOptions
 from trompe_shared.colours import colour_of
 from trompe_shared.errors import RendererError, SpecError
@@ -37,12 +39,8 @@ def turntable(
         raise SpecError(f"The background {background!r} is not a colour; use white, black or #rrggbb.")
     cameras = [Camera(framing.distance, 360 * k / TURNS, ELEVATION, centre=framing.centre) for k in range(TURNS)]
     views = [View(camera, Light(), behind) for camera in cameras]
-    host, _, port = renderers[0].address.rpartition(":")
-    target = SailenvTarget(host, int(port))
-    try:
+    with closing(SailenvTarget(*host_and_port(renderers[0].address))) as target:
         images = target.render(obj, views, size=(SIDE, SIDE))
-    finally:
-        target.close()
     return Response(encode_png(np.concatenate(list(images), axis=1)), media_type="image/png")
 
 

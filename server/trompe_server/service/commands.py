@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from trompe_server.service.doctor import check_all, in_json, in_words
 from trompe_server.settings import Settings
 from trompe_server.system.log import log_to_stderr
+from trompe_shared.addresses import host_and_port
 from trompe_shared.errors import SpecError
 from trompe_shared.faults import faults_of
 
@@ -157,12 +158,10 @@ def _renderers_at(listed: tuple[str, ...], names: tuple[str, ...]) -> "RendererA
 
 
 def _address(text: str) -> tuple[str, int]:
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdecimal():
-        raise click.BadParameter(
-            f"{text!r} is not HOST:PORT, e.g. 127.0.0.1:8085", param_hint="--renderer or --renderers-dns"
-        )
-    return host, int(port)
+    try:
+        return host_and_port(text)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--renderer or --renderers-dns") from error
 
 
 @click.command()

@@ -1,6 +1,5 @@
 """``trompe serve``: starts and stops database, children and HTTP server in order."""
 
-import ipaddress
 import resource
 import signal
 import socket
@@ -25,6 +24,7 @@ from trompe_server.settings import Settings
 from trompe_server.storage.folders import open_folder
 from trompe_server.storage.tokens import Tokens
 from trompe_server.system.files import exclusive
+from trompe_shared.addresses import is_loopback
 
 BACKLOG: Final = 2048
 """Connections waiting to be accepted."""
@@ -141,7 +141,7 @@ def _url(listener: socket.socket) -> str:
 
 
 def _refuse_public(host: str, settings: Settings) -> None:
-    if _is_loopback(host):
+    if is_loopback(host):
         return
     with closing(JobStore(settings.database_url)) as store:
         closed = any(token.revoked is None for token in Tokens(store.engine).all())
@@ -158,13 +158,6 @@ def _refuse_without_renderers(settings: Settings, elsewhere: RendererAddresses) 
             f"{settings.workers} attack workers need a renderer: start some with --renderers, name some with "
             "--renderer HOST:PORT, or start no attack workers with --workers 0."
         )
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _leave(_number: int, _frame: FrameType | None) -> NoReturn:
