@@ -14,26 +14,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor
 
 from trompe_experiments.asset_objects import AssetObject, asset_objects
 from trompe_server.attack import grid_views
-from trompe_server.renderers import local_renderer
+from trompe_server.surrogate import SamplingModel, Surrogate
+from trompe_server.surrogate.calibration import CALIBRATED_GREYS, CURVE_GREYS, Calibration
+from trompe_server.surrogate.fidelity import Fidelity
 from trompe_shared.colours import COLOURS
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import ShippedObject, shipped_objects
 
-__all__ = [
-    "BenchObject",
-    "Times",
-    "assets",
-    "bench_objects",
-    "in_rounds",
-    "local_renderer",
-    "machine",
-    "painted_at_random",
-    "rescaled",
-]
+GREYS = {"calibrated": CALIBRATED_GREYS, "curve": CURVE_GREYS}
+"""What the target is asked for: `auto` takes the first for all of the paper's objects; the second costs the most."""
 
 
 @dataclass(frozen=True)
@@ -93,15 +87,28 @@ def rescaled(obj: Object3D, factor: float) -> Object3D:
     )
 
 
-def painted_at_random(
-    n_views: int, size: tuple[int, int], greys: Sequence[int], generator: np.random.Generator
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Stand-ins for what a target shows, where only time counts: clean (views, H, W, 3) and probes (greys, views, H, W,
-    3), each probe dimmed grey."""
+def measured_at_random(n_views: int, size: tuple[int, int], model: str) -> tuple[Calibration, NDArray[np.uint8]]:
+    """Stand-ins for what a target shows, where only time counts: a calibration whose probes are dimmed grey, and clean
+    images (views, H, W, 3)."""
+    generator, greys = np.random.default_rng(0), GREYS[model]
     clean = generator.integers(40, 200, (n_views, *size, 3), dtype=np.uint8)
     shade = generator.uniform(0.4, 0.9, (n_views, *size, 1))
     probes = np.stack([np.broadcast_to((grey * shade).astype(np.uint8), clean.shape) for grey in greys])
-    return clean, probes
+    nothing = Fidelity((), (), (), ())
+    return Calibration(model, "for time alone", SamplingModel(), greys, probes, nothing, 0), clean
+
+
+def forward_backward(
+    surrogate: Surrogate, textures: Mapping[str, Tensor], gradient: Callable[[Tensor], Tensor]
+) -> None:
+    """One step's work of the surrogate: textures to images of all views, and back from each batch's ``gradient``."""
+    leaves = {name: texture.detach().requires_grad_() for name, texture in textures.items()}
+    texels = surrogate.texels(leaves)
+    collected = texels.detach().requires_grad_()
+    for batch in range(len(surrogate.batches)):
+        images = surrogate.render(collected, batch)
+        images.backward(gradient(images))  # type: ignore[no-untyped-call]
+    torch.autograd.grad(texels, list(leaves.values()), collected.grad)
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,6 @@ from trompe_server.surrogate import textures_of
 from trompe_shared.geometry import FIELD_OF_VIEW, View, spherical
 from trompe_shared.object3d import Object3D
 
-__all__ = ["PyTorch3DPeer"]
-
-LEVEL = 2
-"""Textures are read at this mip level, a quarter of their size: the level that comes nearest to the paper's 0.33."""
-NO_SPECULAR = ((0.0, 0.0, 0.0),)
 PYTORCH3DS = np.diag([-1.0, 1.0, -1.0])
 """From OpenGL's camera coordinates (x right, looks along -z) to PyTorch3D's (x left, looks along +z)."""
 

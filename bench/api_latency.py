@@ -11,52 +11,33 @@ import argparse
 import asyncio
 import os
 import statistics
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import httpx
 
 from bench._common import machine
+from trompe_client._embedded import SERVE, embedded_server
 from trompe_experiments.markdown import markdown_table
+from trompe_shared.api import JobRequest
 
 MARKS = {"reads": 0.050, "submits": 0.150}
 """Seconds that 99 of 100 must be answered in."""
-LONG = {"object": "mug", "label": "mug", "steps": 10_000, "epsilon": 0.004, "alpha": 0.0002}
-QUEUED = {"object": "mug", "label": "mug", "needs": {"gpu": 1}, "labels": {"bench": "latency"}}
+LONG = {"steps": 10_000, "epsilon": 0.004, "alpha": 0.0002, "priority": "interactive"}
+QUEUED = {"needs": {"gpu": 1}, "labels": {"bench": "latency"}}
 """What is submitted stays in the queue: there is no worker with a GPU."""
 
 
-@contextmanager
-def serving(folder: Path, workers: int) -> Iterator[str]:
-    """The URL of a service with so many attack workers, its log in ``folder``."""
-    command = [sys.executable, "-m", "trompe_server.system.child", "serve", "--port", "0", "--workers", str(workers)]
-    with (folder / "serve.log").open("w") as log:
-        process = subprocess.Popen(
-            [*command, "--data", str(folder)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-            env=os.environ | {"TROMPE_RATE_LIMIT": "0"},
-        )
-        assert process.stdout is not None
-        try:
-            yield process.stdout.readline().split()[-1]
-        finally:
-            process.terminate()
-            process.wait(30)
+def mug(options: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    """A job on the shipped mug."""
+    return JobRequest.of("mug", label="mug", seed=seed, **options).model_dump(mode="json")
 
 
 async def occupy(client: httpx.AsyncClient, workers: int) -> None:
     """Give each worker an attack, and wait until all of them are at its steps."""
     for seed in range(workers):
-        (await client.post("/v1/jobs", json=LONG | {"seed": seed, "priority": "interactive"})).raise_for_status()
+        (await client.post("/v1/jobs", json=mug(LONG, seed))).raise_for_status()
     while True:
         running = (await client.get("/v1/jobs", params={"state": "running"})).json()["jobs"]
         phases = [job["progress"]["phase"] for job in running]
@@ -67,7 +48,7 @@ async def occupy(client: httpx.AsyncClient, workers: int) -> None:
 
 async def fill(client: httpx.AsyncClient, count: int) -> list[str]:
     """Ids of jobs that reads ask for."""
-    answers = [await client.post("/v1/jobs", json=QUEUED | {"seed": seed}) for seed in range(count)]
+    answers = [await client.post("/v1/jobs", json=mug(QUEUED, seed)) for seed in range(count)]
     return [answer.raise_for_status().json()["id"] for answer in answers]
 
 
@@ -80,7 +61,7 @@ async def measure(
     async def ask(number: int) -> None:
         started = time.perf_counter()
         if number % round(1 / options.submits) == 0:
-            kind, answer = "submits", await client.post("/v1/jobs", json=QUEUED | {"seed": number})
+            kind, answer = "submits", await client.post("/v1/jobs", json=mug(QUEUED, number))
         else:
             job = jobs[number % len(jobs)]
             path = (f"/v1/jobs/{job}", "/v1/jobs?limit=50", "/v1/workers", f"/v1/jobs/{job}", "/v1/objects")[number % 5]
@@ -119,7 +100,9 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--submits", type=float, default=0.2, help="share of the requests")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder, serving(Path(folder), options.workers) as url:
+    os.environ["TROMPE_RATE_LIMIT"] = "0"
+    os.environ.pop("TROMPE_DATA", None)
+    with embedded_server(command=(*SERVE[:-1], "--workers", str(options.workers), SERVE[-1])) as url:
         taken = asyncio.run(run(url, options))
     print(f"{options.rate:g} requests/s, {options.workers} attack workers computing; {machine()}\n")
     header = ["", "requests", "p50 (ms)", "p99 (ms)", "worst (ms)", "mark for p99 (ms)"]

@@ -12,7 +12,7 @@ import csv
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,13 +20,11 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from bench._common import BenchObject, bench_objects, machine, painted_at_random
+from bench._common import BenchObject, bench_objects, forward_backward, machine, measured_at_random
 from trompe_experiments.markdown import markdown_table
-from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
-from trompe_server.surrogate.calibration import CURVE_GREYS, Calibration, build_surrogate
-from trompe_server.surrogate.fidelity import Fidelity
+from trompe_server.surrogate import textures_of
+from trompe_server.surrogate.calibration import build_surrogate
 from trompe_server.system.memory import keep_freed_memory
 from trompe_shared.object3d import Object3D, Part
 
@@ -111,28 +109,15 @@ def cost(entry: BenchObject, case: Case, rounds: int) -> Cost:
     """The costs of one case."""
     views = [entry.views(azimuths=6, elevations=-(-case.views // 6))[k] for k in range(case.views)]
     size = (case.side, case.side)
-    clean, probes = painted_at_random(len(views), size, CURVE_GREYS, np.random.default_rng(0))
-    nothing = Fidelity((), (), (), ())
-    calibration = Calibration("curve", "for time alone", SamplingModel(), CURVE_GREYS, probes, nothing, 0)
+    calibration, clean = measured_at_random(len(views), size, "curve")
     textures = textures_of(case.obj)
     preparing, stepping = [], []
     for _ in range(rounds):
         seconds, surrogate = timed(lambda: build_surrogate(calibration, case.obj, views, clean))
         preparing.append(seconds)
-        stepping += [timed(lambda: step(surrogate, textures))[0] for _ in range(2)]  # noqa: B023
+        stepping += [timed(lambda: forward_backward(surrogate, textures, torch.ones_like))[0] for _ in range(2)]  # noqa: B023
     middle = (statistics.median(preparing), 1000 * statistics.median(stepping))
     return Cost(case.axis, case.size, *middle, surrogate.geometry.nbytes / 2**20)
-
-
-def step(surrogate: Surrogate, textures: Mapping[str, Tensor]) -> None:
-    """Forward and backward of all views."""
-    leaves = {name: texture.detach().requires_grad_() for name, texture in textures.items()}
-    texels = surrogate.texels(leaves)
-    collected = texels.detach().requires_grad_()
-    for batch in range(len(surrogate.batches)):
-        images = surrogate.render(collected, batch)
-        images.backward(torch.ones_like(images))  # type: ignore[no-untyped-call]
-    torch.autograd.grad(texels, list(leaves.values()), collected.grad)
 
 
 def timed(work: Callable[[], Made]) -> tuple[float, Made]:

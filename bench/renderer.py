@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from bench._common import BenchObject, bench_objects, in_rounds, local_renderer, machine
+from bench._common import BenchObject, bench_objects, in_rounds, machine
 from trompe_experiments.markdown import markdown_table
 from trompe_renderer.engines.pyrender import PyrenderEngine, PyrenderOptions
 from trompe_renderer.engines.pyrender.passes import ObjectRenderer
@@ -36,7 +36,7 @@ from trompe_renderer.protocol.limits import Limits
 from trompe_renderer.protocol.session import Session
 from trompe_renderer.protocol.upload import ModelCache
 from trompe_renderer.world.snapshot import Snapshot
-from trompe_server.renderers import SailenvTarget
+from trompe_server.renderers import SailenvTarget, local_renderer
 from trompe_shared import sailenv_client as client
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import View, sailenv_pose

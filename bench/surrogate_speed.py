@@ -17,14 +17,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bench._common import BenchObject, Times, assets, bench_objects, in_rounds, machine, painted_at_random, rescaled
+from bench._common import (
+    GREYS,
+    BenchObject,
+    Times,
+    assets,
+    bench_objects,
+    forward_backward,
+    in_rounds,
+    machine,
+    measured_at_random,
+    rescaled,
+)
 from trompe_experiments.markdown import markdown_table
 from trompe_server.attack import Budget, Goal, attack, movable, start
 from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
 from trompe_server.job.texture_attack import CHUNK
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of
-from trompe_server.surrogate.calibration import CALIBRATED_GREYS, CURVE_GREYS, Calibration, build_surrogate
-from trompe_server.surrogate.fidelity import Fidelity
+from trompe_server.surrogate.calibration import build_surrogate
 from trompe_server.surrogate.sampling import Gather
 from trompe_server.surrogate.surrogate import BATCH
 from trompe_server.system.memory import keep_freed_memory
@@ -54,26 +64,13 @@ class Work:
 
     def forward_backward(self) -> None:
         """One step's work of the surrogate: textures to images of all views, and back."""
-        leaves = {name: texture.detach().requires_grad_() for name, texture in self.textures.items()}
-        texels = self.surrogate.texels(leaves)
-        collected = texels.detach().requires_grad_()
-        for number, views in enumerate(self.surrogate.batches):
-            images = self.surrogate.render(collected, number)
-            images.backward(self.gradient[: len(views)])  # type: ignore[no-untyped-call]
-        torch.autograd.grad(texels, list(leaves.values()), collected.grad)
-
-
-MODELS = {"calibrated": CALIBRATED_GREYS, "curve": CURVE_GREYS}
-"""What the target is asked for: `auto` takes the first for all of the paper's objects; the second costs the most."""
+        forward_backward(self.surrogate, self.textures, lambda images: self.gradient[: len(images)])
 
 
 def work_of(entry: BenchObject, obj: Object3D, name: str, size: tuple[int, int], n_views: int, model: str) -> Work:
     """Prepare ``obj`` with pictures at random for probes."""
-    views, greys = entry.views()[:n_views], MODELS[model]
-    generator = np.random.default_rng(0)
-    clean, probes = painted_at_random(len(views), size, greys, generator)
-    nothing = Fidelity((), (), (), ())
-    calibration = Calibration(model, "for time alone", SamplingModel(), greys, probes, nothing, 0)
+    views = entry.views()[:n_views]
+    calibration, clean = measured_at_random(len(views), size, model)
     surrogate = build_surrogate(calibration, obj, views, clean)
     gradient = torch.randn(BATCH, 3, *size, generator=torch.Generator().manual_seed(0))
     gradient = gradient.contiguous(memory_format=torch.channels_last)
@@ -199,7 +196,7 @@ def compare(entries: Sequence[BenchObject], size: tuple[int, int], n_views: int,
         work_of(entry, obj, f"{entry.name} {name}, {model}", size, n_views, model)
         for entry in entries
         for name, obj in ((f"{SMALL} texture", rescaled(entry.obj, SMALL)), (FULL, entry.obj))
-        for model in MODELS
+        for model in GREYS
     ]
     classifier = fastest_classifier()
     contenders: dict[str, Callable[[], object]] = {work.name: work.forward_backward for work in works}
