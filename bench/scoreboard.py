@@ -10,12 +10,11 @@ import argparse
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
@@ -26,7 +25,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bench._common import machine
+from trompe_client._embedded import embedded_server
 from trompe_experiments.asset_objects import asset_objects
+from trompe_experiments.markdown import markdown_table
 from trompe_server.classifiers import Classifier, load_classifier
 
 REAL: Final = ("toilet_paper", "lamp_floor", "plunger")
@@ -51,9 +52,11 @@ def main() -> None:
     work.mkdir(parents=True, exist_ok=True)
     missing = [name for name in job_names() if not (work / f"{name}.json").exists()]
     if missing:
-        with served(work / "data") as (server, url):
+        os.environ["TROMPE_DATA"] = str(work / "data")
+        with embedded_server() as url:
+            _wait_until_ready(url)
             for name in missing:
-                figures = run_job(name, assets=assets, server=server, url=url, out=work / name)
+                figures = run_job(name, assets=assets, url=url, out=work / name)
                 (work / f"{name}.json").write_text(json.dumps(figures, indent=1))
                 print(f"{name}: {figures}", flush=True)
     jobs = {name: json.loads((work / f"{name}.json").read_text()) for name in job_names()}
@@ -76,43 +79,21 @@ def job_names() -> list[str]:
     return [f"{name}-{mode}" for name in (*REAL, *SHIPPED) for mode in MODES]
 
 
-@contextmanager
-def served(data: Path) -> Iterator[tuple[int, str]]:
-    """``trompe serve`` as a process: its id and its address."""
-    command = [sys.executable, "-m", "trompe_client.cli", "serve", "--port", "0", "--data", str(data)]
-    log = data.with_suffix(".log")
-    with log.open("w") as stream:
-        service = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
-        try:
-            yield service.pid, _address(log, service)
-        finally:
-            service.send_signal(signal.SIGTERM)
-            service.wait(60)
-
-
-def _address(log: Path, service: subprocess.Popen[bytes]) -> str:
+def _wait_until_ready(url: str) -> None:
     for _ in range(600):
-        if found := re.search(r"http://127\.0\.0\.1:\d+", log.read_text()):
-            url = found[0]
-            try:
-                with urlopen(f"{url}/readyz", timeout=5):
-                    return url
-            except OSError:
-                pass
-        if service.poll() is not None:
-            break
+        with suppress(OSError), urlopen(f"{url}/readyz", timeout=5):
+            return
         time.sleep(0.2)
-    sys.exit(f"trompe serve did not start; see {log}")
+    sys.exit("trompe serve does not become ready")
 
 
-def run_job(name: str, *, assets: Path, server: int, url: str, out: Path) -> Figures:
+def run_job(name: str, *, assets: Path, url: str, out: Path) -> Figures:
     """One attack by the command line, and everything the table says of it."""
     obj, _, mode = name.rpartition("-")
     command, victim, left_out = _command(obj, assets)
     if mode == "grid":
         command.append("--grid")
-    processes = _descendants(server)
-    for pid in processes:
+    for pid in _descendants(os.getpid()):
         Path(f"/proc/{pid}/clear_refs").write_text("5")  # forget the peak so far
     before, started = _renders(url), time.perf_counter()
     subprocess.run([*command, "--server", url, "--out", str(out)], check=True, stderr=subprocess.DEVNULL)
@@ -123,7 +104,7 @@ def run_job(name: str, *, assets: Path, server: int, url: str, out: Path) -> Fig
         "phases": {phase: round(seconds, 1) for phase, seconds in result["seconds"].items()},
         "renders": round(_renders(url) - before),
         "images_shown": result["evaluations"],
-        "peak_memory_mib": max(_peak(pid) for pid in _descendants(server)),
+        "peak_memory_mib": max(map(_peak, _descendants(os.getpid()))),
         "a_drop": _rounded(result["target"]["a_drop"]),
         "held_out": _rounded(result["held_out"]["a_drop"]),
         **_judged(out, result["label"], victim, left_out),
@@ -176,10 +157,10 @@ def _renders(url: str) -> float:
 
 
 def _descendants(pid: int) -> list[int]:
-    """``pid`` and all processes below it."""
+    """All processes below ``pid``."""
     tasks = Path(f"/proc/{pid}/task").glob("*/children")  # each thread lists its own
     children = [int(child) for task in tasks for child in task.read_text().split()]
-    return [pid, *(each for child in children for each in _descendants(child))]
+    return children + [each for child in children for each in _descendants(child)]
 
 
 def _peak(pid: int) -> int:
@@ -215,9 +196,9 @@ def page(measured: Mapping[str, Figures]) -> str:
     for mode in MODES:
         for title, objects in (("real objects", REAL), ("shipped objects", SHIPPED)):
             jobs = {row: [rows[row]["jobs"][f"{name}-{mode}"] for name in objects] for row in rows}
-            text += ["", f"## {'Default job' if mode == 'default' else 'Grid'}, {title}", "", *_table(jobs)]
-    text += ["", "## Lines of Python", "", "| row | packages | tests |", "|---|---:|---:|"]
-    text += [f"| {row} | {rows[row]['lines']['packages']:,} | {rows[row]['lines']['tests']:,} |" for row in rows]
+            text += ["", f"## {'Default job' if mode == 'default' else 'Grid'}, {title}", "", _table(jobs)]
+    counted = [[row, *(f"{rows[row]['lines'][what]:,}" for what in ("packages", "tests"))] for row in rows]
+    text += ["", "## Lines of Python", "", markdown_table(["row", "packages", "tests"], counted, align="lrr")]
     return "\n".join(text) + "\n"
 
 
@@ -232,12 +213,9 @@ COLUMNS: Final = {
 }
 
 
-def _table(jobs: Mapping[str, Sequence[Figures]]) -> Iterator[str]:
-    yield f"| row | {' | '.join(COLUMNS)} |"
-    yield f"|---|{'---:|' * len(COLUMNS)}"
-    for row, figures in jobs.items():
-        cells = [_cell([job[key] for job in figures]) for key in COLUMNS.values()]
-        yield f"| {row} | {' | '.join(cells)} |"
+def _table(jobs: Mapping[str, Sequence[Figures]]) -> str:
+    lines = [[row, *(_cell([job[key] for job in some]) for key in COLUMNS.values())] for row, some in jobs.items()]
+    return markdown_table(["row", *COLUMNS], lines, align="l" + "r" * len(COLUMNS))
 
 
 def _cell(values: Sequence[float | None]) -> str:
