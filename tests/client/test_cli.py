@@ -26,11 +26,11 @@ from tests.client.conftest import NOW, SPEC, FakeServer, trompe, zipped
 from trompe_client import BadRequest, Client, JobHandle
 from trompe_client._report import result_report, spent
 from trompe_client.cli import connection
-from trompe_client.cli.attack import attack, flag_of
+from trompe_client.cli.attack import attack
+from trompe_client.cli.options import flag_of
 from trompe_server.pages.present import command
 from trompe_shared.api import OPTIONS, PARTS, JobSpec, JobState, Option, SearchOptions, in_flags
-from trompe_shared.api.jobs import CONDITIONS
-from trompe_shared.api.jobs import _option as option
+from trompe_shared.api.jobs import CONDITIONS, option
 
 
 def stored_id(data: bytes) -> str:

@@ -1,70 +1,19 @@
 """``trompe attack``. Its flags are made from ``OPTIONS``."""
 
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, Literal, get_args, get_origin
+from typing import Any, Final, get_args
 
 import click
 
 from trompe_client._plan import Upload, plan_attack
 from trompe_client.cli.connection import out_option, server_option, service, token_option
 from trompe_client.cli.following import deliver, follow, follow_our_own
-from trompe_client.cli.options import Sectioned, SectionOption, tag_option
+from trompe_client.cli.options import Sectioned, flag_of, tag_option
 from trompe_client.cli.output import json_option, say
 from trompe_client.tracking import TRACKERS, tracked
-from trompe_shared.api import OPTIONS, VIEW_LIMITS, JobRequest, Needs, Option, ViewRanges, in_flags
+from trompe_shared.api import OPTIONS, JobRequest, Needs, in_flags
 from trompe_shared.errors import SpecError
-
-
-def _class(word: str) -> str | int:
-    return int(word) if word.isdecimal() else word
-
-
-def _mask(word: str) -> tuple[str, str]:
-    texture, equals, picture = word.partition("=")
-    if not (texture and equals and picture):
-        raise click.BadParameter(f"{word!r} should be a texture and a picture of its size: albedo.png=mask.png.")
-    return texture, picture
-
-
-def _by_name(_ctx: click.Context, _option: click.Parameter, given: tuple[tuple[Any, ...], ...]) -> dict[str, Any]:
-    return {name: values[0] if len(values) == 1 else values for name, *values in given}
-
-
-def _value(kind: Any) -> Mapping[str, Any]:
-    """Click's settings of a flag with values of this type."""
-    if kind is bool:
-        return {"is_flag": True}
-    if kind is ViewRanges:
-        return {"type": (click.Choice(list(VIEW_LIMITS)), float, float), "callback": _by_name}
-    if get_origin(kind) is dict:
-        return {"type": _mask, "callback": _by_name}
-    if get_origin(kind) is Literal:
-        return {"type": click.Choice(get_args(kind))}
-    if get_origin(kind) is tuple:
-        return {"type": get_args(kind)}
-    kind = get_args(kind)[0] if get_origin(kind) is list else kind
-    return {"type": kind if kind in {int, float, str} else _class}
-
-
-def flag_of(option: Option) -> SectionOption:
-    """The flag of a job's option."""
-    words = option.help[0].upper() + option.help[1:]
-    default = ", ".join(option.default) if isinstance(option.default, list) else option.default
-    if type(default) in {str, int, float} and default != "":
-        words += f"; default: {default}"
-    unset = option.type is bool and option.default is None
-    return SectionOption(
-        [f"{option.flag}/--no{option.flag[1:]}" if unset else option.flag, option.keyword],
-        section=option.part.title(),
-        help=f"{words}.{' *' if option.repeated else ''}",
-        required=option.info.is_required(),
-        multiple=option.repeated,
-        metavar=option.metavar,
-        default=None,
-        **_value(option.type),
-    )
 
 
 def _amounts(_ctx: click.Context, _option: click.Parameter, words: tuple[str, ...]) -> dict[str, str]:

@@ -10,8 +10,7 @@ from trompe_client._client import Client
 from trompe_client._report import job_table, jobs_table
 from trompe_client.cli.connection import out_option, with_client
 from trompe_client.cli.following import deliver, follow
-from trompe_client.cli.grouping import ListedByDefault
-from trompe_client.cli.options import tag_option
+from trompe_client.cli.options import ListedByDefault, tag_option
 from trompe_client.cli.output import as_json, print_json, say
 from trompe_shared.api import Job, JobState
 

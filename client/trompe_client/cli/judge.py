@@ -12,42 +12,32 @@ from pydantic import ValidationError
 
 from trompe_client._client import Client
 from trompe_client._progress import shown
-from trompe_client.cli.connection import token_option
+from trompe_client.cli.connection import out_option, token_option
 from trompe_client.cli.following import deliver, follow
+from trompe_client.cli.options import flag_of
 from trompe_client.cli.output import json_option, say
-from trompe_shared.api import MANIFEST, MANIFEST_PAGE, OPTIONS, Event, JobState, JudgementSpec, Manifest, Progress
+from trompe_shared.api import (
+    JUDGEMENT_OPTIONS,
+    MANIFEST,
+    MANIFEST_PAGE,
+    OPTIONS,
+    Event,
+    JobState,
+    JudgementSpec,
+    Manifest,
+    Progress,
+)
 from trompe_shared.errors import SpecError
 
 HERE: Final = "trompe.here"
 """Entry points of the server package with the functions that judge without a service."""
 
 
-def _help(keyword: str) -> str:
-    """The words of a job's option."""
-    words = OPTIONS[keyword].help
-    return words[0].upper() + words[1:]
-
-
-@click.command()
+@click.command(params=list(map(flag_of, JUDGEMENT_OPTIONS)))
 @click.argument("before", required=False)
 @click.argument("after", required=False)
-@click.option("--label", multiple=True, metavar="NAME_OR_INDEX", help=f"{_help('label')}. *")
-@click.option("--suite", metavar="NAME", help="Views, networks and renderers by name: standard-1 (docs/benchmark.md).")
-@click.option("--network", "networks", multiple=True, metavar="FILE_OR_NAME", help="A network. Default: tiny. *")
-@click.option(
-    "--renderer",
-    "renderers",
-    multiple=True,
-    metavar="NAME",
-    help="An engine; without --server also HOST:PORT of a running renderer. Default: pyrender, or the server's own. *",
-)
-@click.option("--views", type=int, help="Random views and lights. Default: 60.")
-@click.option("--seed", type=int, help="Of the views. Default: 0.")
-@click.option("--epsilon", type=float, help="The budget that AFTER is said to keep, 0..1.")
-@click.option("--distance", type=float, help=f"{_help('distance')}.")
-@click.option("--elevation", type=(float, float), metavar="LO HI", help=f"{_help('elevation')}.")
-@click.option("--background", metavar="COLOUR", help="white, black or '#rrggbb'. Default: white.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Folder for the results.")
+@click.option("--label", multiple=True, metavar="NAME_OR_INDEX", help=f"{OPTIONS['label'].help.capitalize()}. *")
+@out_option(required=False, help="Folder for the results.")
 @click.option(
     "--verify", type=click.Path(path_type=Path, exists=True, dir_okay=False), help="Check a manifest instead."
 )

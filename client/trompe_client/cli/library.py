@@ -10,7 +10,7 @@ from trompe_client import _core
 from trompe_client._client import Client
 from trompe_client._report import records_table
 from trompe_client.cli.connection import with_client
-from trompe_client.cli.grouping import ListedByDefault
+from trompe_client.cli.options import ListedByDefault
 from trompe_client.cli.output import say
 from trompe_shared.api import BackgroundInfo, ClassifierInfo, ObjectInfo, RendererInfo, WorkerInfo
 

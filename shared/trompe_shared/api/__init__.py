@@ -32,7 +32,7 @@ from trompe_shared.api.jobs import (
     in_parts,
     levels_within,
 )
-from trompe_shared.api.judgements import JOB_RESULT, JudgementRequest, JudgementSpec
+from trompe_shared.api.judgements import JOB_RESULT, JUDGEMENT_OPTIONS, JudgementRequest, JudgementSpec
 from trompe_shared.api.manifest import (
     AS_RENDERED,
     MANIFEST,
@@ -79,6 +79,7 @@ __all__ = [
     "AS_RENDERED",
     "FEW_RECOGNISED",
     "JOB_RESULT",
+    "JUDGEMENT_OPTIONS",
     "MANIFEST",
     "MANIFEST_PAGE",
     "MOST_VIEWS",

@@ -166,7 +166,7 @@ class _Spelling:
     in_form: bool
 
 
-def _option(
+def option(
     default: Any = ...,
     help: str = "",
     *,
@@ -190,13 +190,11 @@ _EngineName = Annotated[str, Field(min_length=1, max_length=300)]
 class VictimOptions(_Part):
     """Attacked networks."""
 
-    classifier: str = _option(
+    classifier: str = option(
         "tiny", "victim: a .pt2 or .onnx file, or a name", metavar=_NETWORK, file="classifier", in_form=True
     )
-    ensemble: list[str] = _option(
-        list, "another victim, attacked together with it", metavar=_NETWORK, file="classifier"
-    )
-    queries: Annotated[int, Field(ge=2, le=10_000), AfterValidator(_even)] | None = _option(
+    ensemble: list[str] = option(list, "another victim, attacked together with it", metavar=_NETWORK, file="classifier")
+    queries: Annotated[int, Field(ge=2, le=10_000), AfterValidator(_even)] | None = option(
         None, "scores asked per image and step, an even number; only for a classifier without gradients (.onnx)"
     )
 
@@ -204,26 +202,26 @@ class VictimOptions(_Part):
 class PaintOptions(_Part):
     """Budget of the change."""
 
-    epsilon: Annotated[float, Field(gt=0, le=1), AfterValidator(_one_level)] = _option(
+    epsilon: Annotated[float, Field(gt=0, le=1), AfterValidator(_one_level)] = option(
         0.05, "largest change of a texel, 0..1", in_form=True
     )
-    perceptual: bool = _option(
+    perceptual: bool = option(
         False,
         "bound each texel by its visibility, epsilon at most: less in plain areas, less hue than lightness",
     )
-    epsilon_view: Annotated[float, Field(gt=0, le=1)] | None = _option(
+    epsilon_view: Annotated[float, Field(gt=0, le=1)] | None = option(
         None, "largest change of a pixel of the surrogate's views, 0..1 (the paper's view constraint)"
     )
-    tau: Annotated[float, Field(ge=0, lt=1)] | None = _option(
+    tau: Annotated[float, Field(ge=0, lt=1)] | None = option(
         None, "saliency threshold, 0..1; default: all pixels", in_form=True
     )
-    keep: Annotated[float, Field(gt=0, le=1)] | None = _option(
+    keep: Annotated[float, Field(gt=0, le=1)] | None = option(
         None, "share of the texels to attack, the most effective ones; default: all texels"
     )
-    materials: list[str] = _option(
+    materials: list[str] = option(
         list, "attack this material only; default: all materials", flag="--material", metavar="NAME"
     )
-    masks: dict[str, str] = _option(
+    masks: dict[str, str] = option(
         dict,
         "picture of a texture's size, white where the texture may change",
         flag="--mask",
@@ -235,15 +233,15 @@ class PaintOptions(_Part):
 class GoalOptions(_Part):
     """Goal of the attack."""
 
-    label: ClassNames = _option(
+    label: ClassNames = option(
         ...,
         "the object's true class, by name or index; each of several counts as the object",
         metavar="NAME_OR_INDEX",
         in_form=True,
     )
-    target: str | int | None = _option(None, "class to be taken for; default: any other class", metavar="NAME_OR_INDEX")
-    top_k: Annotated[int, Field(ge=1)] = _option(1, "the true class must leave the k best classes")
-    loss: Loss = _option("margin", "loss to maximise")
+    target: str | int | None = option(None, "class to be taken for; default: any other class", metavar="NAME_OR_INDEX")
+    top_k: Annotated[int, Field(ge=1)] = option(1, "the true class must leave the k best classes")
+    loss: Loss = option("margin", "loss to maximise")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -255,64 +253,64 @@ class GoalOptions(_Part):
 class SearchOptions(_Part):
     """Search for the change."""
 
-    steps: Annotated[int, Field(ge=1, le=10_000)] = _option(
+    steps: Annotated[int, Field(ge=1, le=10_000)] = option(
         90, "steps at most; the attack stops once all views are safely won"
     )
-    alpha: Annotated[float, Field(gt=0, le=1)] | None = _option(
+    alpha: Annotated[float, Field(gt=0, le=1)] | None = option(
         None, "mean step size, 0..1; default: 0.01, or epsilon / 5 if smaller"
     )
-    optimiser: OptimiserName = _option("nesterov", "rule of a step; pgd is the paper's")
-    image_pipeline: PipelineName | None = _option(
+    optimiser: OptimiserName = option("nesterov", "rule of a step; pgd is the paper's")
+    image_pipeline: PipelineName | None = option(
         None,
         "random changes of each image before the networks: robust (size, tone, noise, JPEG), transfer (placement too, "
         "for networks left out) or none; default: transfer for an ensemble, else robust; none for grid and queries",
     )
-    views_per_step: Annotated[int, Field(ge=1, le=MOST_VIEWS)] | None = _option(
+    views_per_step: Annotated[int, Field(ge=1, le=MOST_VIEWS)] | None = option(
         None, f"views in one step; default: {VIEWS_PER_STEP} of a pool, all of the grid"
     )
-    surrogate: SurrogateModel = _option("auto", "colour model of the surrogate")
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = _option(0, "the same seed and threads give equal bytes", in_form=True)
+    surrogate: SurrogateModel = option("auto", "colour model of the surrogate")
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = option(0, "the same seed and threads give equal bytes", in_form=True)
 
 
 class ViewOptions(_Part):
     """Views."""
 
-    centre: Literal["object", "origin"] | None = _option(
+    centre: Literal["object", "origin"] | None = option(
         None,
         "point that cameras look at: the middle of the object's bounding sphere, or the origin; default: origin for "
         "the grid, else object",
     )
-    distance: Distance | None = _option(
+    distance: Distance | None = option(
         None, "camera distance in metres; default: a shipped object's own, or to fit the frame", in_form=True
     )
-    elevation: Elevation | None = _option(
+    elevation: Elevation | None = option(
         None, "range of camera elevations in degrees; default: a shipped object's own, or 0 50", metavar="LO HI"
     )
-    background: Annotated[list[str], BeforeValidator(_as_list), Field(min_length=1, max_length=64)] = _option(
+    background: Annotated[list[str], BeforeValidator(_as_list), Field(min_length=1, max_length=64)] = option(
         lambda: ["white"],
         "white, black, '#rrggbb' or a picture; each view draws one of several",
         metavar="COLOUR_OR_FILE",
         file="background",
         in_form=True,
     )
-    pool: Annotated[int, Field(ge=1, le=MOST_VIEWS)] = _option(240, "attack this many random cameras and lights")
-    grid: bool = _option(False, "attack the paper's grid of views in place of random ones")
-    azimuths: Annotated[int, Field(ge=1, le=360)] | None = _option(
+    pool: Annotated[int, Field(ge=1, le=MOST_VIEWS)] = option(240, "attack this many random cameras and lights")
+    grid: bool = option(False, "attack the paper's grid of views in place of random ones")
+    azimuths: Annotated[int, Field(ge=1, le=360)] | None = option(
         None, "columns of the grid, evenly spaced; default: the paper's six, of which 0 and 360 are the same"
     )
-    elevations: Annotated[int, Field(ge=1, le=180)] = _option(10, "rows of the grid")
-    conditions: Conditions = _option(
+    elevations: Annotated[int, Field(ge=1, le=180)] = option(10, "rows of the grid")
+    conditions: Conditions = option(
         "usual",
         "ranges of random views: usual, or wide (distance 0.7 to 1.5 times, rolled, light from anywhere, tinted)",
     )
-    ranges: ViewRanges = _option(
+    ranges: ViewRanges = option(
         ViewRanges,
         f"range of random views in place of the one in `conditions`: {', '.join(VIEW_LIMITS)}; angles in degrees",
         flag="--range",
         metavar="NAME LO HI",
     )
-    held_out: Annotated[int, Field(ge=0, le=1000)] = _option(60, "random views to judge on, hidden from the attack")
-    renderers: Annotated[list[_EngineName], BeforeValidator(_as_list), Field(max_length=8)] = _option(
+    held_out: Annotated[int, Field(ge=0, le=1000)] = option(60, "random views to judge on, hidden from the attack")
+    renderers: Annotated[list[_EngineName], BeforeValidator(_as_list), Field(max_length=8)] = option(
         list,
         "engine of the renderers to attack, by name; several are painted for at once; default: the service's own",
         flag="--renderer",
@@ -366,7 +364,7 @@ class ViewOptions(_Part):
 class JudgeOptions(_Part):
     """Judges of the result that are not attacked."""
 
-    networks: list[str] = _option(
+    networks: list[str] = option(
         list,
         "another classifier, which only judges",
         flag="--judge",
@@ -374,7 +372,7 @@ class JudgeOptions(_Part):
         keyword="judges",
         file="classifier",
     )
-    renderers: Annotated[list[_EngineName], BeforeValidator(_as_list), Field(max_length=8)] = _option(
+    renderers: Annotated[list[_EngineName], BeforeValidator(_as_list), Field(max_length=8)] = option(
         list,
         "engine of other renderers, which only judge",
         flag="--judge-renderer",

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from trompe_shared.api.jobs import ClassNames, Distance, Elevation, QueueOptions
+from trompe_shared.api.jobs import ClassNames, Distance, Elevation, Option, QueueOptions, option
 from trompe_shared.api.schema import Schema
 from trompe_shared.colours import colour_of
 from trompe_shared.errors import SpecError
@@ -38,15 +38,21 @@ class JudgementSpec(Schema):
     before: str = Field(min_length=1)
     after: str = Field(min_length=1, description="the object of `before`, repainted by anyone")
     label: Annotated[ClassNames, BeforeValidator(_plain)] = Field(description="each class counts as the object")
-    networks: _Names = Field(default=[], description="default: the shipped one, or those of the suite")
-    renderers: _Names = Field(default=[], description="engines by name; default: the first, or those of the suite")
-    views: Annotated[int, Field(ge=1, le=MOST_VIEWS)] | None = Field(None, description="random views; default: 60")
-    seed: Annotated[int, Field(ge=0, lt=2**31)] | None = Field(None, description="of the views; default: 0")
-    epsilon: Annotated[float, Field(gt=0, le=1)] | None = Field(None, description="the stated budget, 0..1")
-    distance: Distance | None = Field(None, description="of the cameras, metres; default: as for an attack")
-    elevation: Elevation | None = Field(None, description="range in degrees; default: as for an attack")
-    background: str = Field("white", description="white, black or '#rrggbb'")
-    suite: str | None = Field(None, description="fixes views and seed, and adds networks and renderers: standard-1")
+    networks: _Names = option(
+        [], "network; default: the shipped one, or the suite's", flag="--network", metavar="FILE_OR_NAME"
+    )
+    renderers: _Names = option(
+        [], "engine, or HOST:PORT on one machine; default: the first, or the suite's", flag="--renderer", metavar="NAME"
+    )
+    views: Annotated[int, Field(ge=1, le=MOST_VIEWS)] | None = option(None, "random views; default: 60")
+    seed: Annotated[int, Field(ge=0, lt=2**31)] | None = option(None, "of the views; default: 0")
+    epsilon: Annotated[float, Field(gt=0, le=1)] | None = option(None, "the stated budget, 0..1")
+    distance: Distance | None = option(None, "of the cameras, metres; default: as for an attack")
+    elevation: Elevation | None = option(None, "of the cameras, degrees; default: as for an attack", metavar="LO HI")
+    background: str = option("white", "white, black or '#rrggbb'", metavar="COLOUR")
+    suite: str | None = option(
+        None, "fixes views and seed, and adds networks and renderers: standard-1", metavar="NAME"
+    )
 
     @classmethod
     def of(cls, before: str, after: str, **options: Any) -> Self:
@@ -71,3 +77,11 @@ class JudgementRequest(QueueOptions, JudgementSpec):
     def spec(self) -> JudgementSpec:
         """The judgement alone."""
         return JudgementSpec.model_validate(self.model_dump(include=set(JudgementSpec.model_fields)))
+
+
+JUDGEMENT_OPTIONS: Final = [
+    Option("judgement", name, info)
+    for name, info in JudgementSpec.model_fields.items()
+    if name not in {"before", "after", "label"}
+]
+"""Options with a flag made from their field."""
