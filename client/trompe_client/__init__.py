@@ -20,9 +20,8 @@ from trompe_client._errors import (
     Unauthorized,
     WaitTimeout,
 )
-from trompe_client._job import AsyncJobHandle, JobHandle
+from trompe_client._job import AsyncJobHandle, JobHandle, ResultPage
 from trompe_client._many import Attack, Outcome
-from trompe_client._page import ResultPage
 from trompe_client._retry import Retries
 
 __all__ = [

@@ -3,13 +3,16 @@
 import time
 from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing, suppress
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from trompe_client import _core
 from trompe_client._errors import JobCancelled, JobFailed, ServerFault, ServerUnreachable, TooMany, WaitTimeout
 from trompe_client._operations import check, send_once
 from trompe_client._port import Port
 from trompe_shared.api import Event, Job, JobState
+
+if TYPE_CHECKING:
+    from trompe_client._client import AsyncClient, Client
 
 PATIENCE: Final = 60.0
 """Seconds that a server may be unreachable (restarting) while a job is followed."""
@@ -22,10 +25,16 @@ AWAY: Final = (ServerUnreachable, ServerFault, TooMany)
 
 
 class Followed:
-    """A job as last seen."""
+    """A job of a client as last seen."""
 
-    def __init__(self, status: Job) -> None:
-        self.status = status
+    def __init__(self, client: "Client | AsyncClient", status: Job) -> None:
+        self.client, self.status = client, status
+        self._port: Port = client.port
+
+    @property
+    def server(self) -> str:
+        """The server's address."""
+        return self.client.server
 
     @property
     def id(self) -> str:

@@ -1,14 +1,15 @@
-"""Handles on one job: follow it, wait for it, download its results."""
+"""Handles on one job: follow it, wait for it, show and download its results."""
 
 from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from trompe_client import _core
 from trompe_client._following import Followed, follow, wait
 from trompe_client._operations import send
-from trompe_client._page import ResultPage
-from trompe_client._port import Port, blocking, finish, iterate
+from trompe_client._port import blocking, finish, iterate
 from trompe_client._progress import Progress, shown
 from trompe_client._transfer import fetch, fetch_all
 from trompe_shared.api import Event, Job, Manifest, Result
@@ -17,21 +18,23 @@ if TYPE_CHECKING:
     from trompe_client._client import AsyncClient, Client
 
 
-class _Handle(Followed):
-    """A job of a client."""
-
-    def __init__(self, client: "Client | AsyncClient", status: Job) -> None:
-        super().__init__(status)
-        self.client = client
-        self._port: Port = client.port
-
-    @property
-    def server(self) -> str:
-        """The server's address."""
-        return self.client.server
+HEIGHT: Final = 900
+"""Pixels in a notebook."""
 
 
-class AsyncJobHandle(_Handle):
+@dataclass(frozen=True)
+class ResultPage:
+    """One HTML page with everything inside. A notebook shows it; ``html`` is its text, to be written to a file."""
+
+    html: str
+
+    def _repr_html_(self) -> str:
+        """The page in a frame that can reach neither the notebook nor a network."""
+        style = f"width: 100%; height: {HEIGHT}px; border: 0"
+        return f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{escape(self.html)}"></iframe>'
+
+
+class AsyncJobHandle(Followed):
     """``JobHandle`` for asyncio: the same methods to await; iterate ``events`` by ``async for``."""
 
     client: "AsyncClient"
@@ -93,7 +96,7 @@ class AsyncJobHandle(_Handle):
         return AsyncJobHandle(self.client, await send(self._port, _core.retry(self.id, key=_core.new_key())))
 
 
-class JobHandle(_Handle):
+class JobHandle(Followed):
     """A job on a server. ``status`` is the job as last seen; ``refresh`` updates it."""
 
     client: "Client"

@@ -53,11 +53,7 @@ def result_report(
     table = _table("", "views", "A_before", "A_after", "A_drop", right=4)
     for name, accuracy in _rows(result):
         table.add_row(name, accuracy.counted, *_cells(accuracy))
-    facts = Table.grid(padding=(0, 2))
-    facts.add_column(no_wrap=True)
-    facts.add_column()
-    for name, value in _facts(result, seconds or result.seconds):
-        facts.add_row(name, value)
+    facts = _pairs(_facts(result, seconds or result.seconds))
     notes = [Text(f"n.a.: {in_flags(note)}", style="yellow")] if note else []
     warnings = [Text(f"warning: {in_flags(each)}", style="yellow") for each in result.warnings if each != note]
     return Group(Text(_headline(result), style="bold"), table, Text("[..] intervals at 95 %"), facts, *notes, *warnings)
@@ -98,12 +94,16 @@ def _judged(job: Job, spec: JudgementSpec) -> list[str]:
 
 def job_table(job: Job) -> Table:
     """State of a job, and its options that differ from the defaults."""
+    return _pairs((name, value) for name, value in _job_facts(job) if value)
+
+
+def _pairs(facts: Iterable[tuple[str, str]]) -> Table:
+    """Names and values, a line each."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    for name, value in _job_facts(job):
-        if value:
-            table.add_row(name, value)
+    for fact in facts:
+        table.add_row(*fact)
     return table
 
 

@@ -1,6 +1,5 @@
 """The command ``trompe``. Its subcommands are imported when they are called."""
 
-from dataclasses import dataclass
 from importlib import import_module, metadata
 from typing import Any, Final
 
@@ -29,27 +28,24 @@ OWN: Final = {
 """Commands of this package, and their modules."""
 
 
-@dataclass(frozen=True)
-class _Extension:
-    """A command of another package: the extra that installs it, and its line in ``trompe --help``."""
-
-    extra: str
-    help: str
-
-
 EXTENSIONS: Final = {
-    "serve": _Extension("server", "Run the service: API, attack worker and renderer."),
-    "worker": _Extension("server", "Run an additional attack worker."),
-    "demo": _Extension("server", "Attack a shipped object and show the result."),
-    "doctor": _Extension("server", "Check this machine and suggest repairs."),
-    "experiment": _Extension("experiments", "Run grids of jobs and report their results."),
-    "migrate": _Extension("server", "Create or upgrade the service's database."),
-    "render": _Extension("renderer", "Run a renderer worker (SAILenv's protocol)."),
-    "token": _Extension("server", "Create, list and revoke access tokens."),
+    "serve": "Run the service: API, attack worker and renderer.",
+    "worker": "Run an additional attack worker.",
+    "demo": "Attack a shipped object and show the result.",
+    "doctor": "Check this machine and suggest repairs.",
+    "experiment": "Run grids of jobs and report their results.",
+    "migrate": "Create or upgrade the service's database.",
+    "render": "Run a renderer worker (SAILenv's protocol).",
+    "token": "Create, list and revoke access tokens.",
 }
+"""Commands of our other packages, with their lines in ``trompe --help``."""
 
-PARTLY: Final = {"judge": "server"}
-"""Own commands that need an extra unless they are given a server."""
+EXTRAS: Final = dict.fromkeys(EXTENSIONS, "server") | {
+    "experiment": "experiments",
+    "render": "renderer",
+    "judge": "server",
+}
+"""Extra that installs each of them, and of an own command without a server."""
 
 
 class _Trompe(click.Group):
@@ -74,7 +70,7 @@ class _Trompe(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands without importing those of other packages."""
-        lines = {name: extension.help for name, extension in EXTENSIONS.items()}
+        lines = dict(EXTENSIONS)
         for name in OWN:
             command = self.get_command(ctx, name)
             lines[name] = command.get_short_help_str(100) if command else ""
@@ -94,7 +90,7 @@ class _Trompe(click.Group):
         except BrokenPipeError:
             raise
         except ModuleNotFoundError as error:  # raised when the command runs
-            if ctx.invoked_subcommand not in {*EXTENSIONS, *PARTLY}:
+            if ctx.invoked_subcommand not in EXTRAS:
                 raise
             raise _missing_extra(ctx.invoked_subcommand, error) from error
         except (TrompeError, OSError) as error:
@@ -116,9 +112,9 @@ def _load_extension(name: str) -> click.Command:
 
 
 def _missing_extra(name: str, error: ModuleNotFoundError) -> click.ClickException:
-    if name not in {*EXTENSIONS, *PARTLY}:
+    if name not in EXTRAS:
         return click.ClickException(f"`trompe {name}` cannot be loaded: {error}.")
-    extra = PARTLY[name] if name in PARTLY else EXTENSIONS[name].extra
+    extra = EXTRAS[name]
     return click.ClickException(f"`trompe {name}` needs the {extra} extra: pip install 'trompe[{extra}]' ({error})")
 
 
