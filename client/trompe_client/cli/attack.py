@@ -9,18 +9,11 @@ import click
 from trompe_client._plan import Upload, plan_attack
 from trompe_client.cli.connection import out_option, server_option, service, token_option
 from trompe_client.cli.following import deliver, follow, follow_our_own
-from trompe_client.cli.options import Sectioned, flag_of, tag_option
+from trompe_client.cli.options import Sectioned, flag_of, needs_option, tag_option
 from trompe_client.cli.output import json_option, say
 from trompe_client.tracking import TRACKERS, tracked
-from trompe_shared.api import OPTIONS, JobRequest, Needs, in_flags
+from trompe_shared.api import OPTIONS, JobRequest, in_flags
 from trompe_shared.errors import SpecError
-
-
-def _amounts(_ctx: click.Context, _option: click.Parameter, words: tuple[str, ...]) -> dict[str, str]:
-    pairs = [word.partition("=") for word in words]
-    if wrong := [word for word, pair in zip(words, pairs, strict=True) if not all(pair)]:
-        raise click.BadParameter(f"{wrong[0]!r} should be a name and an amount: gpu=0.5.")
-    return {name: amount for name, _, amount in pairs}
 
 
 def _priority() -> click.Option:
@@ -29,16 +22,10 @@ def _priority() -> click.Option:
     return click.Option(["--priority"], type=click.Choice(get_args(info.annotation)), help=words.capitalize())
 
 
-def _needs() -> click.Option:
-    fields = ", ".join(f"{name} ({info.description})" for name, info in Needs.model_fields.items())
-    words = f"What the job occupies: {fields}. Default: cpu=1. *"
-    return click.Option(["--needs"], multiple=True, metavar="NAME=AMOUNT", callback=_amounts, help=words)
+FLAGS: Final = [*map(flag_of, OPTIONS.values()), _priority(), needs_option()]
 
 
-PARAMETERS: Final = [click.Argument(["object"]), *map(flag_of, OPTIONS.values())]
-
-
-@click.command(cls=Sectioned, params=[*PARAMETERS, _priority(), _needs()])
+@click.command(cls=Sectioned, params=[click.Argument(["object"]), *FLAGS])
 @server_option(None)
 @token_option
 @tag_option("Label of your own, to find the job by. *")

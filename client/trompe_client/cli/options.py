@@ -5,7 +5,7 @@ from typing import Any, Final, Literal, TypeVar, get_args, get_origin
 
 import click
 
-from trompe_shared.api import VIEW_LIMITS, Option, ViewRanges
+from trompe_shared.api import VIEW_LIMITS, Needs, Option, ViewRanges
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -55,11 +55,16 @@ def _class(word: str) -> str | int:
     return int(word) if word.isdecimal() else word
 
 
-def _mask(word: str) -> tuple[str, str]:
-    texture, equals, picture = word.partition("=")
-    if not (texture and equals and picture):
-        raise click.BadParameter(f"{word!r} should be a texture and a picture of its size: albedo.png=mask.png.")
-    return texture, picture
+def _pair(expected: str) -> Callable[[str], tuple[str, str]]:
+    """Type of NAME=VALUE; ``expected`` says what these are, with an example."""
+
+    def parse(word: str) -> tuple[str, str]:
+        name, _, value = word.partition("=")
+        if not (name and value):
+            raise click.BadParameter(f"{word!r} should be {expected}.")
+        return name, value
+
+    return parse
 
 
 def _by_name(_ctx: click.Context, _option: click.Parameter, given: tuple[tuple[Any, ...], ...]) -> dict[str, Any]:
@@ -73,7 +78,7 @@ def _value(kind: Any) -> Mapping[str, Any]:
     if kind is ViewRanges:
         return {"type": (click.Choice(list(VIEW_LIMITS)), float, float), "callback": _by_name}
     if get_origin(kind) is dict:
-        return {"type": _mask, "callback": _by_name}
+        return {"type": _pair("a texture and a picture of its size: albedo.png=mask.png"), "callback": _by_name}
     if get_origin(kind) is Literal:
         return {"type": click.Choice(get_args(kind))}
     if get_origin(kind) is tuple:
@@ -103,12 +108,13 @@ def flag_of(option: Option) -> SectionOption:
 
 def tag_option(help: str) -> Callable[[F], F]:
     """--tag KEY=VALUE, repeatable; passed on as one mapping, ``labels``."""
-    return click.option("--tag", "labels", multiple=True, metavar="KEY=VALUE", callback=_labels, help=help)
+    kind = _pair("a name and a value: campaign=mugs")
+    return click.option("--tag", "labels", multiple=True, metavar="KEY=VALUE", type=kind, callback=_by_name, help=help)
 
 
-def _labels(_ctx: click.Context, _option: click.Parameter, words: tuple[str, ...]) -> dict[str, str]:
-    pairs = [word.partition("=") for word in words]
-    for name, equals, value in pairs:
-        if not (name and equals and value):
-            raise click.BadParameter(f"{name + equals + value!r} should be a name and a value: campaign=mugs.")
-    return {name: value for name, _, value in pairs}
+def needs_option() -> click.Option:
+    """--needs NAME=AMOUNT, repeatable; passed on as one mapping."""
+    fields = ", ".join(f"{name} ({info.description})" for name, info in Needs.model_fields.items())
+    words = f"What the job occupies: {fields}. Default: cpu=1. *"
+    kind = _pair("a name and an amount: gpu=0.5")
+    return click.Option(["--needs"], multiple=True, metavar="NAME=AMOUNT", type=kind, callback=_by_name, help=words)

@@ -112,7 +112,7 @@ class Agent:
             self._send_pictures(request.values["views"])
         else:
             try:
-                values = getattr(self._session, command.name)(**request.values)
+                values = getattr(self._session, command.name)(**request.values) or ()
             except Exception as error:  # the client waits for a whole reply in any case
                 self._link.send(_refusal(request, self._note(command.name, self._reason(error))))
             else:

@@ -20,15 +20,14 @@ def _checked_direction(value: Vector) -> Vector:
     return direction
 
 
-def _commands(setting: str, check: Callable[[Any], Any]) -> tuple[Callable[..., tuple[Any]], Callable[..., tuple[()]]]:
+def _commands(setting: str, check: Callable[[Any], Any]) -> tuple[Callable[..., tuple[Any]], Callable[..., None]]:
     """The methods that read and set a field of ``WorldLight``; ``check`` raises ``RendererError``."""
 
     def get(self: "LightCommands", *, light: str) -> tuple[Any]:
         return (getattr(self._light(light), setting),)
 
-    def put(self: "LightCommands", *, light: str, **value: Any) -> tuple[()]:
+    def put(self: "LightCommands", *, light: str, **value: Any) -> None:
         self._lights[light] = replace(self._light(light), **{setting: check(value[setting])})
-        return ()
 
     return get, put
 
@@ -46,9 +45,8 @@ class LightCommands:
     def get_ambient_light_color(self) -> tuple[Ints]:
         return (self._ambient,)
 
-    def set_ambient_light_color(self, *, color: Ints) -> tuple[()]:
+    def set_ambient_light_color(self, *, color: Ints) -> None:
         self._ambient = checked_color(color)
-        return ()
 
     def get_lights_names(self) -> tuple[list[str]]:
         return (list(self._lights),)

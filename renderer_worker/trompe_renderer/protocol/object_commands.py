@@ -99,25 +99,22 @@ class ObjectCommands:
         size, pose = checked_vector(scale, "scale"), _checked_pose(position, rotation)
         return (self._spawn(ObjectRequest(name, pose, size, motion, limited=frustum_limited)),)
 
-    def despawn_object(self, *, instance: int) -> tuple[()]:
+    def despawn_object(self, *, instance: int) -> None:
         self._spawned_object(instance)
         del self._spawned[instance]
         self._cache.textures.hold(self, _texture_size(item.model for item in self._spawned.values()))
-        return ()
 
-    def move_object(self, *, instance: int, position: Vector, rotation: Vector) -> tuple[()]:
+    def move_object(self, *, instance: int, position: Vector, rotation: Vector) -> None:
         """Set an object's pose. This ends its own movement."""
         item = self._spawned_object(instance)
         self._spawned[instance] = replace(item, pose=_checked_pose(position, rotation), motion=None)
-        return ()
 
-    def repaint_object(self, *, instance: int, textures: Sequence[tuple[str, tuple[int, int, bytes]]]) -> tuple[()]:
+    def repaint_object(self, *, instance: int, textures: Sequence[tuple[str, tuple[int, int, bytes]]]) -> None:
         painted = self._spawned_object(instance)
         pictures = {name: np.frombuffer(data, np.uint8).reshape(h, w, 3) for name, (h, w, data) in textures}
         model = repainted(painted.model, pictures)
         self._admit(model, instead_of=instance)
         self._spawned[instance] = replace(painted, model=model)
-        return ()
 
     def _admit(self, model: HashedModel, *, instead_of: int | None = None) -> None:
         """Raise ``RendererError`` if the textures of ``model`` and of all other spawned objects exceed the limit."""

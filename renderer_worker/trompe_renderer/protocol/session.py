@@ -1,7 +1,7 @@
 """The state of one agent: scene, camera, background. No sockets, no OpenGL, no clock.
 
-Each method answers the command of its name in ``trompe_shared.sailenv.COMMANDS`` with the values of the reply. It
-refuses with a ``TrompeError`` whose message becomes the reason.
+Each method answers the command of its name in ``trompe_shared.sailenv.COMMANDS`` with the values of the reply, if any.
+It refuses with a ``TrompeError`` whose message becomes the reason.
 """
 
 from collections.abc import Mapping
@@ -80,21 +80,15 @@ class Session(LightCommands, ObjectCommands):
         reason, self._error = self._error, ""
         return (reason,)
 
-    def change_scene(self, *, scene: str) -> tuple[()]:
+    def change_scene(self, *, scene: str) -> None:
         setup = scene_named(scene)
         self._load(setup)
         self._position, self._rotation = setup.position, setup.rotation
-        return ()
 
     def load_scenario(self, *, scenario: Mapping[str, Any]) -> tuple[str, ...]:
         """Load a scene and spawn objects; the camera stays. Answers an id for each object, "" for a refused one."""
-        try:
-            script = read_scenario(scenario)
-            scene = scene_named(script.scene)
-        except TrompeError as error:
-            self._refusals.append(str(error))
-            return ("",) * len(scenario["objects"])
-        self._load(scene)
+        script = read_scenario(scenario)
+        self._load(scene_named(script.scene))
         if script.frustum_far is not None:
             self._set_frustum(script.frustum_far)
         return tuple(map(self._enter, script.objects))
@@ -108,10 +102,9 @@ class Session(LightCommands, ObjectCommands):
             self._refusals.append(str(error))
             return ""
 
-    def spawn_view_frustum(self) -> tuple[()]:
+    def spawn_view_frustum(self) -> None:
         """Make moving objects bounce off the camera's present view frustum."""
         self._set_frustum(FRUSTUM_FAR)
-        return ()
 
     def _set_frustum(self, far: float) -> None:
         aspect = self.size[0] / self.size[1]
@@ -122,29 +115,24 @@ class Session(LightCommands, ObjectCommands):
     def get_position(self) -> tuple[Vector]:
         return (self._position,)
 
-    def set_position(self, *, position: Vector) -> tuple[()]:
+    def set_position(self, *, position: Vector) -> None:
         self._position = checked_vector(position, "position")
-        return ()
 
     def get_rotation(self) -> tuple[Vector]:
         return (self._rotation,)
 
-    def set_rotation(self, *, rotation: Vector) -> tuple[()]:
+    def set_rotation(self, *, rotation: Vector) -> None:
         self._rotation = checked_vector(rotation, "rotation")
-        return ()
 
-    def toggle_follow(self) -> tuple[()]:
+    def toggle_follow(self) -> None:
         """No effect: it concerns Unity's window on the screen."""
-        return ()
 
-    def set_clear_color(self, *, color: Ints) -> tuple[()]:
+    def set_clear_color(self, *, color: Ints) -> None:
         """Set the background: a colour, or the sky if any number is negative."""
         self._background = Sky() if min(color) < 0 else unit_color(checked_color(color))
-        return ()
 
     def get_light_type(self, *, light: str) -> tuple[str]:
         return (self._engine.to_text(),) if light == EXTENSIONS else super().get_light_type(light=light)
 
-    def set_noise(self, *, number: int) -> tuple[()]:
+    def set_noise(self, *, number: int) -> None:
         self._noise = number
-        return ()
