@@ -50,9 +50,8 @@ def run(
     Run it again to continue a stopped run: only missing jobs are submitted.
     """
     from trompe_experiments.judged import judge_all
-    from trompe_experiments.progress import experiment_display
+    from trompe_experiments.progress import Tracked, experiment_display
     from trompe_experiments.run import run_experiment
-    from trompe_experiments.tracking import Tracked
 
     started, plan = monotonic(), plan_experiment(load_experiment(file))
     folder = out or Path("experiments") / plan.experiment.name

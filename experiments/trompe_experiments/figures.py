@@ -9,9 +9,8 @@ from trompe_experiments.between import between_chart, between_markdown
 from trompe_experiments.engines import engines_chart, engines_markdown
 from trompe_experiments.histograms import prediction_histograms
 from trompe_experiments.judged import JUDGEMENTS, JudgedRow
-from trompe_experiments.paper import paper_means_markdown, table_one_chart, table_one_markdown
+from trompe_experiments.paper import paper_means_markdown, table_one_chart, table_one_markdown, texels_scatter
 from trompe_experiments.pareto import pareto_markdown, speed_accuracy_chart
-from trompe_experiments.scatter import texels_scatter
 from trompe_experiments.stability.chart import stability_chart, stability_markdown
 from trompe_experiments.style import Drawing, stamp_of
 from trompe_experiments.surrogates import surrogates_chart, surrogates_markdown, surrogates_of

@@ -1,16 +1,17 @@
-"""Progress display of an experiment: a bar for all jobs, a line for each running one."""
+"""Display of an experiment's progress, a bar for all jobs and a line for each running one, and its log to a tracker."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
+from trompe_client.tracking import Run
 from trompe_experiments.about import in_words
 from trompe_experiments.plan import Row
 from trompe_experiments.run import Finished, Show
-from trompe_shared.api import Job, JobState
+from trompe_shared.api import Job, JobSpec, JobState
 
 
 @contextmanager
@@ -66,6 +67,31 @@ class _Display:
             return ""
         each = (time.monotonic() - self.started) / (self.done - self.before)
         return f"about {in_words(each * (self.total - self.done))} left"
+
+
+class Tracked:
+    """A display whose jobs are runs of a tracker too. Finished jobs of an earlier run are not logged again."""
+
+    def __init__(self, display: Show, new_run: Callable[[str, JobSpec], Run]) -> None:
+        self._display, self._new_run, self._runs = display, new_run, dict[str, Run]()
+
+    def begin(self, *, total: int, done: int) -> None:
+        self._display.begin(total=total, done=done)
+
+    def look(self, row: Row, job: Job) -> None:
+        self._run(row).progress(job.progress)
+        self._display.look(row, job)
+
+    def end(self, row: Row, finished: Finished) -> None:
+        self._run(row).end(finished.result)
+        del self._runs[row.key]
+        self._display.end(row, finished)
+
+    def _run(self, row: Row) -> Run:
+        if row.key not in self._runs:
+            name = "  ".join(filter(None, (row.place.experiment, row.object, row.place.configuration)))
+            self._runs[row.key] = self._new_run(name, row.request)
+        return self._runs[row.key]
 
 
 def _named(row: Row) -> str:

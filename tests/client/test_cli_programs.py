@@ -13,8 +13,7 @@ from click.testing import CliRunner
 from tests.client.conftest import FakeServer, trompe
 from trompe_client import Client
 from trompe_client.cli import main
-from trompe_client.cli.exits import EXITS
-from trompe_client.cli.group import EXTENSIONS, OWN
+from trompe_client.cli.group import EXITS, EXTENSIONS, OWN
 from trompe_shared.api import Job, JobRequest, JobState, Priority
 from trompe_shared.api import Result as JobResult
 

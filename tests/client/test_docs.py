@@ -20,8 +20,7 @@ from tests.client.conftest import FakeServer, zipped
 from tests.documentation import DOCS, blocks
 from trompe_client._embedded import embedded_server
 from trompe_client.cli import main
-from trompe_client.cli.exits import EXITS
-from trompe_client.cli.group import OWN
+from trompe_client.cli.group import EXITS, OWN
 
 QUICKSTART = {heading: code for language in ("python", "sh") for heading, code in blocks("quickstart.md", language)}
 

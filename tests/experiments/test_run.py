@@ -31,11 +31,10 @@ from trompe_experiments import (
 from trompe_experiments.about import ABOUT, estimated_seconds, write_about
 from trompe_experiments.cli import experiment
 from trompe_experiments.plan import Row
-from trompe_experiments.progress import experiment_display
+from trompe_experiments.progress import Tracked, experiment_display
 from trompe_experiments.service import Service
 from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, RowId, read_table
 from trompe_experiments.terminal import compared, differences, failures, read_results
-from trompe_experiments.tracking import Tracked
 from trompe_server.api.examples import RESULT as EXAMPLE
 from trompe_shared.api import Job, JobRequest, JobSpec, JobState, Problem, Progress, Result
 from trompe_shared.errors import SpecError

@@ -1,17 +1,22 @@
 """Follow a job to its end and deliver its results."""
 
+import os
+import shutil
+import tempfile
 import time
+import zipfile
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import click
 
-from trompe_client._delivery import in_the_form_of
+from trompe_client._errors import ContractError
 from trompe_client._job import JobHandle
 from trompe_client._progress import Progress, Show, shown
 from trompe_client.cli.output import as_json, console, print_json, say
-from trompe_shared.api import Event, JobState, JudgementSpec, in_flags
+from trompe_shared.api import ADVERSARIAL, Event, JobState, JudgementSpec, in_flags
 from trompe_shared.errors import TrompeError
+from trompe_shared.local_files import SPLIT_SUFFIXES
 
 
 def follow(
@@ -67,7 +72,7 @@ def deliver(
         say({"job": job.status, "manifest": manifest}, lambda: judgement_report(manifest, files))
         return
     if source is not None:
-        files = [in_the_form_of(source, file) for file in files]
+        files = [_in_the_form_of(source, file) for file in files]
     result = job.result()
     if as_json():
         print_json({"job": job.status, "result": result, "files": [str(file) for file in files]}, indent=2)
@@ -80,3 +85,34 @@ def deliver(
     screen.print(result_report(result, note=note, seconds=spent(result, job.status, start_up=start_up, wall=wall)))
     if files:
         screen.print("written:", *(f"  {file}" for file in files), sep="\n")
+
+
+def _in_the_form_of(source: str, file: Path) -> Path:
+    """Unpack the zip with the repainted object if ``source`` is a folder or a model with files beside it.
+
+    Returns the folder; any other file stays as it is.
+    """
+    given = Path(source)
+    if not (file.name.endswith(f"{ADVERSARIAL}.zip") and (given.is_dir() or given.suffix.lower() in SPLIT_SUFFIXES)):
+        return file
+    folder = file.with_suffix("")
+    _unpack(file, folder)
+    file.unlink()
+    return folder
+
+
+def _unpack(archive: Path, folder: Path) -> None:
+    """Unpack a flat zip, and replace ``folder`` by it once it is complete."""
+    with tempfile.TemporaryDirectory(dir=archive.parent, prefix=".unpacking-") as scratch:
+        fresh = Path(scratch, "object")
+        fresh.mkdir()
+        with zipfile.ZipFile(archive) as members:
+            for info in members.infolist():
+                if PurePosixPath(info.filename).name != info.filename:
+                    raise ContractError(
+                        f"{archive.name} should be a flat zip, but holds {info.filename!r}; not unpacked."
+                    )
+                (fresh / info.filename).write_bytes(members.read(info))
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.replace(fresh, folder)

@@ -5,9 +5,9 @@ from typing import Any, Final
 
 import click
 
-from trompe_client.cli.exits import EXITS, INTERRUPTED, exit_code
+from trompe_client import _errors as errors
 from trompe_client.cli.output import show_error
-from trompe_shared.errors import TrompeError
+from trompe_shared.errors import ClassifierError, LabelError, ObjectError, SpecError, TrompeError
 
 COMMANDS_GROUP: Final = "trompe.commands"
 
@@ -27,7 +27,6 @@ OWN: Final = {
 }
 """Commands of this package, and their modules."""
 
-
 EXTENSIONS: Final = {
     "serve": "Run the service: API, attack worker and renderer.",
     "worker": "Run an additional attack worker.",
@@ -46,6 +45,32 @@ EXTRAS: Final = dict.fromkeys(EXTENSIONS, "server") | {
     "judge": "server",
 }
 """Extra that installs each of them, and of an own command without a server."""
+
+INTERRUPTED: Final = 130
+
+EXITS: Final = {
+    0: "success; n.a. is a success too",
+    1: "any other error; `doctor` found a fault",
+    2: "invalid options or files",
+    3: "no server answers",
+    4: "refused: missing or wrong token, or missing right; or too many requests",
+    5: "no such job, object, classifier or file, or not possible in its state",
+    6: "the job failed",
+    7: "the job was cancelled",
+    8: "--timeout is over; the job continues",
+    INTERRUPTED: "interrupted by Ctrl-C; a job on a server continues",
+}
+"""Exit codes, listed by ``trompe --help`` and docs/cli.md."""
+
+_CODES: Final[dict[int, tuple[type[Exception], ...]]] = {
+    2: (SpecError, ObjectError, ClassifierError, LabelError, errors.BadRequest),
+    3: (errors.ServerUnreachable, errors.EmbeddedServerError),
+    4: (errors.Unauthorized, errors.Forbidden, errors.TooMany),
+    5: (errors.NotFound, errors.Conflict),
+    6: (errors.JobFailed,),
+    7: (errors.JobCancelled,),
+    8: (errors.WaitTimeout,),
+}
 
 
 class _Trompe(click.Group):
@@ -94,8 +119,13 @@ class _Trompe(click.Group):
                 raise
             raise _missing_extra(ctx.invoked_subcommand, error) from error
         except (TrompeError, OSError) as error:
-            show_error(ctx, error, code=exit_code(error), flags=ctx.invoked_subcommand in OWN)
-            ctx.exit(exit_code(error))
+            show_error(ctx, error, code=_exit_code(error), flags=ctx.invoked_subcommand in OWN)
+            ctx.exit(_exit_code(error))
+
+
+def _exit_code(error: Exception) -> int:
+    """Exit code of an error."""
+    return next((code for code, kinds in _CODES.items() if isinstance(error, kinds)), 1)
 
 
 def _load_extension(name: str) -> click.Command:

@@ -1,8 +1,7 @@
 """The HTTP contract between client and server. Needs pydantic alone.
 
 ``jobs`` (what an attack asks for), ``judgements`` (what a judgement does), ``results`` (``result.json``), ``manifest``
-(``judgement.json``), ``stored`` (objects, classifiers, backgrounds),
-``service`` (the record of jobs, workers, problems).
+(``judgement.json``), ``service`` (the record of jobs, stored things, workers, problems).
 """
 
 from trompe_shared.api.jobs import (
@@ -62,17 +61,19 @@ from trompe_shared.api.results import (
     Visibility,
 )
 from trompe_shared.api.service import (
+    BackgroundInfo,
+    ClassifierInfo,
     Event,
     ExperimentInfo,
     Job,
     JobList,
     JobState,
+    ObjectInfo,
     Problem,
     Progress,
     RendererInfo,
     WorkerInfo,
 )
-from trompe_shared.api.stored import BackgroundInfo, ClassifierInfo, ObjectInfo
 
 __all__ = [
     "ADVERSARIAL",

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from trompe_renderer.engines.engine import GBuffer
 from trompe_renderer.engines.pyrender.gbuffer import DrawCall, GBufferPass
 from trompe_renderer.engines.pyrender.gpu_cache import GpuCache
-from trompe_renderer.engines.pyrender.options import PyrenderOptions
-from trompe_renderer.engines.pyrender.passes import ObjectRenderer
+from trompe_renderer.engines.pyrender.passes import ObjectRenderer, PyrenderOptions
 from trompe_renderer.engines.pyrender.platform import create_context, pyrender
 from trompe_renderer.engines.surfaces import clipping_planes
 from trompe_renderer.world.lights import WorldLight

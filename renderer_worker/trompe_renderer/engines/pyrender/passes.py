@@ -7,14 +7,15 @@
 - Only colour is read back, not depth.
 """
 
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
 
 import numpy as np
+from click import IntRange
 from numpy.typing import NDArray
 from PIL import Image
 
 from trompe_renderer.engines.pyrender.blending import BlendedPrimitive, back_to_front
-from trompe_renderer.engines.pyrender.options import PyrenderOptions
 from trompe_renderer.engines.pyrender.platform import GL, MAX_ANISOTROPY, pyrender
 from trompe_renderer.engines.pyrender.shaders import framebuffer, renderbuffer
 from trompe_renderer.engines.pyrender.sky import SkyPass
@@ -25,6 +26,17 @@ from trompe_shared.opacity import CUTOFF
 SLOPE_BIAS: Final = 5.0
 """Twice the reach of the shader's filter, 2.5 texels: OpenGL takes the slope of the steeper axis only."""
 CONSTANT_BIAS: Final = 8.0
+
+
+@dataclass(frozen=True)
+class PyrenderOptions:
+    """docs/worker.md lists effects and costs. ``anisotropy``: longest footprint of texture filters, as a ratio."""
+
+    shadows: bool = True
+    shadow_map: Annotated[int, IntRange(64, 16384)] = 1024
+    msaa: Annotated[int, IntRange(1, 32)] = 4
+    supersample: Annotated[int, IntRange(1, 4)] = 1
+    anisotropy: Annotated[int, IntRange(1, 16)] = 1
 
 
 class ObjectRenderer(pyrender.Renderer):  # type: ignore[misc]
