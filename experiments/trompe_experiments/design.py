@@ -26,7 +26,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from trompe_shared.api import OPTIONS
 from trompe_shared.errors import SpecError
 from trompe_shared.faults import Fault, faults_of
-from trompe_shared.presets import PRESETS
+from trompe_shared.presets import with_preset
 
 ELSEWHERE: Final = {"object": "list objects under `objects`", "seed": "list seeds under `seeds`"}
 """Options of a job that a file sets in another place."""
@@ -58,11 +58,7 @@ def _number(value: Any) -> Any:
 
 
 def _base(options: Options) -> Options:
-    """Replace ``preset`` by its options; explicit ones override them."""
-    preset = options.pop("preset", None)
-    if preset is not None and preset not in PRESETS:
-        raise ValueError(f"unknown preset {preset!r}; presets: {', '.join(PRESETS)}")
-    return _known((dict(PRESETS[preset].options) if preset else {}) | options)
+    return _known(with_preset(options))
 
 
 def _case(options: Options) -> Options:
@@ -87,6 +83,8 @@ def _grid(options: Options) -> Options:
     for name, values in options.items():
         if not isinstance(values, list) or not values:
             raise ValueError(f"{name!r} must be a list of values; got {values!r}")
+    for preset in options.get("preset", []):
+        with_preset({"preset": preset})
     return known | {name: options[name] for name in options if name == "preset"}
 
 

@@ -13,7 +13,7 @@ from trompe_experiments.table import RowId, job_key
 from trompe_shared.api import JobRequest
 from trompe_shared.errors import ObjectError, SpecError
 from trompe_shared.local_files import CLASSIFIER_SUFFIXES, PICTURE_SUFFIXES
-from trompe_shared.presets import PRESETS
+from trompe_shared.presets import with_preset
 from trompe_shared.shipped import shipped_objects
 
 LABEL, CASE = "experiment", "case"
@@ -72,19 +72,10 @@ def plan_experiment(experiment: Experiment) -> Plan:
         for name, chosen, (case, variation) in product(objects, combinations, cases.items()):
             configuration = ", ".join([*([case] if case else []), *(f"{k} {_word(v)}" for k, v in chosen.items())])
             place = RowId(experiment=experiment.name, key="", series=series, case=case, configuration=configuration)
-            options = dict(experiment.base) | objects[name] | _with_preset(chosen) | dict(variation)
+            options = dict(experiment.base) | objects[name] | with_preset(chosen) | dict(variation)
             seeds = options.pop("seeds", experiment.seeds)
             rows += [_row(place, name, options | {"seed": seed}, files) for seed in seeds]
     return Plan(experiment, tuple(rows))
-
-
-def _with_preset(chosen: Options) -> dict[str, Any]:
-    """A combination with its preset replaced by options; the others override them."""
-    preset = chosen.get("preset")
-    if preset is not None and preset not in PRESETS:
-        raise SpecError(f"Unknown preset {preset!r}; presets: {', '.join(PRESETS)}.")
-    own = {name: value for name, value in chosen.items() if name != "preset"}
-    return (dict(PRESETS[preset].options) if preset else {}) | own
 
 
 def _word(value: Any) -> str:

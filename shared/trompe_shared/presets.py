@@ -5,7 +5,6 @@ Measured in docs/experiments.md by ``trompe experiment run speed_accuracy``.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, Final
 
 
@@ -17,14 +16,20 @@ class Preset:
     options: Mapping[str, Any]
 
 
-def _preset(help: str, **options: Any) -> Preset:
-    return Preset(help, MappingProxyType(options))
+PRESETS: Final[Mapping[str, Preset]] = {
+    "fast": Preset("a first look with few random views and few steps", {"pool": 60, "steps": 25, "held_out": 30}),
+    "balanced": Preset("effective on unseen cameras and lights too", {"pool": 240, "steps": 90, "held_out": 60}),
+    "best": Preset("strongest attack, at any cost", {"pool": 960, "steps": 300, "held_out": 200}),
+}
 
 
-PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
-    {
-        "fast": _preset("a first look with few random views and few steps", pool=60, steps=25, held_out=30),
-        "balanced": _preset("effective on unseen cameras and lights too", pool=240, steps=90, held_out=60),
-        "best": _preset("strongest attack, at any cost", pool=960, steps=300, held_out=200),
-    }
-)
+def with_preset(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options with ``preset`` replaced by those of the preset; the others override them.
+
+    Raises ``ValueError`` for an unknown preset.
+    """
+    preset = options.get("preset")
+    if preset is not None and preset not in PRESETS:
+        raise ValueError(f"unknown preset {preset!r}; presets: {', '.join(PRESETS)}")
+    others = {name: value for name, value in options.items() if name != "preset"}
+    return (dict(PRESETS[preset].options) if preset else {}) | others

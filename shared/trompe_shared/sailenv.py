@@ -14,7 +14,6 @@ import json
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any, Final, Protocol
 
 from trompe_shared.errors import ProtocolError, RendererError
@@ -39,9 +38,7 @@ MAIN_LIGHT: Final = "Main Light"
 RIM_LIGHT: Final = "Rim Light"
 LIGHT_NOT_FOUND: Final = "light_not_found"
 
-VIEW_FLAGS: Final[Mapping[str, int]] = MappingProxyType(
-    {"main": 1, "category": 4, "object": 8, "optical": 16, "depth": 32}
-)
+VIEW_FLAGS: Final[Mapping[str, int]] = {"main": 1, "category": 4, "object": 8, "optical": 16, "depth": 32}
 """Bit of each view in FRAME's flags, in the order of the reply."""
 
 Reader = Callable[[int], bytes]
@@ -375,7 +372,7 @@ _ROWS: Final = (
     _status(0xE3, "set_noise", {"number": _UNSIGNED}),
 )
 
-COMMANDS: Final[Mapping[str, Command]] = MappingProxyType({row.name: row for row in _ROWS})
+COMMANDS: Final[Mapping[str, Command]] = {row.name: row for row in _ROWS}
 """All commands by name."""
 
 _BY_CODE: Final = {row.code: row for row in _ROWS}
