@@ -59,7 +59,7 @@ class Mesh:
     ) -> None:
         """A box between two corners, closed or with only some of its sides."""
         center, half = (np.array(low) + high) / 2, (np.array(high) - low) / 2
-        for normal, up in (FACES[side] for side in sides):
+        for normal, up, _ in (FACES[side] for side in sides):
             across = np.cross(up, normal)
             self.rectangle(material, center + half * normal, half * across, half * np.array(up))
 

@@ -13,8 +13,6 @@ from PIL import Image
 from objects.mesh import Patch, Texels
 from trompe_shared.object3d import pack_zip
 
-__all__ = ["SIDE", "archive"]
-
 SIDE: Final = 512
 """Width and height of every texture, texels."""
 MARGIN: Final = 2

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from objects.brushes import clouds, cover, mix, noise, rgb, smooth, wood, woven
 from objects.mesh import Coat, Paint, Patch, Texels, Warp, bevelled_box, cap, curve, moved, revolve
 
-__all__ = ["chair", "lamp", "table"]
-
 Array = NDArray[np.float64]
 Materials = Mapping[str, Sequence[Patch]]
 

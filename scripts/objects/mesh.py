@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Coat", "Paint", "Patch", "Texels", "bevelled_box", "cap", "curve", "moved", "revolve", "sheet", "tube"]
+from trompe_renderer.check.probes import FACES
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -190,16 +190,6 @@ def tube(
     return sheet(path[:, None] + offset, paint, density=density)
 
 
-_FACES = {
-    "right": ((0, 0, -1), (0, 1, 0)),
-    "left": ((0, 0, 1), (0, 1, 0)),
-    "top": ((1, 0, 0), (0, 0, -1)),
-    "bottom": ((1, 0, 0), (0, 0, 1)),
-    "front": ((1, 0, 0), (0, 1, 0)),
-    "back": ((-1, 0, 0), (0, 1, 0)),
-}
-
-
 def bevelled_box(
     size: Sequence[float],
     paint: Paint,
@@ -215,10 +205,10 @@ def bevelled_box(
     """
     half = np.asarray(size, dtype=np.float64) / 2
     faces = {}
-    for name, axes in _FACES.items():
-        right, up = (np.asarray(axis, dtype=np.float64) for axis in axes)
+    for name, (normal, upwards, _) in FACES.items():
+        out, up = (np.asarray(axis, dtype=np.float64) for axis in (normal, upwards))
+        right = np.cross(up, out)
         s, t = (_knots(float(abs(axis) @ half), bevel, int(abs(axis) @ np.asarray(cuts))) for axis in (right, up))
-        out = np.cross(right, up)
         grid = s[None, :, None] * right + t[:, None, None] * up + float(abs(out) @ half) * out
         edge = (
             np.isin(np.arange(len(s)), [0, len(s) - 1])[None, :],

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from objects.brushes import clouds, cover, letters, mix, noise, rgb, smooth, star
 from objects.mesh import Coat, Patch, Texels, cap, curve, revolve, tube
 
-__all__ = ["bottle", "mug", "teapot"]
-
 Array = NDArray[np.float64]
 Materials = Mapping[str, Sequence[Patch]]
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from objects.brushes import clouds, cover, letters, mix, noise, rgb, smooth, star
 from objects.mesh import Coat, Paint, Patch, Texels, bevelled_box, sheet
 
-__all__ = ["ball", "book"]
-
 Array = NDArray[np.float64]
 Materials = Mapping[str, Sequence[Patch]]
 

@@ -287,12 +287,8 @@ class _Connection:
             return "It gave no reason."
 
     def _read(self, count: int) -> bytes:
-        data = bytearray()
-        while len(data) < count:
-            part = self._socket.recv(min(count - len(data), 2**20))
-            if not part:
-                raise EOFError("it closed the connection")
-            data += part
+        data = bytearray(count)
+        self._read_into(memoryview(data))
         return bytes(data)
 
     def _read_into(self, room: memoryview) -> None:

@@ -13,24 +13,17 @@ from trompe_shared.wavefront import Part, obj_text
 
 TEXTURE: Final = "paint.png"
 """The only texture of all probes but the cube."""
-FACES: Final[Mapping[str, tuple[tuple[int, int, int], tuple[int, int, int]]]] = {
-    "right": ((1, 0, 0), (0, 1, 0)),
-    "left": ((-1, 0, 0), (0, 1, 0)),
-    "top": ((0, 1, 0), (0, 0, -1)),
-    "bottom": ((0, -1, 0), (0, 0, 1)),
-    "front": ((0, 0, 1), (0, 1, 0)),
-    "back": ((0, 0, -1), (0, 1, 0)),
+Triple = tuple[int, int, int]
+FACES: Final[Mapping[str, tuple[Triple, Triple, Triple]]] = {
+    "right": ((1, 0, 0), (0, 1, 0), (230, 25, 25)),
+    "left": ((-1, 0, 0), (0, 1, 0), (25, 230, 230)),
+    "top": ((0, 1, 0), (0, 0, -1), (25, 230, 25)),
+    "bottom": ((0, -1, 0), (0, 0, 1), (230, 25, 230)),
+    "front": ((0, 0, 1), (0, 1, 0), (25, 25, 230)),
+    "back": ((0, 0, -1), (0, 1, 0), (230, 230, 25)),
 }
-"""Outward normal of each face of the cube, and the direction in which v grows."""
-COLOURS: Final = {
-    "right": (230, 25, 25),
-    "left": (25, 230, 230),
-    "top": (25, 230, 25),
-    "bottom": (230, 25, 230),
-    "front": (25, 25, 230),
-    "back": (230, 230, 25),
-}
-"""Opposite faces have complementary colours."""
+"""Outward normal of each face of the cube, the direction in which v grows, and its colour: complementary ones opposite
+each other."""
 RINGS: Final = (1.0, 0.8, 0.65, 0.5, 0.35)
 """sRGB levels of the chart's rings, all equally wide, from the middle outwards."""
 
@@ -44,8 +37,8 @@ def plain(*colour: int) -> Colours:
 
 def cube(half: float) -> Object3D:
     """A cube with a colour, a texture and a material for each face. ``half`` of an edge, metres."""
-    parts = [_face(normal, up, half, name) for name, (normal, up) in FACES.items()]
-    return _object(parts, {f"{name}.png": plain(*colour) for name, colour in COLOURS.items()})
+    parts = [_face(normal, up, half, name) for name, (normal, up, _) in FACES.items()]
+    return _object(parts, {f"{name}.png": plain(*colour) for name, (_, _, colour) in FACES.items()})
 
 
 def plate(half: float, texture: Colours) -> Object3D:
@@ -66,7 +59,7 @@ def disc(radius: float, texture: Colours, *, corners: int = 90) -> Object3D:
 
 def ball(radius: float, texture: Colours, *, middle: float = 0.0) -> Object3D:
     """A smooth sphere: a cube of finely divided faces, blown up. ``middle``: its x, metres."""
-    faces = [_face(normal, up, 1.0, "paint", steps=8) for normal, up in FACES.values()]
+    faces = [_face(normal, up, 1.0, "paint", steps=8) for normal, up, _ in FACES.values()]
     points = np.concatenate([each.vertices for each in faces])
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     triangles = [each.faces + k * len(each.vertices) for k, each in enumerate(faces)]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from trompe_renderer.check.findings import FINAL, Finding, fault, ok, warning
 from trompe_renderer.check.measures import Blob, blob, border, level, median, patterns, positions
-from trompe_renderer.check.probes import COLOURS, FACES, RINGS, TEXTURE, ball, chart, cube, disc, plain, plate
+from trompe_renderer.check.probes import FACES, RINGS, TEXTURE, ball, chart, cube, disc, plain, plate
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View, spherical
 from trompe_shared.object3d import Object3D
@@ -226,13 +226,13 @@ def _expected(view: View, flips: tuple[int, int] = FLIPS[0]) -> Seen:
     matrix, grid = view.camera.world_to_camera(), np.linspace(-0.9, 0.9, 7)
     a, b = (each.reshape(-1, 1) for each in np.meshgrid(grid, grid))
     found = {}
-    for name, (normal, up) in FACES.items():
+    for normal, up, colour in FACES.values():
         n, v = np.array(normal), np.array(up)
         if n @ (view.camera.position() - HALF * n) <= 0:
             continue
         x, y, z = matrix[:3, :3] @ (HALF * (n + a * np.cross(v, n) + b * v)).T + matrix[:3, 3:]
         right, down = _pixels(1.0, SQUARE) * np.array([(x / -z).mean(), (y / z).mean()])
-        found[int(patterns(np.array(COLOURS[name])))] = (flips[1] * float(right), flips[0] * float(down))
+        found[int(patterns(np.array(colour)))] = (flips[1] * float(right), flips[0] * float(down))
     return found
 
 
@@ -246,7 +246,7 @@ def _distance(seen: Seen, expected: Seen) -> float:
 
 
 def _named(seen: Seen) -> str:
-    names = {int(patterns(np.array(colour))): name for name, colour in COLOURS.items()}
+    names = {int(patterns(np.array(colour))): name for name, (_, _, colour) in FACES.items()}
     from_left = sorted(seen, key=lambda kind: seen[kind])
     return ", ".join(names[kind] for kind in from_left) or "no face"
 
