@@ -184,29 +184,21 @@ def stability(out: Path, objects: tuple[str, ...], seeds: int, only: str, retry_
 
 @experiment.command("export-variants")
 @out_option(required=True, help="Folder for the variants.")
-@click.option("--object", "objects", multiple=True, help="Shipped object; several times. Default: all.")
-@click.option("--variants", default=2, show_default=True, type=click.IntRange(1), help="Variants of each object.")
+@click.option("--object", "names", multiple=True, help="Shipped object; several times. Default: all.")
+@click.option(
+    "--variants", "per_object", default=2, show_default=True, type=click.IntRange(1), help="Variants of each object."
+)
 @click.option("--epsilon", default=0.05, show_default=True, type=click.FloatRange(0, 1, min_open=True))
 @click.option("--views", default=40, show_default=True, type=click.IntRange(1), help="Pictures of each variant.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
 @server_option(None)
 @token_option
-def export_variants(
-    out: Path,
-    objects: tuple[str, ...],
-    variants: int,
-    epsilon: float,
-    views: int,
-    seed: int,
-    server: str | None,
-    token: str | None,
-) -> None:
+def export_variants(out: Path, server: str | None, token: str | None, **asked: Any) -> None:
     """Write adversarial variants of shipped objects: archives, and labelled pictures in train and test folders."""
     from trompe_experiments.progress import experiment_display
     from trompe_experiments.variants import export_variants as export
     from trompe_server.renderers import local_renderer
 
-    asked: Any = {"names": objects, "per_object": variants, "epsilon": epsilon, "views": views, "seed": seed}
     with (
         service(server, token) as client,
         local_renderer() as target,

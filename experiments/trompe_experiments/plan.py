@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
-from trompe_client._plan import AttackPlan, Upload, plan_attack, source_of
+from trompe_client._plan import AttackPlan, Read, Upload, plan_attack, source_of
 from trompe_experiments.asset_objects import asset_objects
 from trompe_experiments.design import AssetsFolder, Experiment, expanded
 from trompe_experiments.table import RowId, job_key
@@ -134,23 +135,14 @@ class _Files:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._read: dict[tuple[str, str], Upload | str] = {}
-        self._hashes: dict[Upload, str] = {}
+        self.read: Read = cache(self._read)
+        self.sha256 = cache(Upload.sha256)
 
     def path(self, text: str) -> Path:
         """A path of the experiment's file, relative to its folder."""
         return self._folder / expanded(text)
 
-    def read(self, kind: str, source: str | Path) -> Upload | str:
+    def _read(self, kind: str, source: str | Path) -> Upload | str:
         """See ``trompe_client._plan.Read``. Objects are names unless they are paths."""
-        if (kind, str(source)) not in self._read:
-            is_file = isinstance(source, Path) or kind == "mask" or Path(source).suffix.lower() in FILE_SUFFIXES
-            found = source_of(kind, self.path(str(source))) if is_file else str(source)
-            self._read[kind, str(source)] = found
-        return self._read[kind, str(source)]
-
-    def sha256(self, upload: Upload) -> str:
-        """Hash of a file's bytes."""
-        if upload not in self._hashes:
-            self._hashes[upload] = upload.sha256()
-        return self._hashes[upload]
+        is_file = isinstance(source, Path) or kind == "mask" or Path(source).suffix.lower() in FILE_SUFFIXES
+        return source_of(kind, self.path(str(source))) if is_file else str(source)

@@ -144,17 +144,14 @@ def _named(row: ResultRow) -> str:
 
 
 def _table(data: Data) -> str:
-    head = "".join(f"<th>{name}</th>" for name in COLUMNS)
-    lines = ["".join(f"<td>{_cell(getattr(row, name))}</td>" for name in COLUMNS) for row in data.rows]
-    body = "".join(f"<tr>{line}</tr>" for line in lines)
-    table = f"<table><tr>{head}</tr>{body}</table>"
-    return f"<h2>All rows</h2><details><summary>{len(lines)} rows</summary>{table}</details>"
+    lines = [[_cell(getattr(row, name)) for name in COLUMNS] for row in data.rows]
+    return f"<h2>All rows</h2><details><summary>{len(lines)} rows</summary>{_rows_in_html([COLUMNS, *lines])}</details>"
 
 
 def _cell(value: object) -> str:
     if value is None:
         return "n.a."
-    return f"{value:.3g}" if isinstance(value, float) else html.escape(str(value))
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def _source(data: Data) -> str:
@@ -173,15 +170,15 @@ def _html_table(markdown: str) -> str:
         if not lines[0].startswith("|"):
             parts.append(f"<p>{_bold(block)}</p>")
             continue
-        rows = [cells_of(line) for k, line in enumerate(lines) if k != 1]
-        parts.append(
-            "<table>" + "".join(_html_row(row, "th" if k == 0 else "td") for k, row in enumerate(rows)) + "</table>"
-        )
+        parts.append(_rows_in_html([cells_of(line) for k, line in enumerate(lines) if k != 1]))
     return "".join(parts)
 
 
-def _html_row(cells: Sequence[str], tag: str) -> str:
-    return "<tr>" + "".join(f"<{tag}>{_bold(cell)}</{tag}>" for cell in cells) + "</tr>"
+def _rows_in_html(rows: Sequence[Sequence[str]]) -> str:
+    """A table of ``rows``, of which the first is its head."""
+    tags = ["th", *["td"] * (len(rows) - 1)]
+    lines = ("".join(f"<{t}>{_bold(cell)}</{t}>" for cell in row) for t, row in zip(tags, rows, strict=True))
+    return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
 def _bold(text: str) -> str:

@@ -93,15 +93,15 @@ def run_experiment(plan: Plan, service: Service, folder: Path, *, show: Show, re
 
 
 def _run(plan: Plan, service: Service, folder: Path, show: Show, *, retry_failed: bool) -> Rows:
-    jobs, collected = plan.jobs(), _Collected(folder)
+    jobs, collected = plan.jobs(), folder / "jobs"
     tables = _Tables.of(jobs, folder)
-    known = {key: found for key in jobs if (found := collected.load(key) or tables.finished(key)) is not None}
+    known = {key: found for key in jobs if (found := _kept(collected / key) or tables.finished(key)) is not None}
     missing = [row for key, row in jobs.items() if key not in known or (retry_failed and known[key].failed)]
     show.begin(total=len(jobs), done=len(jobs) - len(missing))
     rows = write_tables(plan, known, folder)
     for row, finished, files in _follow(missing, known, service, plan, show):
         known[row.key] = finished
-        collected.save(row.key, finished, files)
+        _keep(collected / row.key, finished, files)
         rows = write_tables(plan, known, folder)
         show.end(row, finished)
     return rows
@@ -162,35 +162,28 @@ def _fetch(row: Row, job: Job, service: Service, artifacts: list[str]) -> tuple[
     return Finished(state=state, job=job.id, error=note, result=result, predictions=predictions), files
 
 
-class _Collected:
-    """The folder ``jobs``."""
+def _kept(folder: Path) -> Finished | None:
+    """The job in its own ``folder``, if there is one."""
+    try:
+        kept = Finished.model_validate_json((folder / "job.json").read_bytes())
+        if kept.failed:
+            return kept
+        result = Result.model_validate_json((folder / "result.json").read_bytes())
+    except (FileNotFoundError, ValueError):  # missing, or of another version: the job is submitted again
+        return None
+    return kept.model_copy(update={"result": result})
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder / "jobs"
 
-    def load(self, key: str) -> Finished | None:
-        """A kept job."""
-        folder = self._folder / key
-        try:
-            kept = Finished.model_validate_json((folder / "job.json").read_bytes())
-            if kept.failed:
-                return kept
-            result = Result.model_validate_json((folder / "result.json").read_bytes())
-        except (FileNotFoundError, ValueError):  # missing, or of another version: the job is submitted again
-            return None
-        return kept.model_copy(update={"result": result})
-
-    def save(self, key: str, finished: Finished, files: Files) -> None:
-        """Keep a job. ``job.json`` is written last: a folder without it does not count."""
-        folder = self._folder / key
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, data in files.items():
-            (folder / Path(name).name).write_bytes(data)
-        if finished.result is not None:
-            (folder / "result.json").write_text(finished.result.model_dump_json(), "utf-8")
-        partial = folder / ".job.json.part"
-        partial.write_text(finished.model_dump_json(exclude={"result", "row"}), "utf-8")
-        partial.replace(folder / "job.json")
+def _keep(folder: Path, finished: Finished, files: Files) -> None:
+    """Write a job into its own folder, ``job.json`` last: a folder without it does not count."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        (folder / Path(name).name).write_bytes(data)
+    if finished.result is not None:
+        (folder / "result.json").write_text(finished.result.model_dump_json(), "utf-8")
+    partial = folder / ".job.json.part"
+    partial.write_text(finished.model_dump_json(exclude={"result", "row"}), "utf-8")
+    partial.replace(folder / "job.json")
 
 
 @dataclass(frozen=True)
