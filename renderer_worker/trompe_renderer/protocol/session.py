@@ -1,39 +1,59 @@
-"""The state of one agent: scene, camera, background. No sockets, no OpenGL, no clock.
+"""The state of one agent: scene, camera, lights, background. No sockets, no OpenGL, no clock.
 
 Each method answers the command of its name in ``trompe_shared.sailenv.COMMANDS`` with the values of the reply, if any.
 It refuses with a ``TrompeError`` whose message becomes the reason.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 
-from trompe_renderer.protocol.light_commands import LightCommands
 from trompe_renderer.protocol.object_commands import ObjectCommands
 from trompe_renderer.protocol.upload import ModelCache
+from trompe_renderer.world.lights import WorldLight
 from trompe_renderer.world.movement import frustum_walls
 from trompe_renderer.world.objects import ObjectRequest
 from trompe_renderer.world.scenario import read_scenario
 from trompe_renderer.world.scenes import OBJECT_VIEW, SceneSetup, scene_named
 from trompe_renderer.world.snapshot import Background, Matrix, Sky, Snapshot
-from trompe_renderer.world.validation import Ints, Vector, checked_color, checked_vector, unit_color
+from trompe_renderer.world.validation import Ints, Vector, checked_color, checked_number, checked_vector, unit_color
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, TrompeError
 from trompe_shared.geometry import FIELD_OF_VIEW, unity_to_opengl_rotation
-from trompe_shared.sailenv import EXTENSIONS
+from trompe_shared.sailenv import EXTENSIONS, LIGHT_NOT_FOUND
 
 FRUSTUM_NEAR: Final = 0.3
 FRUSTUM_FAR: Final = 15.0
 """Metres; the values in SAILenv's git client."""
 
 
-class Session(LightCommands, ObjectCommands):
+def _checked_direction(value: Vector) -> Vector:
+    direction = checked_vector(value, "direction")
+    if np.linalg.norm(direction) < 1e-6:
+        raise RendererError("A light's direction must not be zero.")
+    return direction
+
+
+def _commands(setting: str, check: Callable[[Any], Any]) -> tuple[Callable[..., tuple[Any]], Callable[..., None]]:
+    """The methods that read and set a field of ``WorldLight``; ``check`` raises ``RendererError``."""
+
+    def get(self: "Session", *, light: str) -> tuple[Any]:
+        return (getattr(self._light(light), setting),)
+
+    def put(self: "Session", *, light: str, **value: Any) -> None:
+        self._lights[light] = replace(self._light(light), **{setting: check(value[setting])})
+
+    return get, put
+
+
+class Session(ObjectCommands):
     """State and answers for one agent, used by one thread. ``size`` is (width, height) of its images, pixels."""
 
     def __init__(self, cache: ModelCache, engine: EngineInfo) -> None:
-        LightCommands.__init__(self)
-        ObjectCommands.__init__(self, cache)
+        super().__init__(cache)
         self.size = (1, 1)
         self._engine = engine
         self._sequence = self._noise = 0
@@ -44,7 +64,7 @@ class Session(LightCommands, ObjectCommands):
     def _load(self, scene: SceneSetup) -> None:
         """Restart in ``scene``; the camera stays."""
         self._sequence += 1
-        self._reset_lights(scene.lights, scene.ambient)
+        self._lights, self._ambient = dict(scene.lights), scene.ambient
         self._reset_objects(scene.static_objects, scene.walls)
         background = scene.background
         self._background: Background = background if isinstance(background, Sky) else unit_color(background)
@@ -131,8 +151,32 @@ class Session(LightCommands, ObjectCommands):
         """Set the background: a colour, or the sky if any number is negative."""
         self._background = Sky() if min(color) < 0 else unit_color(checked_color(color))
 
-    def get_light_type(self, *, light: str) -> tuple[str]:
-        return (self._engine.to_text(),) if light == EXTENSIONS else super().get_light_type(light=light)
-
     def set_noise(self, *, number: int) -> None:
         self._noise = number
+
+    def get_ambient_light_color(self) -> tuple[Ints]:
+        return (self._ambient,)
+
+    def set_ambient_light_color(self, *, color: Ints) -> None:
+        self._ambient = checked_color(color)
+
+    def get_lights_names(self) -> tuple[list[str]]:
+        return (list(self._lights),)
+
+    def get_light_type(self, *, light: str) -> tuple[str]:
+        return (self._engine.to_text() if light == EXTENSIONS else self._light(light).kind,)
+
+    get_light_color, set_light_color = _commands("color", checked_color)
+    get_light_intensity, set_light_intensity = _commands(
+        "intensity", partial(checked_number, what="light's intensity", low=0.0)
+    )
+    get_light_indirect_multiplier, set_light_indirect_multiplier = _commands(
+        "multiplier", partial(checked_number, what="light's indirect multiplier", low=0.0)
+    )
+    get_light_position, set_light_position = _commands("position", partial(checked_vector, what="position"))
+    get_light_direction, set_light_direction = _commands("direction", _checked_direction)
+
+    def _light(self, name: str) -> WorldLight:
+        if name not in self._lights:
+            raise RendererError(f"{LIGHT_NOT_FOUND}: there is no light {name!r}; choose one of {list(self._lights)}.")
+        return self._lights[name]
