@@ -98,37 +98,31 @@ class _ClientText:
         return text
 
 
-@dataclass(frozen=True)
 class _ServerText:
     """Text from a server: an int with the number of BYTES, then UTF-8."""
 
-    limit: int = MAX_TEXT
-
     def pack(self, value: str) -> bytes:
         data = _utf8(value)
-        return _INT.pack(_within(len(data), self.limit, "text")) + data
+        return _INT.pack(_within(len(data), MAX_TEXT, "text")) + data
 
     def take(self, read: Reader) -> str:
-        count = _within(_INT.take(read), self.limit, "text")
+        count = _within(_INT.take(read), MAX_TEXT, "text")
         try:
             return read(count).decode("utf-8")
         except UnicodeDecodeError as error:
             raise ProtocolError(f"A text of {count} bytes is not UTF-8 ({error}).") from error
 
 
-@dataclass(frozen=True)
 class _File:
     """A file from a client: its name, an int with its size, its bytes. The value is ``(name, bytes)``."""
 
-    limit: int = MAX_FILE
-
     def pack(self, value: tuple[str, bytes]) -> bytes:
         name, data = value
-        return _CLIENT_TEXT.pack(name) + _INT.pack(_within(len(data), self.limit, "file")) + data
+        return _CLIENT_TEXT.pack(name) + _INT.pack(_within(len(data), MAX_FILE, "file")) + data
 
     def take(self, read: Reader) -> tuple[str, bytes]:
         name = _CLIENT_TEXT.take(read)
-        return name, read(_within(_INT.take(read), self.limit, "file"))
+        return name, read(_within(_INT.take(read), MAX_FILE, "file"))
 
 
 @dataclass(frozen=True)
@@ -149,7 +143,6 @@ class _List:
         return [row[0] for row in rows] if len(self.kinds) == 1 else rows
 
 
-@dataclass(frozen=True)
 class _Dynamic:
     """An optional movement: a bool, then its type and its description as JSON text. The value is ``None`` or a pair."""
 
@@ -162,7 +155,6 @@ class _Dynamic:
         return (_CLIENT_TEXT.take(read), _JSON.take(read)) if _BOOL.take(read) else None
 
 
-@dataclass(frozen=True)
 class _Scenario:
     """JSON text of an object with a list "objects", as long as the reply. The value is the object."""
 
@@ -181,7 +173,6 @@ class _Scenario:
         return value
 
 
-@dataclass(frozen=True)
 class _Pixels:
     """An 8-bit RGB picture. The value is (height, width, rows), top row first."""
 
@@ -196,7 +187,6 @@ class _Pixels:
         return height, width, read(height * width * 3)
 
 
-@dataclass(frozen=True)
 class _Changes:
     """Commands whose reply is a status alone, each a code byte and its fields. The value is (name, fields) pairs."""
 

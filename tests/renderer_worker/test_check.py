@@ -21,9 +21,8 @@ from trompe_renderer.check import REMEDIES, EngineRender, check, questions
 from trompe_renderer.command import render
 from trompe_renderer.engines.engine import Engine, noise_seed
 from trompe_renderer.engines.pyrender import PyrenderEngine, PyrenderOptions
-from trompe_renderer.world.lights import WorldLight
 from trompe_renderer.world.model import model_of
-from trompe_renderer.world.snapshot import Instance, Snapshot
+from trompe_renderer.world.snapshot import Instance, Snapshot, WorldLight
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import look_rotation
 from trompe_shared.sailenv_client import SailenvTarget

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trompe_renderer.engines.pyrender import PyrenderEngine, PyrenderOptions
-from trompe_renderer.world.lights import WorldLight
-from trompe_renderer.world.snapshot import Matrix, Snapshot
+from trompe_renderer.world.snapshot import Matrix, Snapshot, WorldLight
 from trompe_server.image_pipelines import ImagePipeline
 from trompe_server.renderers import SailenvTarget, local_renderer
 from trompe_shared.geometry import FIELD_OF_VIEW, look_rotation

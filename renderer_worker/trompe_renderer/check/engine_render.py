@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_renderer.engines.engine import Engine, draw
-from trompe_renderer.world.lights import WorldLight
 from trompe_renderer.world.model import HashedModel, model_of, repainted
-from trompe_renderer.world.snapshot import Instance, Snapshot
+from trompe_renderer.world.snapshot import Instance, Snapshot, WorldLight
 from trompe_renderer.world.validation import unit_color
 from trompe_shared.geometry import View, light_travel_direction
 from trompe_shared.object3d import Object3D

@@ -17,8 +17,7 @@ from trompe_renderer.engines.surfaces import (
     linear_light,
     surfaces_of,
 )
-from trompe_renderer.world.lights import WorldLight
-from trompe_renderer.world.snapshot import Matrix, Sky, Snapshot
+from trompe_renderer.world.snapshot import Matrix, Sky, Snapshot, WorldLight
 from trompe_renderer.world.validation import unit_color
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError

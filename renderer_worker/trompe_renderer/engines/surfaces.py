@@ -9,9 +9,8 @@ from typing import Any, Final, Generic, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_renderer.world.lights import WorldLight
 from trompe_renderer.world.model import HashedModel, content_key
-from trompe_renderer.world.snapshot import Matrix, Sky, Snapshot
+from trompe_renderer.world.snapshot import Matrix, Sky, Snapshot, WorldLight
 from trompe_shared.geometry import FIELD_OF_VIEW
 from trompe_shared.object3d import Material, Part, decode_rgb, open_image
 from trompe_shared.opacity import opacity_of

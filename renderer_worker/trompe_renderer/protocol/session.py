@@ -13,12 +13,11 @@ import numpy as np
 
 from trompe_renderer.protocol.object_commands import ObjectCommands
 from trompe_renderer.protocol.upload import ModelCache
-from trompe_renderer.world.lights import WorldLight
 from trompe_renderer.world.movement import frustum_walls
 from trompe_renderer.world.objects import ObjectRequest
 from trompe_renderer.world.scenario import read_scenario
 from trompe_renderer.world.scenes import OBJECT_VIEW, SceneSetup, scene_named
-from trompe_renderer.world.snapshot import Background, Matrix, Sky, Snapshot
+from trompe_renderer.world.snapshot import Background, Matrix, Sky, Snapshot, WorldLight
 from trompe_renderer.world.validation import Ints, Vector, checked_color, checked_number, checked_vector, unit_color
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, TrompeError

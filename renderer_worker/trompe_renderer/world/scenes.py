@@ -11,11 +11,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from trompe_renderer.world.lights import WorldLight
 from trompe_renderer.world.model import HashedModel, model_of
 from trompe_renderer.world.movement import NO_WALLS, Pose, Walls, room_walls
 from trompe_renderer.world.objects import WorldObject
-from trompe_renderer.world.snapshot import Sky
+from trompe_renderer.world.snapshot import Sky, WorldLight
 from trompe_renderer.world.validation import WHITE, Ints, Vector
 from trompe_shared.errors import RendererError
 from trompe_shared.geometry import Light

@@ -1,12 +1,14 @@
 """A snapshot of the world: objects, lights and camera of one picture. Values only."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_renderer.world.lights import WorldLight
 from trompe_renderer.world.model import HashedModel
+from trompe_renderer.world.validation import WHITE, Ints, Vector, checked_vector
+from trompe_shared.geometry import Light, light_travel_direction
 
 Matrix = NDArray[np.float64]
 Color = tuple[float, float, float]
@@ -23,6 +25,28 @@ class Instance:
     pose: Matrix
     number: int
     category: int
+
+
+@dataclass(frozen=True)
+class WorldLight:
+    """A directional light that travels along ``direction``, or a point light at ``position`` (metres), no shadows.
+
+    At ``intensity`` 1 a white matt surface that faces the light, one metre away from a point light, reflects white. A
+    point light falls with the square of the distance. ``color`` is linear, 0 to 255. The direction of a point light,
+    the position of a directional light and ``multiplier`` (of indirect light) are stored without effect.
+    """
+
+    direction: Vector
+    intensity: float
+    color: Ints = WHITE
+    position: Vector = (0.0, 3.0, 0.0)
+    multiplier: float = 1.0
+    kind: Literal["Directional", "Point"] = "Directional"
+
+    @classmethod
+    def of(cls, light: Light) -> "WorldLight":
+        """White directional light like ``light``."""
+        return cls(checked_vector(light_travel_direction(light).tolist(), "direction"), light.intensity)
 
 
 @dataclass(frozen=True)

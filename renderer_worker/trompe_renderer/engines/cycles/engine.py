@@ -25,8 +25,7 @@ from trompe_renderer.engines.surfaces import (
     surfaces_of,
     without_backs,
 )
-from trompe_renderer.world.lights import WorldLight
-from trompe_renderer.world.snapshot import Snapshot
+from trompe_renderer.world.snapshot import Snapshot, WorldLight
 from trompe_renderer.world.validation import unit_color
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError

@@ -12,8 +12,7 @@ from trompe_renderer.engines.pyrender.gpu_cache import GpuCache
 from trompe_renderer.engines.pyrender.passes import ObjectRenderer, PyrenderOptions
 from trompe_renderer.engines.pyrender.platform import create_context, pyrender
 from trompe_renderer.engines.surfaces import clipping_planes
-from trompe_renderer.world.lights import WorldLight
-from trompe_renderer.world.snapshot import Matrix, Snapshot
+from trompe_renderer.world.snapshot import Matrix, Snapshot, WorldLight
 from trompe_renderer.world.validation import unit_color
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import FIELD_OF_VIEW

@@ -24,8 +24,7 @@ from trompe_renderer.engines.surfaces import (
     surfaces_of,
     towards,
 )
-from trompe_renderer.world.lights import WorldLight
-from trompe_renderer.world.snapshot import Sky, Snapshot
+from trompe_renderer.world.snapshot import Sky, Snapshot, WorldLight
 from trompe_renderer.world.validation import unit_color
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError
