@@ -2,11 +2,12 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from types import UnionType
 from typing import Any, BinaryIO, Generic, Self, TypeVar
 
 from pydantic import ValidationError
@@ -70,12 +71,13 @@ class Plan(Generic[R]):
 
     def uploads(self) -> list[Upload]:
         """Files to send before the request, each once."""
-        found = (each for value in self.options.values() for each in _items(value) if isinstance(each, Upload))
-        return list(dict.fromkeys(found))
+        found: dict[Upload, None] = {}
+        _replaced(self.options, Upload, found.setdefault)
+        return list(found)
 
     def request(self, ids: Mapping[Upload, str]) -> R:
         """The request with ids in place of files; a file without an id keeps its name. Raises ``SpecError``."""
-        return self.make(**_with_ids(self.options, ids))
+        return self.make(**_replaced(self.options, Upload, lambda upload: ids.get(upload, upload.filename)))
 
     def checked(self) -> Self:
         """The plan itself. Raises ``SpecError`` for invalid options."""
@@ -93,12 +95,13 @@ def _job_request(*, object: str, **options: Any) -> JobRequest:
         raise SpecError(f"Invalid options: {'; '.join(map(_by_keyword, faults_of(error)))}.") from error
 
 
-def _with_ids(value: Any, ids: Mapping[Upload, str]) -> Any:
-    if isinstance(value, Upload):
-        return ids.get(value, value.filename)
+def _replaced(value: Any, kind: type | UnionType, by: Callable[[Any], Any]) -> Any:
+    """``value`` with everything of a kind replaced, in nested mappings and lists too."""
+    if isinstance(value, kind):
+        return by(value)
     if isinstance(value, Mapping):
-        return {key: _with_ids(each, ids) for key, each in value.items()}
-    return [_with_ids(each, ids) for each in value] if isinstance(value, list | tuple) else value
+        return {key: _replaced(each, kind, by) for key, each in value.items()}
+    return [_replaced(each, kind, by) for each in value] if isinstance(value, list | tuple | set) else value
 
 
 def _by_keyword(fault: Fault) -> str:
@@ -137,7 +140,7 @@ def plan_attack(object: Source, *, read: Read = source_of, **options: Any) -> At
             planned[keyword] = value
         else:
             several = option.repeated and isinstance(value, str | Path)
-            planned[keyword] = _read_all([value] if several else value, partial(read, option.file))
+            planned[keyword] = _replaced([value] if several else value, str | Path, partial(read, option.file))
     return Plan(planned, _job_request).checked()
 
 
@@ -150,21 +153,6 @@ def plan_judgement(before: Source, after: Source, **options: Any) -> Plan[Judgem
     if "networks" in options:
         planned["networks"] = [classifier_source(each) for each in options["networks"]]
     return Plan(planned, JudgementRequest.of).checked()
-
-
-def _read_all(value: Any, read: Callable[[Source], Upload | str]) -> Any:
-    if isinstance(value, str | Path):
-        return read(value)
-    return {name: read(each) for name, each in value.items()} if isinstance(value, Mapping) else list(map(read, value))
-
-
-def _items(value: Any) -> Iterator[Any]:
-    if isinstance(value, Mapping):
-        yield from value.values()
-    elif isinstance(value, list):
-        yield from value
-    else:
-        yield value
 
 
 def object_source(source: Source) -> Upload | str:
