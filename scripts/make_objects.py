@@ -6,14 +6,12 @@ python scripts/make_objects.py [--out FOLDER] [--only NAME]
 import argparse
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from objects.atlas import archive
 from objects.furniture import chair, lamp, table
-from objects.mesh import Patch
 from objects.tableware import bottle, mug, teapot
 from objects.things import ball, book
 
@@ -24,24 +22,17 @@ FRAMING: Final = 2.1
 """Camera distance in radii: the object fills the picture from every side, as ``framing_distance`` has it."""
 
 
-@dataclass(frozen=True)
-class Kind:
-    """How an object is made, and from which elevations (degrees) it is looked at."""
-
-    make: Callable[[], Mapping[str, Sequence[Patch]]]
-    elevation: tuple[float, float]
-
-
 KINDS: Final = {
-    "ball": Kind(ball, (-30, 60)),
-    "book": Kind(book, (0, 50)),
-    "bottle": Kind(bottle, (-5, 45)),
-    "chair": Kind(chair, (0, 50)),
-    "lamp": Kind(lamp, (-10, 45)),
-    "mug": Kind(mug, (0, 50)),
-    "table": Kind(table, (5, 50)),
-    "teapot": Kind(teapot, (0, 50)),
+    "ball": (ball, (-30, 60)),
+    "book": (book, (0, 50)),
+    "bottle": (bottle, (-5, 45)),
+    "chair": (chair, (0, 50)),
+    "lamp": (lamp, (-10, 45)),
+    "mug": (mug, (0, 50)),
+    "table": (table, (5, 50)),
+    "teapot": (teapot, (0, 50)),
 }
+"""How an object is made, and from which elevations (degrees) it is looked at."""
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -53,10 +44,11 @@ def main(arguments: Sequence[str]) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     rows = {}
     for name in [options.only] if options.only else sorted(KINDS):
-        data = archive(name, KINDS[name].make())
+        make, elevation = KINDS[name]
+        data = archive(name, make())
         (options.out / f"{name}.zip").write_bytes(data)
         distance = round(FRAMING * load_object(data).radius, 3)
-        rows[name] = {"label": name, "distance": distance, "elevation": KINDS[name].elevation}
+        rows[name] = {"label": name, "distance": distance, "elevation": elevation}
         print(f"{name}: {len(data) / 1e3:.0f} kB")
     if not options.only:
         (options.out / "objects.json").write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")

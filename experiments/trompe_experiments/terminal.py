@@ -29,11 +29,7 @@ def read_results(folder: str | Path) -> list[ResultRow]:
 
 def results_table(rows: Sequence[ResultRow]) -> RenderableType:
     """A line for each setting (object, classifier, configuration) with means over seeds; then the mean of all rows."""
-    table = Table()
-    for name in ("object", "classifier", "configuration"):
-        table.add_column(name, overflow="fold")
-    for name in ("seeds", "surrogate", "target", "A_drop", "held-out A_drop", "N%", "s"):
-        table.add_column(name, justify="right", no_wrap=True)
+    table = _table(["seeds", "surrogate", "target", "A_drop", "held-out A_drop", "N%", "s"])
     for group in grouped(rows, lambda row: (row.series, *_setting(row))).values():
         first = group[0]
         cells = [_pair(group, "surrogate"), _pair(group, "target"), _spread(group, "target_a_drop")]
@@ -94,11 +90,7 @@ def differences(first: Sequence[ResultRow], second: Sequence[ResultRow]) -> list
 
 def comparison_table(found: Sequence[Difference]) -> RenderableType:
     """A line for each shared setting with all figures before and after; then a summary."""
-    table = Table()
-    for name in ("object", "classifier", "configuration"):
-        table.add_column(name, overflow="fold")
-    for figure in FIGURES:
-        table.add_column(figure.replace("_a_drop", " A_drop").replace("_", " "), justify="right", no_wrap=True)
+    table = _table([figure.replace("_a_drop", " A_drop").replace("_", " ") for figure in FIGURES])
     for each in found:
         cells = [f"{figure_words(each.before[name])} > {figure_words(each.after[name])}" for name in FIGURES]
         table.add_row(each.object, each.classifier, each.configuration, *cells)
@@ -108,6 +100,16 @@ def comparison_table(found: Sequence[Difference]) -> RenderableType:
     if changes:
         summary += f"; on average {average(changes):+.3f}"
     return Group(table, Text(summary))
+
+
+def _table(figures: Iterable[str]) -> Table:
+    """An empty table: a setting, and figures."""
+    table = Table()
+    for name in ("object", "classifier", "configuration"):
+        table.add_column(name, overflow="fold")
+    for figure in figures:
+        table.add_column(figure, justify="right", no_wrap=True)
+    return table
 
 
 def _setting(row: ResultRow) -> Setting:

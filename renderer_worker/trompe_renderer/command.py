@@ -86,25 +86,18 @@ def render(
 
     There is no authentication: listen only on an address that no stranger can reach.
     """
-    if check is not None:
-        sys.exit(not _check(check, engine, settings))
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO if verbose else logging.WARNING, format="%(message)s")
-    faulthandler.enable()
-    stop = _StopSignals()
     try:
+        if check is not None:
+            from trompe_renderer.check.report import check_at, check_engine
+
+            sys.exit(not (check_at(check) if check else check_engine(engine, settings)))
+        logging.basicConfig(stream=sys.stderr, level=logging.INFO if verbose else logging.WARNING, format="%(message)s")
+        faulthandler.enable()
+        stop = _StopSignals()
         _serve(_listen(host, port), engine, settings, Options(**options), stop)  # type: ignore[arg-type]
     except RendererError as error:
         raise click.ClickException(str(error)) from error
     stop.exit()
-
-
-def _check(address: str, engine: str, settings: Mapping[str, str]) -> bool:
-    from trompe_renderer.check.report import check_at, check_engine
-
-    try:
-        return check_at(address) if address else check_engine(engine, settings)
-    except RendererError as error:
-        raise click.ClickException(str(error)) from error
 
 
 def _listen(host: str, port: int) -> socket.socket:
