@@ -5,10 +5,11 @@ import html
 import io
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 from PIL.Image import Resampling
 
@@ -28,75 +29,53 @@ COLUMNS: Final = (
     *("object", "classifier", "configuration", "seed", "state", "target_a_before", "target_a_after", "target_a_drop"),
     *("surrogate_a_drop", "held_out_a_drop", "texels_altered", "ssim", "surrogate_model", "evaluations", "seconds"),
 )
-STYLE: Final = """
-body{font:15px/1.5 system-ui,sans-serif;color:#262626;max-width:1180px;margin:2rem auto;padding:0 1rem}
-h1{margin-bottom:0}h2{margin-top:2.2rem;border-bottom:1px solid #ddd}img{max-width:100%;height:auto}
-table{border-collapse:collapse;font-size:13px;font-variant-numeric:tabular-nums;display:block;overflow-x:auto}
-th,td{padding:.25rem .6rem;border-bottom:1px solid #e5e5e5;text-align:right;vertical-align:top}
-th{position:sticky;top:0;background:#fff}td:first-child,th:first-child,td.t,th.t{text-align:left}
-.facts{color:#555}.bad{color:#a33600}details{margin:.6rem 0}summary{cursor:pointer}
-a:focus,summary:focus{outline:2px solid #0072B2}
-"""
 
 
 def write_report(folder: Path) -> Path:
     """Write ``report.html`` and its figures from the tables in ``folder``; returns its path. Raises ``SpecError``."""
-    data = read_data(folder)
-    parts = [
-        _head(data),
-        *_figures(data),
-        *_pictures(data),
-        _failed(data),
-        _warnings(data),
-        _table(data),
-        _source(data),
-    ]
+    data, about, source = read_data(folder), folder / ABOUT, folder / SOURCE
+    environment = Environment(
+        loader=PackageLoader("trompe_experiments", "files"), keep_trailing_newline=True, undefined=StrictUndefined
+    )
+    environment.filters |= {"e": html.escape, "bold": _bold, "blocks": _blocks}
+    text = environment.get_template("report.html").render(
+        experiment=data.rows[0].experiment,
+        facts=_facts(data.rows),
+        about=json.loads(about.read_text("utf-8")) if about.exists() else {},
+        figures=[
+            (kind.title, _base64(data.draw(name)[0].read_bytes()), kind.table and kind.table(data))
+            for name, kind in figures_of(data).items()
+        ],
+        pictures=[(title, _base64(_stacked(files))) for title, files in _pictures(data)],
+        failed=[f"{_named(row)}: {row.state}: {row.error}" for row in data.rows if row.error and row.state != "n.a."],
+        warnings=_warnings(data.rows),
+        rows=[COLUMNS, *([_cell(getattr(row, name)) for name in COLUMNS] for row in data.rows)],
+        results=(RESULTS, _base64((folder / RESULTS).read_bytes())),
+        source=source.read_text("utf-8") if source.exists() else None,
+    )
     path = folder / "report.html"
-    path.write_text(_page(data.rows[0].experiment, "\n".join(part for part in parts if part)), "utf-8")
+    path.write_text(text, "utf-8")
     return path
 
 
-def _page(title: str, body: str) -> str:
-    name = html.escape(title)
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{name}</title>'
-        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>\n'
-        f"<body>{body}</body></html>\n"
-    )
-
-
-def _head(data: Data) -> str:
-    rows = data.rows
+def _facts(rows: Sequence[ResultRow]) -> list[str]:
     drop, held_out = (average(getattr(row, f"{name}_a_drop") for row in rows) for name in ("target", "held_out"))
-    facts = [f"{len({row.key for row in rows})} jobs", f"{len({row.object for row in rows})} objects"]
-    facts.append(f"mean target A_drop {figure_words(drop)}")
-    facts.append(f"on held-out views {figure_words(held_out)}")
-    facts.append(f"{sum({row.key: row.seconds or 0 for row in rows}.values()) / 60:.0f} min of computing")
-    path = data.folder / ABOUT
-    about: dict[str, Any] = json.loads(path.read_text("utf-8")) if path.exists() else {}
-    lines = "".join(f'<p class="facts">{html.escape(f"{k}: {v}")}</p>' for k, v in about.items() if v)
-    return f"<h1>{html.escape(rows[0].experiment)}</h1><p>{', '.join(facts)}.</p>{lines}"
+    return [
+        f"{len({row.key for row in rows})} jobs",
+        f"{len({row.object for row in rows})} objects",
+        f"mean target A_drop {figure_words(drop)}",
+        f"on held-out views {figure_words(held_out)}",
+        f"{sum({row.key: row.seconds or 0 for row in rows}.values()) / 60:.0f} min of computing",
+    ]
 
 
-def _figures(data: Data) -> list[str]:
-    sections = []
-    for name, kind in figures_of(data).items():
-        svg, _ = data.draw(name)
-        image = _embedded(svg.read_bytes(), "image/svg+xml", kind.title)
-        table = f"<details><summary>as a table</summary>{_html_table(kind.table(data))}</details>" if kind.table else ""
-        sections.append(f"<h2>{html.escape(kind.title)}</h2>{image}{table}")
-    return sections
-
-
-def _pictures(data: Data) -> list[str]:
-    """Pictures of one job of each object: the jobs of the histograms."""
+def _pictures(data: Data) -> Iterator[tuple[str, list[Path]]]:
+    """Pictures of one job of each object, by title: the jobs of the histograms."""
     keys = [row.key for row in histogram_rows(plain_rows(data))][:SHOWN_JOBS]
-    sections = []
     for artifact, title in PICTURES.items():
         files = [file for key in dict.fromkeys(keys) if (file := data.folder / "jobs" / key / artifact).is_file()]
         if files:
-            sections.append(f"<h2>{title}</h2>{_embedded(_stacked(files), 'image/jpeg', title)}")
-    return sections
+            yield title, files
 
 
 def _stacked(files: Sequence[Path]) -> bytes:
@@ -113,39 +92,21 @@ def _stacked(files: Sequence[Path]) -> bytes:
     return buffer.getvalue()
 
 
-def _embedded(data: bytes, kind: str, alt: str) -> str:
-    return f'<img alt="{html.escape(alt)}" src="data:{kind};base64,{base64.b64encode(data).decode()}">'
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
 
 
-def _failed(data: Data) -> str:
-    bad = [row for row in data.rows if row.error and row.state != "n.a."]
-    if not bad:
-        return ""
-    items = "".join(f'<li class="bad">{html.escape(f"{_named(row)}: {row.state}: {row.error}")}</li>' for row in bad)
-    return f"<h2>Failed</h2><ul>{items}</ul>"
-
-
-def _warnings(data: Data) -> str:
+def _warnings(rows: Sequence[ResultRow]) -> dict[str, list[str]]:
+    """Rows by warning."""
     told: dict[str, list[str]] = {}
-    for row in data.rows:
+    for row in rows:
         for words in filter(None, row.warnings.split(SEPARATOR)):
             told.setdefault(words, []).append(_named(row))
-    items = "".join(
-        f"<li>{html.escape(words)} <span class='facts'>({html.escape(names[0])}"
-        f"{f' and {len(names) - 1} more' if len(names) > 1 else ''})</span></li>"
-        for words, names in told.items()
-    )
-    count = f"{len(told)} different warnings"
-    return f"<h2>Warnings</h2><details open><summary>{count}</summary><ul>{items}</ul></details>" if told else ""
+    return told
 
 
 def _named(row: ResultRow) -> str:
     return ", ".join(word for word in (row.object, row.configuration, f"seed {row.seed}") if word)
-
-
-def _table(data: Data) -> str:
-    lines = [[_cell(getattr(row, name)) for name in COLUMNS] for row in data.rows]
-    return f"<h2>All rows</h2><details><summary>{len(lines)} rows</summary>{_rows_in_html([COLUMNS, *lines])}</details>"
 
 
 def _cell(value: object) -> str:
@@ -154,32 +115,14 @@ def _cell(value: object) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def _source(data: Data) -> str:
-    table = base64.b64encode((data.folder / RESULTS).read_bytes()).decode()
-    link = f'<a download="{RESULTS}" href="data:text/csv;base64,{table}">{RESULTS}</a>'
-    yaml = data.folder / SOURCE
-    source = f"<pre>{html.escape(yaml.read_text('utf-8'))}</pre>" if yaml.exists() else ""
-    return f"<h2>Data</h2><p>All columns: {link}</p>{source}"
-
-
-def _html_table(markdown: str) -> str:
-    """Our own ``markdown`` (tables, bold, paragraphs) as HTML."""
-    parts: list[str] = []
+def _blocks(markdown: str) -> Iterator[str | list[list[str]]]:
+    """Paragraphs, and rows of tables, of our own ``markdown``."""
     for block in re.split(r"\n\s*\n", markdown.strip()):
         lines = block.splitlines()
-        if not lines[0].startswith("|"):
-            parts.append(f"<p>{_bold(block)}</p>")
-            continue
-        parts.append(_rows_in_html([cells_of(line) for k, line in enumerate(lines) if k != 1]))
-    return "".join(parts)
-
-
-def _rows_in_html(rows: Sequence[Sequence[str]]) -> str:
-    """A table of ``rows``, of which the first is its head."""
-    tags = ["th", *["td"] * (len(rows) - 1)]
-    lines = ("".join(f"<{t}>{_bold(cell)}</{t}>" for cell in row) for t, row in zip(tags, rows, strict=True))
-    return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
+        table = lines[0].startswith("|")
+        yield [cells_of(line) for k, line in enumerate(lines) if k != 1] if table else block
 
 
 def _bold(text: str) -> str:
+    """``text`` in HTML, with its **bold** words."""
     return re.sub(r"\*\*(.*?)\*\*", r"<b>\1</b>", html.escape(text))
