@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 from trompe_client import _core
-from trompe_client._core import JobFilter, Request
+from trompe_client._core import Request
 from trompe_client._job import AsyncJobHandle, JobHandle
 from trompe_client._many import Attack, Outcome, run_all
 from trompe_client._operations import pages, planned, send, stored, uploaded
@@ -112,7 +112,8 @@ class AsyncClient(_Connected["AsyncPort"]):
         classifier: str | None = None,
     ) -> AsyncIterator[AsyncJobHandle]:
         """As ``Client.jobs``."""
-        wanted = JobFilter(JobState(state) if state else None, labels or {}, object, classifier)
+        found = JobState(state) if state else None
+        wanted = _core.job_filter(labels, state=found, object=object, classifier=classifier)
         async for job in pages(self.port, wanted):
             yield AsyncJobHandle(self, job)
 
@@ -261,7 +262,8 @@ class Client(_Connected["BlockingPort"]):
 
         A job must have all ``labels``. ``object`` and ``classifier`` are ids, or names of shipped ones.
         """
-        wanted = JobFilter(JobState(state) if state else None, labels or {}, object, classifier)
+        found = JobState(state) if state else None
+        wanted = _core.job_filter(labels, state=found, object=object, classifier=classifier)
         return (JobHandle(self, job) for job in iterate(pages(self.port, wanted)))
 
     objects = blocking(AsyncClient.objects)

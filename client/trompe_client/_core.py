@@ -19,7 +19,6 @@ from trompe_shared.api import (
     Job,
     JobList,
     JobSpec,
-    JobState,
     JudgementSpec,
     Manifest,
     ObjectInfo,
@@ -62,20 +61,10 @@ class Request(Generic[T]):
     job_id: str | None = None
 
 
-@dataclass(frozen=True)
-class JobFilter:
-    """Filter of a list of jobs."""
-
-    state: JobState | None = None
-    labels: Mapping[str, str] = field(default_factory=dict)
-    object: str | None = None
-    classifier: str | None = None
-
-    def params(self) -> list[tuple[str, str]]:
-        """Query parameters of a request."""
-        words = {"state": self.state, "object": self.object, "classifier": self.classifier}
-        given = [(name, str(word)) for name, word in words.items() if word is not None]
-        return given + [("label", f"{name}:{value}") for name, value in self.labels.items()]
+def job_filter(labels: Mapping[str, str] | None, **words: str | None) -> list[tuple[str, str]]:
+    """Query parameters of a list of jobs with all ``labels``; ``words``: state, object, classifier."""
+    given = [(name, word) for name, word in words.items() if word is not None]
+    return given + [("label", f"{name}:{value}") for name, value in (labels or {}).items()]
 
 
 def store(upload: Upload, kind: type[T]) -> Request[T]:
@@ -100,8 +89,8 @@ def submit(spec: JobSpec | JudgementSpec, *, key: str) -> Request[Job]:
     return Request("POST", path, _reader(Job), headers=headers, json=spec.model_dump_json())
 
 
-def jobs(wanted: JobFilter, *, limit: int, cursor: str | None = None) -> Request[JobList]:
-    params = [*wanted.params(), ("limit", str(limit)), *([("cursor", cursor)] if cursor else [])]
+def jobs(wanted: list[tuple[str, str]], *, limit: int, cursor: str | None = None) -> Request[JobList]:
+    params = [*wanted, ("limit", str(limit)), *([("cursor", cursor)] if cursor else [])]
     return Request("GET", "/v1/jobs", _reader(JobList), params=tuple(params))
 
 

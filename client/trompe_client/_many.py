@@ -11,7 +11,6 @@ from functools import cache, partial
 from typing import Any, Final, Generic, TypeVar
 
 from trompe_client import _core
-from trompe_client._core import JobFilter
 from trompe_client._errors import ClientError
 from trompe_client._following import AWAY, failure
 from trompe_client._operations import pages, send, uploaded
@@ -113,7 +112,7 @@ async def _caught(call: Callable[[], Awaitable[T]], index: int) -> T | Outcome[J
 
 async def _ended(port: Port, batch: str, waiting: Mapping[str, Outcome[Job]]) -> list[Outcome[Job]]:
     """Jobs of the batch that have ended or were deleted."""
-    listed = {job.id: job async for job in pages(port, JobFilter(labels={BATCH: batch}))}
+    listed = {job.id: job async for job in pages(port, _core.job_filter({BATCH: batch}))}
     found = [replace(outcome, job=listed[name]) for name, outcome in waiting.items() if name in listed]
     gone = [await _missed(port, outcome) for name, outcome in waiting.items() if name not in listed]
     return [outcome for outcome in found + gone if outcome.error or (outcome.job and outcome.job.state.final)]

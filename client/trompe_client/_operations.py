@@ -4,7 +4,7 @@ from collections.abc import AsyncGenerator, Callable
 from typing import Any, TypeVar
 
 from trompe_client import _core
-from trompe_client._core import JobFilter, Request
+from trompe_client._core import Request
 from trompe_client._errors import ClientError
 from trompe_client._plan import Plan, R, Upload
 from trompe_client._port import Answer, Port
@@ -59,8 +59,8 @@ async def stored(port: Port, upload: Callable[[], Upload], kind: type[T]) -> T:
     return await send(port, _core.store(await port.off(upload), kind))
 
 
-async def pages(port: Port, wanted: JobFilter) -> AsyncGenerator[Job, None]:
-    """All matching jobs, newest first. Pages are fetched when they are reached; the first one is short."""
+async def pages(port: Port, wanted: list[tuple[str, str]]) -> AsyncGenerator[Job, None]:
+    """All jobs of a ``job_filter``, newest first. Pages are fetched when they are reached; the first one is short."""
     cursor: str | None = None
     while True:
         limit = _core.LONG_PAGE if cursor else _core.SHORT_PAGE

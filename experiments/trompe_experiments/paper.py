@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
@@ -36,6 +36,7 @@ class PaperCell:
     tau: float | None
     target_a_drop: float | None
     texels_altered: float | None
+    keep: float | None = None
 
 
 @dataclass(frozen=True)
@@ -214,30 +215,16 @@ def _legend(made: Drawing, *, paper: bool) -> None:
     made.figure.legend(handles=marks, loc="outside lower center", ncols=3)
 
 
-class _Dot(NamedTuple):
-    panel: str
-    keep: float | None
-    tau: float | None
-    epsilon: float
-    share: float
-    drop: float
-
-
 def texels_scatter(rows: Iterable[ResultRow]) -> Drawing:
     """A panel for each classifier, and one for the paper's results with it. Colour: texels, marker: epsilon."""
-    own = [
-        _Dot(r.classifier, r.keep, r.tau, r.epsilon, r.texels_altered, r.target_a_drop)
-        for r in rows
-        if r.texels_altered is not None and r.target_a_drop is not None
-    ]
-    names = {dot.panel for dot in own}
-    paper = [
-        _Dot(f"{p.classifier}, the paper's (Unity)", None, p.tau, p.epsilon, p.texels_altered, p.target_a_drop)
-        for p in paper_numbers()
-        if p.classifier in names and p.texels_altered is not None and p.target_a_drop is not None
-    ]
-    dots = [*own, *paper]
-    panels = grouped(dots, lambda dot: dot.panel)
+    own = [row for row in rows if row.texels_altered is not None and row.target_a_drop is not None]
+    names = {row.classifier for row in own}
+    paper = [p for p in paper_numbers() if p.classifier in names and None not in (p.texels_altered, p.target_a_drop)]
+    panels: dict[str, list[Any]] = {
+        **grouped(own, lambda row: row.classifier),
+        **grouped(paper, lambda p: f"{p.classifier}, the paper's (Unity)"),
+    }
+    dots = [dot for group in panels.values() for dot in group]
     texels = sorted({(dot.keep, dot.tau) for dot in dots}, key=lambda pair: [value or -1.0 for value in pair])
     colours = dict(zip(texels, PALETTE, strict=False))
     markers = dict(zip(sorted({dot.epsilon for dot in dots}), MARKERS, strict=False))
@@ -245,7 +232,7 @@ def texels_scatter(rows: Iterable[ResultRow]) -> Drawing:
         for axes, (name, group) in zip(made.panels, panels.items(), strict=True):
             for dot in group:
                 look: Any = {"color": colours[dot.keep, dot.tau], "marker": markers[dot.epsilon]}
-                axes.plot(100 * dot.share, dot.drop, ls="", ms=6, mec="white", mew=0.6, **look)
+                axes.plot(100 * dot.texels_altered, dot.target_a_drop, ls="", ms=6, mec="white", mew=0.6, **look)
             axes.set_title(name)
             axes.set_xlabel("texels altered, N (%)")
             axes.set_xlim(left=0)
