@@ -146,21 +146,10 @@ def _file(job_id: str, path: str) -> Request[bytes]:
     return Request("GET", f"{_job_path(job_id)}/{path}", bytes, headers=identity, job_id=job_id)
 
 
-class EventParser:
-    """Parser of server-sent events (https://html.spec.whatwg.org/multipage/server-sent-events.html)."""
-
-    def __init__(self) -> None:
-        self._data: list[str] = []
-
-    def feed(self, line: str) -> Event | None:
-        """Parse one line without its line break. Returns the event that it completes, or None."""
-        if line.startswith("data:"):
-            self._data.append(line[5:].removeprefix(" "))
-        if line or not self._data:
-            return None
-        data, self._data = "\n".join(self._data), []
-        event: Event = _reader(Event)(data.encode())
-        return event
+def event(data: str) -> Event:
+    """Parse the data of one server-sent event."""
+    found: Event = _reader(Event)(data.encode())
+    return found
 
 
 def error_from(status: int, headers: Mapping[str, str], body: bytes, *, job_id: str | None) -> APIError:

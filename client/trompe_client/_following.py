@@ -82,17 +82,19 @@ async def follow(port: Port, job: Followed, deadline: float | None = None) -> As
 
 
 async def _stream(port: Port, job: Followed, after: int | None, deadline: float | None) -> AsyncGenerator[Event, None]:
-    """Events of one connection."""
+    """Events of one connection (https://html.spec.whatwg.org/multipage/server-sent-events.html)."""
     silence = SILENCE if deadline is None else min(SILENCE, max(deadline - time.monotonic(), PAUSE))
-    request, parser = _core.events(job.id, after=after), _core.EventParser()
+    request, data = _core.events(job.id, after=after), list[str]()
     async with port.open(request, silence=silence) as answer:
         await check(answer, request)
         async with aclosing(answer.lines()) as lines:
             async for line in lines:
                 _check_time(job, deadline)
-                event = parser.feed(line)
-                if event is not None:
-                    yield event
+                if line.startswith("data:"):
+                    data.append(line[5:].removeprefix(" "))
+                elif data and not line:
+                    yield _core.event("\n".join(data))
+                    data.clear()
 
 
 async def refresh_patiently(port: Port, job: Followed, deadline: float | None = None) -> Job:
