@@ -6,8 +6,7 @@ their jobs are not run again.
 """
 
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Final, Protocol
@@ -94,8 +93,8 @@ def run_experiment(plan: Plan, service: Service, folder: Path, *, show: Show, re
 
 def _run(plan: Plan, service: Service, folder: Path, show: Show, *, retry_failed: bool) -> Rows:
     jobs, collected = plan.jobs(), folder / "jobs"
-    tables = _Tables.of(jobs, folder)
-    known = {key: found for key in jobs if (found := _kept(collected / key) or tables.finished(key)) is not None}
+    tables = _from_tables(jobs, folder)
+    known = {key: found for key in jobs if (found := _kept(collected / key) or tables.get(key)) is not None}
     missing = [row for key, row in jobs.items() if key not in known or (retry_failed and known[key].failed)]
     show.begin(total=len(jobs), done=len(jobs) - len(missing))
     rows = write_tables(plan, known, folder)
@@ -186,36 +185,26 @@ def _keep(folder: Path, finished: Finished, files: Files) -> None:
     partial.replace(folder / "job.json")
 
 
-@dataclass(frozen=True)
-class _Tables:
-    """Rows of an earlier run, by key, of jobs without a folder."""
+def _from_tables(wanted: Collection[str], folder: Path) -> dict[str, Finished]:
+    """Jobs of an earlier run without a folder, from the tables in ``folder``, if any.
 
-    rows: Mapping[str, ResultRow]
-    predictions: Mapping[str, Sequence[PredictionRow]]
-
-    @classmethod
-    def of(cls, wanted: Collection[str], folder: Path) -> "_Tables":
-        """The tables in ``folder``, if any. Raises ``SpecError`` for unreadable ones, and for rows that the new tables
-        would lose: of jobs not ``wanted`` and without a folder."""
-        table = {row.key: row for row in read_table(folder / RESULTS, ResultRow, optional=True)}
-        rows = {key: row for key, row in table.items() if not (folder / "jobs" / key).exists()}
-        lost = [row for key, row in rows.items() if key not in wanted]
-        if lost:
-            raise SpecError(
-                f"{str(folder / RESULTS)!r} has rows of {len(lost)} jobs that are not in this experiment, "
-                f"such as {lost[0].object}, {lost[0].configuration}, and would lose them: choose another --out, or "
-                "move the table."
-            )
-        predictions = read_table(folder / PREDICTIONS, PredictionRow, optional=True) if rows else []
-        return cls(rows, grouped(predictions, lambda each: each.key))
-
-    def finished(self, key: str) -> Finished | None:
-        """A job by its row."""
-        row = self.rows.get(key)
-        if row is None:
-            return None
-        predictions = tuple(self.predictions.get(key, ()))
-        return Finished(state=row.state, job=row.job, error=row.error, predictions=predictions, row=row)
+    Raises ``SpecError`` for unreadable tables, and for rows that the new ones would lose: of jobs not ``wanted``.
+    """
+    table = {row.key: row for row in read_table(folder / RESULTS, ResultRow, optional=True)}
+    rows = {key: row for key, row in table.items() if not (folder / "jobs" / key).exists()}
+    lost = [row for key, row in rows.items() if key not in wanted]
+    if lost:
+        raise SpecError(
+            f"{str(folder / RESULTS)!r} has rows of {len(lost)} jobs that are not in this experiment, "
+            f"such as {lost[0].object}, {lost[0].configuration}, and would lose them: choose another --out, or "
+            "move the table."
+        )
+    predictions = read_table(folder / PREDICTIONS, PredictionRow, optional=True) if rows else []
+    own = grouped(predictions, lambda each: each.key)
+    return {
+        key: Finished(state=row.state, job=row.job, error=row.error, predictions=tuple(own.get(key, ())), row=row)
+        for key, row in rows.items()
+    }
 
 
 def write_tables(plan: Plan, known: Mapping[str, Finished], folder: Path) -> Rows:
