@@ -13,10 +13,9 @@ from difflib import get_close_matches
 from types import NoneType, UnionType
 from typing import Annotated, Any, Final, Literal, Self, Union, get_args, get_origin
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.fields import FieldInfo
 
-from trompe_shared.api.schema import Schema
 from trompe_shared.errors import SpecError
 
 SurrogateModel = Literal["auto", "diffuse", "calibrated", "curve"]
@@ -46,8 +45,14 @@ VIEWS_PER_STEP: Final = 40
 """Default number of a pool's views in one step."""
 
 
+class Schema(BaseModel):
+    """Base of all models of the contract: it refuses unknown fields."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
 class _Part(Schema):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(frozen=True)
 
 
 Amount = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]

@@ -4,8 +4,7 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from trompe_shared.api.jobs import ClassNames, Distance, Elevation, Option, QueueOptions, option
-from trompe_shared.api.schema import Schema
+from trompe_shared.api.jobs import ClassNames, Distance, Elevation, Option, QueueOptions, Schema, option
 from trompe_shared.colours import colour_of
 from trompe_shared.errors import SpecError
 from trompe_shared.faults import faults_of

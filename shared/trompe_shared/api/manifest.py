@@ -4,9 +4,8 @@ from typing import Final, Literal
 
 from pydantic import Field
 
-from trompe_shared.api.jobs import Colour
+from trompe_shared.api.jobs import Colour, Schema
 from trompe_shared.api.results import Accuracy, Visibility
-from trompe_shared.api.schema import Schema
 from trompe_shared.engine import EngineInfo
 
 AS_RENDERED: Final = "as rendered"

@@ -4,8 +4,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from trompe_shared.api.jobs import Colour, JobSpec
-from trompe_shared.api.schema import Schema
+from trompe_shared.api.jobs import Colour, JobSpec, Schema
 from trompe_shared.engine import DEFAULT_ENGINE, EngineInfo
 
 ADVERSARIAL: Final = "-adversarial"

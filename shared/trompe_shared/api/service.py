@@ -6,9 +6,8 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from trompe_shared.api.jobs import JobSpec, Labels, Needs, Priority
+from trompe_shared.api.jobs import JobSpec, Labels, Needs, Priority, Schema
 from trompe_shared.api.judgements import JudgementSpec
-from trompe_shared.api.schema import Schema
 from trompe_shared.engine import EngineInfo
 
 
