@@ -26,6 +26,7 @@ from trompe_experiments.markdown import markdown_table
 from trompe_server.surrogate import textures_of
 from trompe_server.surrogate.calibration import build_surrogate
 from trompe_server.system.memory import keep_freed_memory
+from trompe_shared.comparison import grouped
 from trompe_shared.object3d import Object3D, Part
 
 TEXTURE_SIDES = (256, 512, 1024, 2048, 4096)
@@ -134,15 +135,10 @@ def exponent(costs: Sequence[Cost], name: str) -> float:
     return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
 
 
-def by_axis(costs: Sequence[Cost]) -> dict[str, list[Cost]]:
-    """The costs of each axis, smallest size first."""
-    return {axis: [each for each in costs if each.axis == axis] for axis in AXES if axis in {c.axis for c in costs}}
-
-
 def exponents(costs: Sequence[Cost]) -> str:
     """Table of the exponents; at most 1.1 counts as linear, for timings are not exact."""
     rows = []
-    for axis, mine in by_axis(costs).items():
+    for axis, mine in grouped(costs, lambda each: each.axis).items():
         slopes = [exponent(mine, name) for name in LABELS]
         sizes = f"{mine[len(mine) // 2].size} .. {mine[-1].size}"
         rows.append([axis, sizes, *(f"{slope:.2f}" for slope in slopes), "yes" if max(slopes) <= 1.1 else "no"])
@@ -169,7 +165,7 @@ def draw(costs: Sequence[Cost], files: Sequence[Path]) -> None:
         from matplotlib.figure import Figure
     except ImportError:
         sys.exit("A chart needs matplotlib: pip install matplotlib, or leave --chart out.")
-    tables = by_axis(costs)
+    tables = grouped(costs, lambda each: each.axis)
     figure = Figure(figsize=(3 * len(tables), 6.4), layout="constrained")
     panels = figure.subplots(len(LABELS), len(tables), sharex="col", sharey="row", squeeze=False)
     for row, name in zip(panels, LABELS, strict=True):
