@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trompe_client import _plan
-from trompe_experiments import Experiment, Plan, load_experiment, plan_experiment, shipped_experiments
+from trompe_experiments.design import Experiment, load_experiment, shipped_experiments
+from trompe_experiments.plan import Plan, plan_experiment
 from trompe_experiments.table import KEY_VERSION, job_key
 from trompe_shared.api import JobRequest, JobSpec
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tests.fakes import FakeTarget
-from trompe_experiments import run_experiment
 from trompe_experiments.in_process import Done, run_job
+from trompe_experiments.run import run_experiment
 from trompe_experiments.service import Service
 from trompe_experiments.stability import cases, disturbed, disturbed_engine, service
 from trompe_experiments.stability.cases import CASES, DISTURBANCES, MEASURED, UNFORESEEN, Case, stability_plan

@@ -8,10 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.experiments.test_run import FakeService, Silent
-from trompe_experiments import Experiment, Plan, load_experiment, plan_experiment, run_experiment
 from trompe_experiments.baselines import baselines_markdown
+from trompe_experiments.design import Experiment, load_experiment
 from trompe_experiments.figures import read_data
 from trompe_experiments.judged import JUDGEMENTS, NOISE, NOTHING, JudgedRow, judge_all, noised
+from trompe_experiments.plan import Plan, plan_experiment
+from trompe_experiments.run import run_experiment
 from trompe_experiments.table import read_table
 from trompe_server.api.examples import MANIFEST as EXAMPLE
 from trompe_shared.api import Job, JudgementRequest, Manifest

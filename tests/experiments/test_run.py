@@ -18,20 +18,13 @@ from rich.console import Console
 from trompe_client import ServerUnreachable
 from trompe_client._errors import BadRequest
 from trompe_client._plan import Upload
-from trompe_experiments import (
-    Experiment,
-    Plan,
-    cli,
-    plan_experiment,
-    progress,
-    run,
-    run_experiment,
-    shipped_experiments,
-)
+from trompe_experiments import cli, progress, run
 from trompe_experiments.about import ABOUT, estimated_seconds, write_about
 from trompe_experiments.cli import experiment
-from trompe_experiments.plan import Row
+from trompe_experiments.design import Experiment, shipped_experiments
+from trompe_experiments.plan import Plan, Row, plan_experiment
 from trompe_experiments.progress import Tracked, experiment_display
+from trompe_experiments.run import run_experiment
 from trompe_experiments.service import Service
 from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, RowId, read_table
 from trompe_experiments.terminal import compared, differences, failures, read_results
