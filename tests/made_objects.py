@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trompe_server.formats.gltf_container import BIN_CHUNK
-from trompe_server.formats.gltf_repaint import glb
+from trompe_server.formats.gltf_write import glb
 from trompe_shared.object3d import encode_png, load_object
 from trompe_shared.shipped import shipped_objects
 

@@ -1,15 +1,14 @@
-"""Assemble surfaces, materials and images to an object in SAILenv's format."""
+"""Assemble surfaces, materials and images to an object in SAILenv's format; find what a repaint changed of one."""
 
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_server.formats.pictures import Pixels, encode_srgb, linear_rgb
+from trompe_server.formats.pictures import Pixels, encode_srgb, linear_rgb, shrink
 from trompe_server.formats.unwrap import BAKED_SIDE, bake, unwrap
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Material, Object3D, encode_png, object_from_files
@@ -37,50 +36,27 @@ def flat_picture(colour: Sequence[float], size: tuple[int, int] = (BAKED_SIDE, B
     return np.broadcast_to(encode_srgb(colour), (*size, 3)).copy()
 
 
-@dataclass(frozen=True)
-class Painted:
-    """Surfaces of one material with their generated texture."""
-
-    parts: tuple[Part, ...]
-    picture: Pixels
-
-
-def painted_flat(surfaces: Sequence[Surface], colour: Sequence[float]) -> Painted:
-    """Texture the surfaces of one material; unwrap them if one lacks UVs or has vertex colours.
+def painted_flat(surface: Surface, colour: Sequence[float]) -> tuple[Part, Pixels]:
+    """A surface without texture with its generated one; unwrapped if it lacks UVs or has vertex colours.
 
     colour: linear; multiplies the vertex colours, which are sRGB-encoded in [0, 1].
     """
-    coloured = any(surface.colours is not None for surface in surfaces)
-    if not coloured and all(surface.uvs is not None for surface in surfaces):
-        return Painted(tuple(_part(surface) for surface in surfaces), flat_picture(colour))
-    cut, size = unwrap([(surface.vertices, surface.faces) for surface in surfaces])
-    parts = tuple(
-        Part(surface.material, surface.vertices[u.source], surface.normals[u.source], u.uvs, u.faces)
-        for surface, u in zip(surfaces, cut, strict=True)
-    )
-    if not coloured:
-        return Painted(parts, flat_picture(colour, size))
-    shades = [_vertex_colours(surface)[u.source] * np.asarray(colour) for surface, u in zip(surfaces, cut, strict=True)]
-    return Painted(parts, bake(list(zip(cut, shades, strict=True)), size=size))
+    if surface.colours is None and surface.uvs is not None:
+        part = Part(surface.material, surface.vertices, surface.normals, surface.uvs, surface.faces)
+        return part, flat_picture(colour)
+    (cut,), size = unwrap([(surface.vertices, surface.faces)])
+    part = Part(surface.material, surface.vertices[cut.source], surface.normals[cut.source], cut.uvs, cut.faces)
+    if surface.colours is None:
+        return part, flat_picture(colour, size)
+    shades = linear_rgb(np.rint(np.clip(surface.colours, 0, 1) * 255).astype(np.uint8))
+    return part, bake([(cut, shades[cut.source] * np.asarray(colour))], size=size)
 
 
 def painted_object(stem: str, surface: Surface, colour: Sequence[float]) -> Object3D:
     """The object of one surface without texture, named after the file ``stem``; see ``painted_flat``."""
     name = safe_name(stem)
-    painted, file = painted_flat([surface], colour), f"{name}_albedo.png"
-    material = {surface.material: Material(surface.material, file)}
-    return assemble(name, painted.parts, material, {file: encode_png(painted.picture)})
-
-
-def _vertex_colours(surface: Surface) -> NDArray[np.float64]:
-    if surface.colours is None:
-        return np.ones((len(surface.vertices), 3))
-    return linear_rgb(np.rint(np.clip(surface.colours, 0, 1) * 255).astype(np.uint8))
-
-
-def _part(surface: Surface) -> Part:
-    assert surface.uvs is not None
-    return Part(surface.material, surface.vertices, surface.normals, surface.uvs, surface.faces)
+    (part, picture), file = painted_flat(surface, colour), f"{name}_albedo.png"
+    return assemble(name, [part], {part.material: Material(part.material, file)}, {file: encode_png(picture)})
 
 
 def check_numbers(values: NDArray[np.floating], what: str) -> None:
@@ -106,3 +82,21 @@ def assemble(
             **files,
         }
     )
+
+
+def repainted(original: Object3D, painted: Object3D) -> dict[str, Pixels]:
+    """The textures (H, W, 3) of ``painted``, by name, with colours different from ``original``.
+
+    Raises ``ObjectError`` if the meshes differ.
+    """
+    if _mesh(original) != _mesh(painted) or original.textures.keys() != painted.textures.keys():
+        raise ObjectError(
+            f"The mesh of {painted.name!r} is not the uploaded one (it was moved, or read by another version of "
+            "Trompe), so its paint does not fit the uploaded file. Take the zip or the GLB, or upload it again."
+        )
+    before = {name: shrink(original.textures[name], max(image.shape[:2])) for name, image in painted.textures.items()}
+    return {name: image for name, image in painted.textures.items() if not np.array_equal(before[name], image)}
+
+
+def _mesh(obj: Object3D) -> list[bytes]:
+    return [data for name, data in obj.files.items() if name.lower().endswith(".obj")]

@@ -14,8 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from trompe_server.formats.assembly import assemble, safe_name
-from trompe_server.formats.comparison import repainted
+from trompe_server.formats.assembly import assemble, repainted, safe_name
 from trompe_server.formats.fbx_tree import MAGIC, Tree, parse_tree
 from trompe_server.formats.pictures import decode, with_alpha_of
 from trompe_server.formats.upload import Upload, base_name

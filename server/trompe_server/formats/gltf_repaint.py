@@ -8,27 +8,22 @@ its triangles stay.
 import base64
 import copy
 import json
-import struct
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_server.formats.assembly import free_name
-from trompe_server.formats.comparison import repainted
+from trompe_server.formats.assembly import free_name, repainted
 from trompe_server.formats.gltf import Model, Slot, load
-from trompe_server.formats.gltf_container import BIN_CHUNK, GLB_MAGIC, JSON_CHUNK, Container, split_glb
+from trompe_server.formats.gltf_container import BIN_CHUNK, Container, split_glb
 from trompe_server.formats.gltf_shapes import Shape
+from trompe_server.formats.gltf_write import Json, Writer, append, glb
 from trompe_server.formats.pictures import Pixels, decode, with_alpha_of
 from trompe_server.formats.unwrap import Unwrapped
 from trompe_server.formats.upload import Upload
 from trompe_shared.object3d import Object3D
-
-Json = dict[str, Any]
-ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-FLOAT, UNSIGNED_INT = 5126, 5125
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
@@ -114,28 +109,22 @@ class _Repainting:
                 primitive["material"] = index
 
 
-class _Editor:
+class _Editor(Writer):
     """Changes to the file's JSON, buffers and images."""
 
     def __init__(self, container: Container) -> None:
+        super().__init__(json.loads(container.text.removeprefix(b"\xef\xbb\xbf")))
         self._container = container
-        self.document: Json = json.loads(container.text.removeprefix(b"\xef\xbb\xbf"))
         self._before = copy.deepcopy(self.document)
-        self._binary = bytearray(container.buffers[0]) if self._has_own_chunk() else bytearray()
+        self.binary += container.buffers[0] if self._has_own_chunk() else b""
         self._files = dict(container.upload.files)
         self._extra = bytearray()
-        self._binary_before = bytes(self._binary)
+        self._binary_before = bytes(self.binary)
         self._serving = _users_of_images(self.document)
 
     def _has_own_chunk(self) -> bool:
         buffers = self._container.document.buffers
         return self._container.binary and bool(buffers) and buffers[0].uri is None
-
-    def add(self, kind: str, entry: Json) -> int:
-        """Append to a list of the document; return the number of the new entry."""
-        entries = self.document.setdefault(kind, [])
-        entries.append(entry)
-        return len(entries) - 1
 
     def serves_only(self, image: int, materials: list[int]) -> bool:
         """Whether an image serves as base colour of these materials and nothing else."""
@@ -192,11 +181,11 @@ class _Editor:
             o.get("byteOffset", 0) < end and o.get("byteOffset", 0) + o["byteLength"] > start for o in others
         )
         if view["buffer"] != 0 or not self._has_own_chunk() or overlaps:
-            entry["bufferView"] = self._add_view(png)
+            entry["bufferView"] = self.add_view(png)
             return
         padding = (end - start - len(png)) % 4
         shift = len(png) + padding - (end - start)
-        self._binary[start:end] = png + bytes(padding)
+        self.binary[start:end] = png + bytes(padding)
         view["byteLength"] = len(png)
         for other in others:
             if other.get("byteOffset", 0) >= end:
@@ -206,7 +195,7 @@ class _Editor:
         """Add a texture with a new image, sampled like the texture ``entry``; return its number."""
         image: Json = {"mimeType": "image/png"}
         if self._container.binary:
-            image["bufferView"] = self._add_view(png)
+            image["bufferView"] = self.add_view(png)
         else:
             image["uri"] = _data_uri(png, "image/png")
         kept = {key: value for key, value in entry.items() if key == "sampler"}
@@ -221,11 +210,8 @@ class _Editor:
                 {name: self._gather(index, cut.source) for name, index in target.items()}
                 for target in primitive["targets"]
             ]
-        uvs = np.stack([cut.uvs[:, 0], 1 - cut.uvs[:, 1]], axis=1).astype("<f4")
-        primitive["attributes"]["TEXCOORD_0"] = self._add_accessor(uvs, {"componentType": FLOAT, "type": "VEC2"})
-        corners = cut.faces.reshape(-1, 1).astype("<u4")
-        kind = {"componentType": UNSIGNED_INT, "type": "SCALAR"}
-        primitive["indices"] = self._add_accessor(corners, kind, target=ELEMENT_ARRAY_BUFFER)
+        primitive["attributes"]["TEXCOORD_0"] = self.add_uvs(cut.uvs)
+        primitive["indices"] = self.add_corners(cut.faces)
         primitive["mode"] = 4
 
     def _gather(self, index: int, source: NDArray[np.int64]) -> int:
@@ -234,25 +220,16 @@ class _Editor:
         kept = {k: v for k, v in accessor.items() if k in {"componentType", "type", "normalized", "name"}}
         if "min" in accessor:
             kept |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        return self._add_accessor(values, kept)
+        return self.add_accessor(values, kept)
 
-    def _add_accessor(self, values: NDArray[np.generic], entry: Json, *, target: int = ARRAY_BUFFER) -> int:
-        row = values.dtype.itemsize * values.shape[1]
-        stride = row + -row % 4 if target == ARRAY_BUFFER else row
-        rows = np.zeros((len(values), stride), np.uint8)
-        rows[:, :row] = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), row)
-        view = {"target": target} | ({"byteStride": stride} if stride != row else {})
-        return self.add("accessors", entry | {"bufferView": self._add_view(rows.tobytes(), view), "count": len(values)})
-
-    def _add_view(self, data: bytes, entry: Json | None = None) -> int:
+    def add_view(self, data: bytes, entry: Json | None = None) -> int:
         """Add a buffer view of new bytes, in the GLB's own chunk or in a new buffer; return its number."""
         if self._container.binary and not self.document.get("buffers"):
             self.document["buffers"] = [{"byteLength": 0}]
         own = self._container.binary and "uri" not in self.document["buffers"][0]
-        where = self._binary if own else self._extra
-        where += bytes(-len(where) % 4)
-        place = {"buffer": 0 if own else len(self._before.get("buffers", [])), "byteOffset": len(where)}
-        where += data
+        if own:
+            return super().add_view(data, entry)
+        place = {"buffer": len(self._before.get("buffers", [])), "byteOffset": append(self._extra, data)}
         return self.add("bufferViews", place | {"byteLength": len(data)} | (entry or {}))
 
     def finish(self) -> Upload:
@@ -260,10 +237,10 @@ class _Editor:
         upload = self._container.upload
         if self._extra:
             self.add("buffers", {"byteLength": len(self._extra), "uri": _data_uri(self._extra, _BYTES)})
-        if self._binary:
-            self.document["buffers"][0]["byteLength"] = len(self._binary)
+        if self.binary:
+            self.document["buffers"][0]["byteLength"] = len(self.binary)
         same = self.document == self._before  # as if unpainted, if a new image has the length of the old one
-        if same and self._binary == self._binary_before and self._files == upload.files:
+        if same and self.binary == self._binary_before and self._files == upload.files:
             return upload
         text = self._container.text if same else _dumped(self.document, self._container.text)
         main = self._packed(text) if self._container.binary else text
@@ -273,22 +250,11 @@ class _Editor:
         kept = split_glb(self._container.upload.data)[1:]
         if kept and kept[0][0] == BIN_CHUNK:
             kept = kept[1:]
-        own = [(BIN_CHUNK, bytes(self._binary))] if self._binary else []
+        own = [(BIN_CHUNK, bytes(self.binary))] if self.binary else []
         return glb(text, [*own, *kept])
 
 
 _BYTES: Final = "application/octet-stream"
-
-
-def glb(text: bytes, chunks: list[tuple[int, bytes]]) -> bytes:
-    """The GLB file of a JSON text and other chunks."""
-    body = b"".join(_chunk(kind, data) for kind, data in [(JSON_CHUNK, text), *chunks])
-    return GLB_MAGIC + struct.pack("<II", 2, 12 + len(body)) + body
-
-
-def _chunk(kind: int, data: bytes) -> bytes:
-    padded = data + (b" " if kind == JSON_CHUNK else b"\0") * (-len(data) % 4)
-    return struct.pack("<II", len(padded), kind) + padded
 
 
 def _dumped(document: Json, before: bytes) -> bytes:

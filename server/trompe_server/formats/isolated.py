@@ -52,17 +52,15 @@ def import_file(
         return Converted(archive.read_bytes(), **{**answer, "textures": textures})
 
 
-def repaint_limited(
-    data: bytes, painted: Object3D, *, name: str, memory: int = MEMORY, seconds: float = SECONDS
-) -> Exported:
+def repaint_limited(data: bytes, painted: Object3D, *, name: str) -> Exported:
     """As ``repaint_file``, in a separate process. Raises ``ObjectError``."""
     with tempfile.TemporaryDirectory() as folder:
         source, archive, out = Path(folder, "upload"), Path(folder, "archive.zip"), Path(folder, "out")
         source.write_bytes(data)
         archive.write_bytes(painted.to_zip())
-        answer = _run(["repaint", str(source), name, str(archive), str(out)], memory=memory, seconds=seconds)
+        answer = _run(["repaint", str(source), name, str(archive), str(out)])
         return Exported(out.read_bytes(), str(answer["ending"]))
 
 
-def _run(arguments: list[str], *, memory: int, seconds: float) -> Mapping[str, Any]:
+def _run(arguments: list[str], *, memory: int = MEMORY, seconds: float = SECONDS) -> Mapping[str, Any]:
     return run_limited(_MODULE, arguments, memory=memory, seconds=seconds, failure=ObjectError)

@@ -12,11 +12,17 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_server.formats.assembly import DEFAULT_COLOUR, assemble, check_numbers, free_name, painted_object, safe_name
-from trompe_server.formats.comparison import repainted
+from trompe_server.formats.assembly import (
+    DEFAULT_COLOUR,
+    assemble,
+    check_numbers,
+    free_name,
+    painted_object,
+    repainted,
+    safe_name,
+)
 from trompe_server.formats.pictures import decode, with_alpha_of
-from trompe_server.formats.refusal import refusing
-from trompe_server.formats.upload import Upload
+from trompe_server.formats.upload import Upload, refusing
 from trompe_server.formats.wavefront import shrunk
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Material, Object3D, encode_png

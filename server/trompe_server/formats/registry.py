@@ -13,7 +13,8 @@ from trompe_shared.object3d import MAX_ARCHIVE_BYTES, Object3D, unpack
 
 @dataclass(frozen=True)
 class Format:
-    """endings: of the mesh file. read: also takes the longest side of a texture. Both raise ``ObjectError``."""
+    """endings: of the mesh file; one without gets the last. read: also takes the longest side of a texture. Both raise
+    ``ObjectError``."""
 
     name: str
     endings: tuple[str, ...]
@@ -38,7 +39,6 @@ _BEGINNINGS: Final = (
     (b"ply\n", "ply"),
     (b"ply\r", "ply"),
 )
-_ENDING: Final = {"gltf": ".glb", "fbx": ".fbx", "ply": ".ply", "stl": ".stl", "obj": ".obj"}
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def _opened(data: bytes, name: str) -> tuple[Upload, Format]:
     if data[:2] == b"PK":
         return _in_archive(unpack(data))
     found = _recognised(data, name)
-    main = name if name.lower().endswith(found.endings) else f"{name or 'object'}{_ENDING[found.name]}"
+    main = name if name.lower().endswith(found.endings) else f"{name or 'object'}{found.endings[-1]}"
     main = main.replace("\\", "/").rsplit("/", 1)[-1]
     return Upload(main, {main: data}, packed=False), found
 

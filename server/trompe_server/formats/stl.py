@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_server.formats.assembly import DEFAULT_COLOUR, check_numbers, painted_object
-from trompe_server.formats.refusal import refusing
-from trompe_server.formats.upload import Upload
+from trompe_server.formats.upload import Upload, refusing
 from trompe_server.formats.wavefront import shrunk
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D

@@ -1,7 +1,9 @@
-"""An uploaded model: its files, and the mesh file among them."""
+"""An uploaded model: its files, the mesh file among them, and failures of a library on it."""
 
 import posixpath
-from collections.abc import Collection, Mapping
+import warnings
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from urllib.parse import unquote
 
@@ -74,3 +76,16 @@ def named(name: str, files: Collection[str]) -> str | None:
         return name
     alike = [file for file in files if file.casefold() == name.casefold()]
     return alike[0] if len(alike) == 1 else None
+
+
+@contextmanager
+def refusing(what: str, *, remedy: str) -> Iterator[None]:
+    """Translate exceptions, and NumPy's warning about malformed numbers, to ``ObjectError``; not ``MemoryError``."""
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", "string or file could not be read to its end", DeprecationWarning)
+            yield
+    except (MemoryError, ObjectError):
+        raise
+    except Exception as error:
+        raise ObjectError(f"{what} cannot be read ({type(error).__name__}: {str(error)[:200]}). {remedy}") from error

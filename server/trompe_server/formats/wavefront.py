@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_server.formats.assembly import DEFAULT_COLOUR, free_name, painted_flat, safe_name
-from trompe_server.formats.comparison import repainted
+from trompe_server.formats.assembly import DEFAULT_COLOUR, free_name, painted_flat, repainted, safe_name
 from trompe_server.formats.pictures import decode, shrink, with_alpha_of
 from trompe_server.formats.upload import Upload, named
 from trompe_shared.errors import ObjectError
@@ -155,11 +154,11 @@ class _Completion:
         if "albedo" in maps[surface.material]:
             self._keep(surface)
             return
-        painted = painted_flat([surface], self._colour(surface))
+        part, picture = painted_flat(surface, self._colour(surface))
         self._rewritten |= surface.uvs is None or surface.colours is not None
-        self._parts += painted.parts
+        self._parts.append(part)
         name = free_name(f"{safe_name(surface.material)}_albedo.png", self._files)
-        self._files[name] = encode_png(painted.picture)
+        self._files[name] = encode_png(picture)
         self._libraries = {k: _with_map(text, surface.material, name) for k, text in self._libraries.items()}
 
     def _keep(self, surface: Surface) -> None:
