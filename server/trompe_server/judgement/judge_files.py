@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_server.attack import ViewDistribution
-from trompe_server.job.protocol import Artifacts
+from trompe_server.job.protocol import Artifacts, OnProgress
 from trompe_server.job.setup import HELD_OUT_STREAM, drawn_views, noise_numbers
 from trompe_server.judgement.manifest import PIPELINES, Judged
 from trompe_server.judgement.sources import JudgedObject, Sources
 from trompe_server.judgement.suites import Suite, suite_of
-from trompe_server.judgement.work import Kept, OnWork, Timed, key_of
+from trompe_server.judgement.work import Kept, Timed, key_of
 from trompe_server.judging.judge import Judge
 from trompe_server.renderers import TargetRenderer
 from trompe_server.spec.framing import Framing, framing_of
@@ -36,7 +36,7 @@ IMAGE_SIZE: Final = (224, 224)
 Images = NDArray[np.uint8]
 
 
-def judge_files(spec: JudgementSpec, sources: Sources, *, kept: Artifacts, on_work: OnWork) -> Judged:
+def judge_files(spec: JudgementSpec, sources: Sources, *, kept: Artifacts, on_progress: OnProgress) -> Judged:
     """Judge what ``spec`` names in ``sources``. A stopped judgement goes on with what is in ``kept``.
 
     Raises ``ObjectError`` if one of the two files cannot be read, and ``SpecError`` for two networks of one name and
@@ -51,7 +51,7 @@ def judge_files(spec: JudgementSpec, sources: Sources, *, kept: Artifacts, on_wo
     )
     views = sampled(suite.views, suite.seed, framing, background=spec.background)
     judged = Judged(spec, suite, before, after, judges, records, views, size)
-    _Run(judged, sources, Kept(kept), on_work).run()
+    _Run(judged, sources, Kept(kept), on_progress).run()
     return judged
 
 
@@ -88,7 +88,7 @@ class _Run:
     judged: Judged
     sources: Sources
     kept: Kept
-    on_work: OnWork
+    on_progress: OnProgress
 
     def run(self) -> None:
         """Look at everything, and note it in ``judged``."""
@@ -111,7 +111,7 @@ class _Run:
         pairs, renderers = 2 * len(self.judged.views), self.judged.suite.renderers
         left = Counter({_rendering(name): pairs for name in renderers})
         left |= Counter({_showing(name, to): pairs * len(PIPELINES) for name in renderers for to in self.judged.judges})
-        return Timed(left, self.on_work)
+        return Timed(left, self.on_progress)
 
     def _in_renderer(self, name: str) -> None:
         objects = {"before": self.judged.before, "after": self.judged.after}

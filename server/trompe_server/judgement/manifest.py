@@ -14,8 +14,7 @@ from trompe_server.judgement.suites import Suite
 from trompe_server.judging.judge import Judge
 from trompe_server.judging.metrics import camera_and_light, drop_warning, margins
 from trompe_server.judging.objects import ObjectPair, texture_changes
-from trompe_server.judging.transparency import faint_warnings
-from trompe_server.judging.visibility import visibility_of
+from trompe_server.judging.visibility import faint_warnings, visibility_of
 from trompe_server.surrogate import behind
 from trompe_server.system.versions import versions
 from trompe_shared.api import (

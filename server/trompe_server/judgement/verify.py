@@ -142,14 +142,7 @@ class _Again:
         judge: Judge,
         logits: NDArray[np.float32],
     ) -> Iterator[str]:
-        classes, known = (
-            (recorded.before, recorded.before_margins)
-            if kind == "before"
-            else (
-                recorded.after,
-                recorded.after_margins,
-            )
-        )
+        classes, known = getattr(recorded, kind), getattr(recorded, f"{kind}_margins")
         now = zip(logits.argmax(axis=1).tolist(), margins(logits, judge.labels).tolist(), strict=True)
         for k, (found, margin) in zip(self.index, now, strict=True):
             if found != classes[k]:

@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_server.job.protocol import Artifacts
+from trompe_server.job.protocol import Artifacts, OnProgress
 from trompe_server.storage.arrays import pack_arrays, unpack_arrays
 from trompe_server.system.versions import versions
 from trompe_shared.api import Progress
@@ -23,32 +23,15 @@ GUESS: Final = 0.05
 """Seconds of an image of a kind that has not been seen."""
 
 
-@dataclass(frozen=True)
-class Work:
-    """What is done now, the share of all images that is done, and an estimate of the seconds left."""
-
-    what: str
-    done: float
-    seconds_left: float
-
-    @property
-    def progress(self) -> Progress:
-        """The same in the words of a job."""
-        return Progress(phase=self.what, fraction=self.done, eta_seconds=self.seconds_left)
-
-
-OnWork = Callable[[Work], None]
-
-
 @dataclass
 class Timed:
-    """Counts the images of each kind of work, and tells ``on_work`` after each step.
+    """Counts the images of each kind of work, and tells ``on_progress`` before and after each step.
 
     left: images to come by kind, ``rendering in three`` or ``showing to tiny``.
     """
 
     left: Counter[str]
-    on_work: OnWork
+    on_progress: OnProgress
     clock: Callable[[], float] = time.monotonic
     _took: dict[str, tuple[int, float]] = field(default_factory=dict)
 
@@ -73,11 +56,9 @@ class Timed:
 
     def _tell(self, kind: str) -> None:
         done = 1 - self.left.total() / self._total if self._total else 1.0
-        self.on_work(Work(kind, done, sum(count * self._pace(each) for each, count in self.left.items())))
-
-    def _pace(self, kind: str) -> float:
-        count, seconds = self._took.get(kind, (0, 0.0))
-        return seconds / count if count else GUESS
+        paces = {each: seconds / count for each, (count, seconds) in self._took.items() if count}
+        left = sum(count * paces.get(each, GUESS) for each, count in self.left.items())
+        self.on_progress(Progress(phase=kind, fraction=done, eta_seconds=left))
 
 
 @dataclass(frozen=True)

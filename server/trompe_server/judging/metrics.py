@@ -39,8 +39,6 @@ Images = NDArray[np.uint8]
 Textures = Mapping[str, NDArray[np.uint8]]
 Label = int | Sequence[int]
 """The object's class, or several that all count as the object."""
-_Verdict = tuple[int, float, float]
-_NoVerdict = tuple[None, None, None]
 
 Z: Final = NormalDist().inv_cdf(0.975)
 """Normal quantile of a two-sided 95 % interval."""
@@ -126,14 +124,9 @@ def drop_interval(
     own = distinct or len(right)
     weights = seen * (own / len(right)) + 0.5
     drawn = np.random.default_rng(seed).multinomial(own, weights / weights.sum(), RESAMPLES)
-    drops = _drops(drawn[drawn[:, :2].any(axis=1)])
-    return float(np.quantile(drops, 0.025)), float(np.quantile(drops, 0.975))
-
-
-def _drops(counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """``a_drop`` from counts (n, 4) of views recognised both times, only before, only after, never."""
-    drops: NDArray[np.float64] = (counts[:, 1] - counts[:, 2]) / counts[:, :2].sum(axis=1)
-    return drops
+    both, lost, won, _ = drawn[drawn[:, :2].any(axis=1)].T
+    low, high = np.quantile((lost - won) / (both + lost), [0.025, 0.975]).tolist()
+    return low, high
 
 
 def drop_warning(found: Accuracy) -> str | None:
@@ -200,16 +193,25 @@ def margins(logits: Logits, label: Label) -> NDArray[np.float64]:
 
 def view_predictions(views: Sequence[View], before: Logits, after: Logits | None, label: Label) -> list[ViewPrediction]:
     """Predictions for each view from logits (views, classes); ``after`` is ``None`` if there was no attack."""
-    old = _verdicts(before, label)
-    new: Sequence[_Verdict | _NoVerdict] = _verdicts(after, label) if after is not None else [(None,) * 3] * len(old)
-    return [_prediction(*row) for row in zip(views, old, new, strict=True)]
-
-
-def _verdicts(logits: Logits, label: Label) -> list[_Verdict]:
-    """(class, its probability, probability of ``label``) of each row."""
-    best, probabilities = logits.argmax(axis=1), softmax(logits)
+    old = _verdicts("before", before, label)
+    new = [{}] * len(old) if after is None else _verdicts("after", after, label)
     return [
-        (int(k), float(row[k]), float(row[np.array(label)].sum())) for k, row in zip(best, probabilities, strict=True)
+        ViewPrediction(
+            **camera_and_light(view), background=view.backdrop or f"#{bytes(view.background).hex()}", **was, **now
+        )
+        for view, was, now in zip(views, old, new, strict=True)
+    ]
+
+
+def _verdicts(when: str, logits: Logits, label: Label) -> list[dict[str, Any]]:
+    """Class, its probability and that of ``label`` in each row, as fields of a ``ViewPrediction``."""
+    return [
+        {
+            when: int(k),
+            f"{when}_confidence": float(row[k]),
+            f"{when}_true_confidence": float(row[np.array(label)].sum()),
+        }
+        for k, row in zip(logits.argmax(axis=1), softmax(logits), strict=True)
     ]
 
 
@@ -227,19 +229,6 @@ def camera_and_light(view: View) -> dict[str, Any]:
         "light_ambient": light.ambient,
         "light_colour": light.colour,
     }
-
-
-def _prediction(view: View, before: _Verdict, after: _Verdict | _NoVerdict) -> ViewPrediction:
-    return ViewPrediction(
-        **camera_and_light(view),
-        background=view.backdrop or f"#{bytes(view.background).hex()}",
-        before=before[0],
-        before_confidence=before[1],
-        before_true_confidence=before[2],
-        after=after[0],
-        after_confidence=after[1],
-        after_true_confidence=after[2],
-    )
 
 
 def fooled_as(before: Logits, after: Logits, label: Label) -> dict[int, int]:

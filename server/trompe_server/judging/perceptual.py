@@ -4,7 +4,6 @@ There is no printability score: it needs the gamut of a printer, and these objec
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -23,34 +22,23 @@ RADIUS: Final = 5
 """Deviation and radius of the Gaussian window of Wang et al., in pixels."""
 
 
-@dataclass(frozen=True)
-class PerceivedChange:
-    """Visibility of a repaint in images of the object, over the object's pixels.
+def perceived_change(before: Images, after: Images, pixels: Pixels) -> dict[str, float]:
+    """``ssim``, ``ssim_worst``, ``delta_e`` and ``delta_e_95`` of the same views before and after, as in
+    ``Visibility``, over the object's ``pixels``; nothing if there are none.
 
-    ssim: mean structural similarity of luminance; 1 means equal. ssim_worst: mean of the worst view.
-    delta_e: mean CIEDE2000 colour difference; a trained eye just notices about 1, side by side.
-    delta_e_95: its 95th percentile.
+    A trained eye just notices a ``delta_e`` of about 1, side by side.
     """
-
-    ssim: float
-    ssim_worst: float
-    delta_e: float
-    delta_e_95: float
-
-
-def perceived_change(before: Images, after: Images, pixels: Pixels) -> PerceivedChange | None:
-    """Compare the same views before and after over ``pixels``; ``None`` if ``pixels`` is empty."""
     shown = [view for view in zip(before, after, pixels, strict=True) if view[2].any()]
     if not shown:
-        return None
+        return {}
     similarity = [_similarity(*view) for view in shown]
     difference = np.concatenate([_colour_difference(old[mask], new[mask]) for old, new, mask in shown])
-    return PerceivedChange(
-        ssim=float(np.concatenate(similarity).mean(dtype=np.float64)),
-        ssim_worst=min(float(view.mean(dtype=np.float64)) for view in similarity),
-        delta_e=float(difference.mean()),
-        delta_e_95=float(np.percentile(difference, 95)),
-    )
+    return {
+        "ssim": float(np.concatenate(similarity).mean(dtype=np.float64)),
+        "ssim_worst": min(float(view.mean(dtype=np.float64)) for view in similarity),
+        "delta_e": float(difference.mean()),
+        "delta_e_95": float(np.percentile(difference, 95)),
+    }
 
 
 def object_pixels(before: Images, after: Images, behind: UInt8[np.ndarray, "..."]) -> Pixels:

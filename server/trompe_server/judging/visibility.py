@@ -1,7 +1,7 @@
-"""Visibility of a repaint in the textures and in images of the object."""
+"""Visibility of a repaint in the textures and in images of the object, and the limit that transparency sets to it."""
 
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping
+from typing import Final
 
 import numpy as np
 from jaxtyping import UInt8
@@ -9,6 +9,11 @@ from jaxtyping import UInt8
 from trompe_server.judging.metrics import max_view_change, mean_texel_change, share_beyond, texels_altered
 from trompe_server.judging.perceptual import Images, object_pixels, perceived_change, total_variation
 from trompe_shared.api import Visibility
+from trompe_shared.object3d import Object3D
+from trompe_shared.opacity import strongest
+
+FAINT: Final = 0.25
+"""Opacity below which the paint on a material is hardly seen: a quarter of its change reaches the image."""
 
 Textures = Mapping[str, UInt8[np.ndarray, "H W 3"]]
 
@@ -26,23 +31,24 @@ def visibility_of(
 
     Without textures their figures are null; so are those of the paper's constraint on views without ``epsilon``.
     """
+    textures = textures_before, textures_after
     pixels = object_pixels(before, after, behind)
     pixels_beyond, views_beyond = (
         (None, None) if epsilon is None else share_beyond(before, after, pixels, epsilon=epsilon)
     )
-    seen = perceived_change(before, after, pixels)
     return Visibility(
         max_view_change=max_view_change(before, after),
         pixels_beyond_epsilon=pixels_beyond,
         views_beyond_epsilon=views_beyond,
-        **({} if seen is None else asdict(seen)),
-        **(_texture_change(textures_before, textures_after) if textures_before else {}),
+        **perceived_change(before, after, pixels),
+        texels_altered=texels_altered(*textures) if textures_before else None,
+        mean_texel_change=mean_texel_change(*textures) if textures_before else None,
+        texture_variation=total_variation(*textures) if textures_before else None,
     )
 
 
-def _texture_change(before: Textures, after: Textures) -> dict[str, float]:
-    return {
-        "texels_altered": texels_altered(before, after),
-        "mean_texel_change": mean_texel_change(before, after),
-        "texture_variation": total_variation(before, after),
-    }
+def faint_warnings(obj: Object3D) -> Iterator[str]:
+    """A warning for each material that is nearly transparent wherever it is strongest."""
+    for name, opacity in strongest(obj).items():
+        if opacity < FAINT:
+            yield f"The material {name!r} is nearly transparent (opacity {opacity:.2f}): paint on it changes little."

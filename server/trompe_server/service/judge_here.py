@@ -20,7 +20,7 @@ def judge_here(spec: JudgementSpec, out: Path, on_progress: Callable[[Progress],
     from trompe_server.storage.folders import LocalArtifacts
 
     began, kept = time.monotonic(), LocalArtifacts(out / KEPT)
-    judged = judge_files(spec, LocalSources(out), kept=kept, on_work=lambda work: on_progress(work.progress))
+    judged = judge_files(spec, LocalSources(out), kept=kept, on_progress=on_progress)
     manifest, files = written(judged, seconds=time.monotonic() - began)
     for name, data in files.items():
         (out / name).write_bytes(data)

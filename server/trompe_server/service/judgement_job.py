@@ -30,9 +30,7 @@ class JudgementJob:
     def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
         """See ``PhasedJob.run``."""
         began = time.perf_counter()
-        judged = judge_files(
-            self._spec, self._sources, kept=self._artifacts, on_work=lambda work: on_progress(work.progress)
-        )
+        judged = judge_files(self._spec, self._sources, kept=self._artifacts, on_progress=on_progress)
         manifest, files = written(judged, seconds=time.perf_counter() - began)
         for name, data in files.items():
             self._artifacts.write(name, data)

@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.fakes import FAKE, FakeTarget
+from trompe_server.job.protocol import OnProgress
 from trompe_server.judgement.judge_files import judge_files
 from trompe_server.judgement.manifest import Judged
 from trompe_server.judgement.sources import LocalSources
-from trompe_server.judgement.work import OnWork
 from trompe_server.renderers import TargetRenderer
 from trompe_server.storage.folders import LocalArtifacts
 from trompe_shared.api import JudgementSpec
@@ -68,9 +68,9 @@ def judge(fake_renderer: CountingTarget, tmp_path: Path) -> Judge:
     """Judges the mug against another file."""
     assert fake_renderer.rendered == []
 
-    def run(after: Path, *, on_work: OnWork = lambda _: None, **options: Any) -> Judged:
+    def run(after: Path, *, on_progress: OnProgress = lambda _: None, **options: Any) -> Judged:
         kept = LocalArtifacts(tmp_path / "kept")
-        return judge_files(spec_of(after, **options), LocalSources(tmp_path), kept=kept, on_work=on_work)
+        return judge_files(spec_of(after, **options), LocalSources(tmp_path), kept=kept, on_progress=on_progress)
 
     return run
 

@@ -19,12 +19,12 @@ from trompe_server.judgement.pictures import judgement_pictures
 from trompe_server.judgement.sources import LocalSources
 from trompe_server.judgement.suites import SUITES, Suite, suite_of
 from trompe_server.judgement.verify import verify
-from trompe_server.judgement.work import Timed, Work
+from trompe_server.judgement.work import Timed
 from trompe_server.library import Library
 from trompe_server.pages.judgement import judgement_page
 from trompe_server.renderers import SailenvTarget
 from trompe_server.storage.folders import LocalArtifacts
-from trompe_shared.api import AS_RENDERED, JobSpec, JudgementSpec, Manifest, Visibility
+from trompe_shared.api import AS_RENDERED, JobSpec, JudgementSpec, Manifest, Progress, Visibility
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
@@ -55,7 +55,7 @@ def test_an_attacked_object_gets_the_figures_of_its_job(
             epsilon=0.15,
         )
         kept = LocalArtifacts(tmp_path / "kept")
-        judged = judge_files(spec, LocalSources(tmp_path), kept=kept, on_work=lambda _: None)
+        judged = judge_files(spec, LocalSources(tmp_path), kept=kept, on_progress=lambda _: None)
         manifest = manifest_of(judged, seconds=1.0)
         found = manifest.cell(spec.renderers[0], "tiny")
         assert found is not None
@@ -158,12 +158,12 @@ class StoppedError(Exception):
 def test_a_stopped_judgement_goes_on_to_the_same_figures(
     judge: Judge, dark: Path, fake_renderer: CountingTarget, tmp_path: Path
 ) -> None:
-    def stop(work: Work) -> None:
-        if work.done > 0.5:
+    def stop(progress: Progress) -> None:
+        if progress.fraction > 0.5:
             raise StoppedError
 
     with pytest.raises(StoppedError):
-        judge(dark, on_work=stop)
+        judge(dark, on_progress=stop)
     rendered = len(fake_renderer.rendered)
     assert rendered == 2
     resumed = manifest_of(judge(dark), seconds=1.0)
@@ -175,7 +175,7 @@ def test_a_stopped_judgement_goes_on_to_the_same_figures(
 
 
 def test_the_time_left_is_that_of_the_images_to_come() -> None:
-    now, told = [0.0], list[Work]()
+    now, told = [0.0], list[Progress]()
     timed = Timed(Counter({"rendering": 20, "showing": 40, "never": 5}), told.append, clock=lambda: now[0])
     timed.skip("never")
     for _ in range(2):
@@ -185,8 +185,8 @@ def test_the_time_left_is_that_of_the_images_to_come() -> None:
         now[0] += 0.001
     with timed.step("showing", 10):
         now[0] += 20
-    assert told[-1].done == pytest.approx(40 / 60)
-    assert told[-1].seconds_left == 40
+    assert told[-1].fraction == pytest.approx(40 / 60)
+    assert told[-1].eta_seconds == 40
 
 
 # The page

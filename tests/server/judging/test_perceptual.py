@@ -1,9 +1,12 @@
 """What a person would see of a repaint: SSIM, CIEDE2000 and total variation."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from trompe_server.judging.perceptual import PerceivedChange, object_pixels, perceived_change, total_variation
+from trompe_server.judging.perceptual import object_pixels, perceived_change, total_variation
+from trompe_shared.api import Visibility
 
 RANDOM = np.random.default_rng(7)
 
@@ -18,11 +21,11 @@ def flat(colour: tuple[int, ...], size: tuple[int, int] = (16, 16)) -> np.ndarra
     return np.full((1, *size, 3), colour, np.uint8)
 
 
-def compared(before: np.ndarray, after: np.ndarray, pixels: np.ndarray | None = None) -> PerceivedChange:
+def compared(before: np.ndarray, after: np.ndarray, pixels: np.ndarray | None = None) -> Any:
     """The change of ``pixels`` (views, H, W), by default of all."""
     found = perceived_change(before, after, np.ones(before.shape[:3], bool) if pixels is None else pixels)
-    assert found is not None
-    return found
+    assert found
+    return Visibility(**found)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +113,7 @@ def test_views_without_the_object_do_not_count_and_without_any_there_is_nothing_
     pixels = np.ones(before.shape[:3], bool)
     pixels[1:] = False
     assert perceived_change(before, after, pixels) == perceived_change(before[:1], after[:1], pixels[:1])
-    assert perceived_change(before, after, pixels & False) is None
+    assert perceived_change(before, after, pixels & False) == {}
 
 
 def test_the_object_is_what_differs_from_the_background_before_or_after() -> None:

@@ -6,7 +6,7 @@ from typing import Final
 from trompe_server.job.report.data import ReportData
 from trompe_server.job.setup import JobSetup
 from trompe_server.judging.metrics import drop_warning, reach_warning, texels_altered, transfer_gap
-from trompe_server.judging.transparency import faint_warnings
+from trompe_server.judging.visibility import faint_warnings
 from trompe_server.surrogate.fidelity import MAX_ERROR, MIN_EXPLAINED
 from trompe_shared.api import MOST_VIEWS, JobSpec
 
