@@ -5,7 +5,7 @@ its prediction of the change that the noise makes in the target's images.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from itertools import product
 from typing import Final
@@ -281,7 +281,7 @@ class Calibration:
 
 def build_surrogate(
     calibration: Calibration,
-    obj: Object3D,
+    obj: Object3D | Painted,
     views: Sequence[View],
     clean: Image8,
     *,
@@ -296,19 +296,8 @@ def build_surrogate(
     """
     if geometry is None:
         size = (clean.shape[1], clean.shape[2])
-        geometry = prepare_geometry(obj, views, size=size, sampling=calibration.sampling, device=device)
-    return _shaded(calibration, geometry, obj, views, clean, backdrops)
-
-
-def _shaded(
-    calibration: Calibration,
-    geometry: Geometry,
-    obj: Object3D | Painted,
-    views: Sequence[View],
-    clean: Image8,
-    backdrops: Mapping[str, Image8],
-) -> Surrogate:
-    """The surrogate on a prepared geometry."""
+        plain = obj.obj if isinstance(obj, Painted) else obj
+        geometry = prepare_geometry(plain, views, size=size, sampling=calibration.sampling, device=device)
     if calibration.model == "diffuse":
         return diffuse_surrogate(geometry, views, backdrops=backdrops)
     greys, probes, tone = calibration.greys, calibration.probes, calibration.tone
@@ -338,7 +327,7 @@ def calibrate(
     tone_map: gives the target's tone curve, if it is needed. A few trial views decide; the other views are probed
     afterwards.
     """
-    trial = _Trial.of(obj, views, clean, ask, generator, backdrops, deterministic=deterministic, tone_map=tone_map)
+    trial = _Trial(obj, views, clean, ask, generator, backdrops, deterministic=deterministic, tone_map=tone_map)
     if wanted in {"auto", "diffuse"}:
         fidelity = trial.fidelity("diffuse", SamplingModel(), ())
         if wanted == "diffuse" or fidelity.good_enough:
@@ -356,35 +345,16 @@ def calibrate(
     return Calibration(model, reason, sampling, greys, probes, fidelity, renders, tone, trial.noise)
 
 
-@dataclass(frozen=True)
 class _Trial:
     """The trial views and the target's images of them: unpainted, repainted at random, and in greys on demand.
 
-    again: unpainted with other noise; ``None`` for a deterministic target.
+    again: unpainted with other noise; ``None`` for a deterministic target. charts: numbers of images of charts that
+    were asked for. probes: images so far, by grey. geometries: of recent hypotheses; hypotheses with the same geometry
+    share one. visible: triangles of the ``KEPT_RASTERS`` most recent rasterisations, by the members that change them.
     """
 
-    obj: Object3D
-    index: tuple[int, ...]
-    views: tuple[View, ...]
-    clean: Image8
-    repainted: Object3D
-    images: Image8
-    backdrops: Mapping[str, Image8]
-    ask: Ask
-    again: Image8 | None
-    tone_map: MeasureToneMap
-    charts: list[int] = field(default_factory=list)
-    """Numbers of images of charts that were asked for."""
-    probes: dict[int, Image8] = field(default_factory=dict)
-    """Images so far, by grey."""
-    geometries: dict[SamplingModel, Geometry] = field(default_factory=dict)
-    """Geometries of recent hypotheses; hypotheses with the same geometry share one."""
-    visible: dict[tuple[object, ...], dict[Camera, Visibility]] = field(default_factory=dict)
-    """Visible triangles of the ``KEPT_RASTERS`` most recent rasterisations, by the members that change them."""
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         obj: Object3D,
         views: Sequence[View],
         clean: Image8,
@@ -394,13 +364,18 @@ class _Trial:
         *,
         deterministic: bool,
         tone_map: MeasureToneMap,
-    ) -> "_Trial":
-        index = tuple(sorted({round(k) for k in np.linspace(0, len(views) - 1, TRIAL_VIEWS + 2)[1:-1]}))
-        few = tuple(views[k] for k in index)
+    ) -> None:
+        self.obj, self.ask, self.backdrops, self.tone_map = obj, ask, backdrops, tone_map
+        self.index = sorted({round(k) for k in np.linspace(0, len(views) - 1, TRIAL_VIEWS + 2)[1:-1]})
+        self.views, self.clean = tuple(views[k] for k in self.index), clean[self.index]
         repainted = painted_noise(obj, generator)
-        images = ask(repainted, few)
-        again = None if deterministic else ask(obj, [replace(view, noise=view.noise + 1) for view in few])
-        return cls(obj, index, few, clean[list(index)], repainted, images, backdrops, ask, again, tone_map)
+        self.images = ask(repainted, self.views)
+        self.again = None if deterministic else ask(obj, [replace(view, noise=view.noise + 1) for view in self.views])
+        self.painted = Painted(obj, CPU), Painted(repainted, CPU)
+        self.charts: list[int] = []
+        self.probes: dict[int, Image8] = {}
+        self.geometries: dict[SamplingModel, Geometry] = {}
+        self.visible: dict[tuple[object, ...], dict[Camera, Visibility]] = {}
 
     @property
     def renders(self) -> int:
@@ -426,11 +401,6 @@ class _Trial:
         difference = (self.again[changed].astype(np.float64) - self.clean[changed]) / 255
         return float(np.sqrt(np.square(difference).mean() / 2)) if len(difference) else 0.0
 
-    @cached_property
-    def painted(self) -> tuple[Painted, Painted]:
-        """The textures without and with the random repaint, for all hypotheses."""
-        return Painted(self.obj, CPU), Painted(self.repainted, CPU)
-
     def probe(self, grey: int) -> Image8:
         """Images of the trial views with the object painted in ``grey``."""
         if grey not in self.probes:
@@ -441,7 +411,7 @@ class _Trial:
         """Images of all ``views`` with the object painted in ``grey``; reuses the trial views."""
         others = [k for k in range(len(views)) if k not in self.index]
         images = np.zeros((len(views), *self.clean.shape[1:]), np.uint8)
-        images[list(self.index)] = self.probe(grey)
+        images[self.index] = self.probe(grey)
         if others:
             images[others] = self.ask(painted_grey(self.obj, grey), [views[k] for k in others])
         return images
@@ -454,7 +424,9 @@ class _Trial:
         calibration = Calibration(model, "", sampling, greys, probes, nothing, 0, tone)
         geometry = replace(self._geometry(sampling), sampling=sampling)
         unpainted, repainted = self.painted
-        surrogate = _shaded(calibration, geometry, unpainted, self.views, self.clean, self.backdrops)
+        surrogate = build_surrogate(
+            calibration, unpainted, self.views, self.clean, geometry=geometry, backdrops=self.backdrops
+        )
         return measure_fidelity(surrogate, unpainted, self.clean, repainted, self.images)
 
     def _geometry(self, sampling: SamplingModel) -> Geometry:

@@ -1,13 +1,14 @@
 """Colour models: from a pixel's texture value to its colour.
 
-Each model is an elementwise function of one number per pixel and channel and returns value and derivative. sRGB
-encoding follows IEC 61966-2-1.
+Each model is called with the texture values (pixels, 3) of pixels and returns (colours, d colour / d value), values and
+colours encoded and in [0, 1]. The derivatives are of each channel by itself, (pixels, 3), or (pixels, 3, 3) with
+[..., i, j] of channel i by channel j. ``shift`` is added to all colours. sRGB encoding follows IEC 61966-2-1.
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Final, Literal, Protocol
+from dataclasses import dataclass
+from typing import Final, Literal
 
 import torch
 from jaxtyping import Float, UInt8
@@ -17,23 +18,6 @@ Encoding = Literal["srgb", "power"]
 
 POWER = 2.2
 """Exponent of the power-law encoding of some renderers, in place of the sRGB curve."""
-
-
-class Shading(Protocol):
-    """The colour model of the object's pixels."""
-
-    def __call__(
-        self, values: Float[Tensor, "pixels 3"]
-    ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"] | Float[Tensor, "pixels 3 3"]]:
-        """(Colours, d colour / d value) of pixels with texture ``values``, both encoded and in [0, 1].
-
-        The derivatives are of each channel by itself, or [..., i, j] of channel i by channel j.
-        """
-        ...
-
-    def anchored(self, anchor: Float[Tensor, "pixels 3"]) -> "Shading":
-        """The model with ``anchor`` added to all colours."""
-        ...
 
 
 GAIN, OFFSET, GAMMA = 1.055, 0.055, 2.4
@@ -148,10 +132,6 @@ class DiffuseShading:
     ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"]]:
         return torch.addcmul(self.shift, values, self.factor).clamp_(0, 1), self.factor.expand_as(values)
 
-    def anchored(self, anchor: Float[Tensor, "pixels 3"]) -> "DiffuseShading":
-        """See ``Shading``."""
-        return replace(self, shift=self.shift + anchor)
-
 
 AMBIENT, DIFFUSE = 0.5, 0.3
 """The light of the paper's surrogate (PyTorch3D's defaults)."""
@@ -208,10 +188,6 @@ class CurveShading:
             light = torch.addcmul(light, bend, beyond, value=-node)
             slope = torch.addcmul(slope, bend, beyond)
         return light, slope
-
-    def anchored(self, anchor: Float[Tensor, "pixels 3"]) -> "CurveShading":
-        """The model with ``anchor`` added to all colours."""
-        return replace(self, shift=self.shift + anchor)
 
 
 def _zero_where_clipped(slopes: Tensor, clipped: Tensor) -> None:

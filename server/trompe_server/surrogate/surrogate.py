@@ -29,13 +29,13 @@ from trompe_server.surrogate.pixel_filter import KernelName, PixelFilter, kernel
 from trompe_server.surrogate.pyramid import MipChain, MipLayout, StoredChain, mip_chains, mip_layout, read_texels
 from trompe_server.surrogate.rasterize import Mesh, Visibility, mesh_of, project, rasterize
 from trompe_server.surrogate.sampling import FilteredGather, Gather, SamplingModel, Taps, fragments_of, taps_of
-from trompe_server.surrogate.shading import Chord, DiffuseShading, Shading, decode, encode, fit_curve, lambert
-from trompe_server.surrogate.tone import ToneMap, fit_tone
+from trompe_server.surrogate.shading import Chord, CurveShading, DiffuseShading, decode, encode, fit_curve, lambert
+from trompe_server.surrogate.tone import ToneMap, ToneShading, fit_tone
 from trompe_shared.geometry import Camera, View, spherical
 from trompe_shared.object3d import Object3D
 
 Image8 = NDArray[np.uint8]
-
+Shading = DiffuseShading | CurveShading | ToneShading
 
 NO_BACKDROPS: Final[Mapping[str, Image8]] = {}
 
@@ -593,7 +593,8 @@ def _anchored(plain: Surrogate, texels: Float[Tensor, "texels 3"]) -> Surrogate:
         for number, batch in enumerate(plain.geometry.batches)
     )
     anchored = tuple(
-        shading.anchored(softshrink(miss, SAME_LEVEL)) for shading, miss in zip(plain.shadings, missed, strict=True)
+        replace(shading, shift=shading.shift + softshrink(miss, SAME_LEVEL))
+        for shading, miss in zip(plain.shadings, missed, strict=True)
     )
     return replace(plain, shadings=anchored, missed=missed)
 

@@ -73,10 +73,6 @@ class ToneMap:
         """The fields by name."""
         return {field.name: getattr(self, field.name).numpy() for field in fields(self)}
 
-    def __call__(self, light: Float[Tensor, "pixels 3"]) -> Float[Tensor, "pixels 3"]:
-        """Encoded colours of ``light``."""
-        return self.with_slope(light)[0]
-
     def with_slope(
         self, light: Float[Tensor, "pixels 3"]
     ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3 3"]]:
@@ -171,10 +167,6 @@ class ToneShading:
         colour = torch.addcmul(self.shift, shown, self.coverage)
         inside = (colour >= 0) & (colour <= 1)
         return colour.clamp_(0, 1), slopes.mul_(by_value[:, None, :]).mul_(inside[:, :, None])
-
-    def anchored(self, anchor: Float[Tensor, "pixels 3"]) -> "ToneShading":
-        """See ``Shading``."""
-        return replace(self, shift=self.shift + anchor)
 
 
 def fit_tone(

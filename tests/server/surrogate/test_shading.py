@@ -14,10 +14,10 @@ from trompe_server.surrogate.shading import (
     ENCODERS,
     GAIN,
     GAMMA,
+    CurveShading,
     DiffuseShading,
     Encoder,
     Encoding,
-    Shading,
     decode,
     decode_with_slope,
     encode,
@@ -36,7 +36,7 @@ def curve(
     coverage: float = 1.0,
     background: float = 0.0,
     encoding: Encoding = "srgb",
-) -> Shading:
+) -> CurveShading:
     """The colour model through ``probes``, (greys, pixels, 3) in 0..255."""
     pixels = probes.shape[1]
     return fit_curve(

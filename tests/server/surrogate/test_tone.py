@@ -24,14 +24,14 @@ def tone() -> ToneMap:
 def test_the_slopes_of_a_tone_curve_are_those_of_finite_differences(tone: ToneMap) -> None:
     _, slopes = tone.with_slope(LIGHT)
     for channel, way in enumerate(1e-6 * torch.eye(3, dtype=torch.float64)):
-        seen = (tone(LIGHT + way) - tone(LIGHT - way)) / 2e-6
+        seen = (tone.with_slope(LIGHT + way)[0] - tone.with_slope(LIGHT - way)[0]) / 2e-6
         away = (seen - slopes[..., channel]).abs().amax(1)
         assert (away > 0.01).double().mean() < 0.02  # the nodes themselves, where the slope jumps
         assert away.median() < 1e-4
 
 
 def test_light_is_read_back_from_what_it_shows(tone: ToneMap) -> None:
-    torch.testing.assert_close(tone.light_of(tone(LIGHT)), LIGHT, atol=1e-4, rtol=0)
+    torch.testing.assert_close(tone.light_of(tone.with_slope(LIGHT)[0]), LIGHT, atol=1e-4, rtol=0)
 
 
 def test_the_slopes_of_the_colour_model_are_those_of_finite_differences(tone: ToneMap) -> None:
