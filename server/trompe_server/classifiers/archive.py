@@ -20,7 +20,7 @@ import io
 import json
 import pickle
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,25 +36,10 @@ MEMBER: Final = re.compile(
     r"|data/sample_inputs/model\.pt|extra/.*|archive_format|archive_version|byteorder|\.data/\w+",
     re.ASCII,
 )
-ATEN: Final = re.compile(r"torch\.ops\.aten\.(?!from_file\b)\w+\.\w+", re.ASCII)
-ARITHMETIC: Final = frozenset(
-    f"_operator.{name}"
-    for name in (
-        "add",
-        "eq",
-        "floordiv",
-        "ge",
-        "getitem",
-        "gt",
-        "le",
-        "lt",
-        "mod",
-        "mul",
-        "ne",
-        "neg",
-        "sub",
-        "truediv",
-    )
+TARGET: Final = re.compile(
+    r"torch\.ops\.aten\.(?!from_file\b)\w+\.\w+"
+    r"|_operator\.(add|eq|floordiv|ge|getitem|gt|le|lt|mod|mul|ne|neg|sub|truediv)",
+    re.ASCII,
 )
 NAME: Final = re.compile(r"[\w .,:@+>-]*", re.ASCII)
 SIZE: Final = re.compile(
@@ -63,6 +48,8 @@ SIZE: Final = re.compile(
     re.ASCII,
 )
 TREE: Final = re.compile(r'builtins\.(tuple|list|dict)|null|\[("\w+"(, "\w+")*)?\]', re.ASCII)
+PLAIN: Final[Mapping[str, re.Pattern[str]]] = {"tree": TREE, "expr_str": SIZE, "target": TARGET}
+"""What strings of a kind may be; all others are names."""
 PROSE: Final = frozenset({"metadata", "torch_version"})
 """Keys with text for people; torch never evaluates it."""
 
@@ -94,7 +81,7 @@ def _check(archive: Any, file: str) -> None:
                 raise _unsafe(file, f"pickled {kind}")
     _check_sample_inputs(archive.read_bytes("data/sample_inputs/model.pt"), file)
     for kind, text in _texts(json.loads(archive.read_bytes("models/model.json"))):
-        if not _is_plain(kind, text):
+        if kind != "guards_code" and not PLAIN.get(kind, NAME).fullmatch(text):
             raise _unsafe(file, f"the {kind} {text[:80]!r}")
 
 
@@ -127,13 +114,3 @@ def _texts(node: Any, key: str = "name") -> Iterator[tuple[str, str]]:
                 yield from _texts(json.loads(value), "tree")
             elif name not in PROSE:
                 yield from _texts(value, "tree" if key == "tree" else name)
-
-
-def _is_plain(kind: str, text: str) -> bool:
-    if kind == "tree":
-        return TREE.fullmatch(text) is not None
-    if kind == "expr_str":
-        return SIZE.fullmatch(text) is not None
-    if kind == "target":
-        return text in ARITHMETIC or ATEN.fullmatch(text) is not None
-    return kind == "guards_code" or NAME.fullmatch(text) is not None

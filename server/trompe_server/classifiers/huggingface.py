@@ -8,8 +8,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from trompe_server.classifiers.contract import Normalised
-from trompe_server.classifiers.extras import import_extra
-from trompe_server.classifiers.hub import WEIGHTS, hub_file
+from trompe_server.classifiers.extras import WEIGHTS, hub_file, import_extra
 from trompe_server.classifiers.network import NamedNetwork
 from trompe_shared.errors import ClassifierError
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from trompe_server.spec.checks import Classes
 from trompe_shared.errors import ClassifierError
 
 BATCH: Final = 10
@@ -22,22 +23,12 @@ Logits = NDArray[np.float32]
 
 
 @runtime_checkable
-class Classifier(Protocol):
-    """An image classifier with logits."""
-
-    @property
-    def name(self) -> str:
-        """Its name in reports."""
-        ...
+class Classifier(Classes, Protocol):
+    """An image classifier with logits. ``name`` is for reports, ``n_classes`` the number of logits."""
 
     @property
     def image_size(self) -> tuple[int, int]:
         """(H, W) of its input."""
-        ...
-
-    @property
-    def n_classes(self) -> int:
-        """Number of its logits."""
         ...
 
     @property

@@ -66,15 +66,6 @@ KNOWN: Final = (
 )
 
 
-class _Options(NamedTuple):
-    """See ``load_classifier``."""
-
-    name: str | None
-    classes: Sequence[str] | None
-    weights: str | Path | None
-    device: str
-
-
 def load_classifier(
     path_or_name: str | Path,
     *,
@@ -93,11 +84,15 @@ def load_classifier(
     """
     _check_device(device)
     reference = str(path_or_name)
-    options = _Options(name, classes, weights, device)
     if reference.startswith(LOOKED_UP):
-        return _by_name(reference, options)
+        return _by_name(reference, name, classes, weights, device)
     if reference != "tiny" and re.fullmatch(r"[a-z]\w*", reference, re.ASCII):
-        return _by_bare_name(reference, options)
+        try:
+            return _by_name(f"torchvision:{reference}", name, classes, weights, device)
+        except ClassifierError as error:
+            raise ClassifierError(
+                f"{reference!r} was taken for a torchvision network: {error} Or give {KNOWN}."
+            ) from error
     if weights is not None:
         raise _own_weights(reference)
     if reference == "tiny":
@@ -121,22 +116,16 @@ def _zoo(reference: str) -> tuple[_Zoo, str]:
     return ZOOS[prefix], reference.removeprefix(prefix)
 
 
-def _by_name(reference: str, options: _Options) -> NetworkClassifier:
+def _by_name(
+    reference: str, name: str | None, classes: Sequence[str] | None, weights: str | Path | None, device: str
+) -> NetworkClassifier:
     zoo, model = _zoo(reference)
-    if options.weights is not None and not zoo.open:
+    if weights is not None and not zoo.open:
         raise _own_weights(reference)
-    given = {"classes": options.classes, "weights": options.weights} if zoo.open else {}
-    found, name = zoo.load(model, **given), options.name or model
-    network, n_classes = prepared(found.network, found.image_size, name, device=options.device)
-    classes = check_classes(options.classes or found.classes, n_classes, name)
-    return NetworkClassifier(name, network, found.image_size, n_classes, classes, options.device)
-
-
-def _by_bare_name(model: str, options: _Options) -> NetworkClassifier:
-    try:
-        return _by_name(f"torchvision:{model}", options)
-    except ClassifierError as error:
-        raise ClassifierError(f"{model!r} was taken for a torchvision network: {error} Or give {KNOWN}.") from error
+    found, name = zoo.load(model, **({"classes": classes, "weights": weights} if zoo.open else {})), name or model
+    network, n_classes = prepared(found.network, found.image_size, name, device=device)
+    names = check_classes(classes or found.classes, n_classes, name)
+    return NetworkClassifier(name, network, found.image_size, n_classes, names, device)
 
 
 def _own_weights(reference: str) -> ClassifierError:

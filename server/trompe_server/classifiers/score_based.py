@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
@@ -72,7 +72,9 @@ class ScoreBasedClassifier(Wrapper):
         height, width = (min(self.cells, side) for side in image.shape[1:])
         coarse = torch.randn((self.queries_per_gradient // 2, 3, height, width), generator=generator)
         smooth = F.interpolate(coarse, image.shape[1:], mode="bilinear").to(image)
-        return smooth if self.background is None else smooth * _differs(image, self.background.to(image))
+        if self.background is None:
+            return smooth
+        return smooth * ((image - self.background.to(image)).abs().amax(0) > 0.25 / 255)  # by more than rounding
 
 
 class _Asked(Function):
@@ -94,11 +96,6 @@ class _Asked(Function):
         for index in torch.nonzero(gradient.any(dim=1)).flatten().tolist():
             estimates[index] = ctx.classifier.estimate(images[index], gradient[index])
         return estimates, None
-
-
-def _differs(image: Float[Tensor, "3 H W"], background: Float[Tensor, "3 #H #W"]) -> Bool[Tensor, "H W"]:
-    """Mask of pixels that differ from the background by more than rounding."""
-    return (image - background).abs().amax(0) > 0.25 / 255
 
 
 def score_based(

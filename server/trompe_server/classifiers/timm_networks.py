@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from trompe_server.classifiers.contract import Normalised
-from trompe_server.classifiers.extras import check_known, import_extra
-from trompe_server.classifiers.hub import WEIGHTS, hub_file
+from trompe_server.classifiers.extras import WEIGHTS, check_known, hub_file, import_extra
 from trompe_server.classifiers.network import NamedNetwork
 from trompe_shared.errors import ClassifierError
 
@@ -33,7 +32,9 @@ def load_timm(model: str, *, classes: Sequence[str] | None = None, weights: str 
         ) from error
     config = timm.data.resolve_model_data_config(network)
     whole = Normalised(network, mean=config["mean"], std=config["std"])
-    return NamedNetwork(whole, config["input_size"][1:], _imagenet(timm, network))
+    subset = timm.data.infer_imagenet_subset(network)  # if it has the classes of a part of ImageNet that timm knows
+    names = None if subset is None else timm.data.ImageNetInfo(subset).label_descriptions()
+    return NamedNetwork(whole, config["input_size"][1:], names)
 
 
 def timm_weights(model: str) -> Path:
@@ -50,9 +51,3 @@ def _timm(model: str) -> Any:
     if not timm.is_model(model):
         check_known(model, timm.list_models(), "timm has no network")
     return timm
-
-
-def _imagenet(timm: Any, network: Any) -> list[str] | None:
-    """Class names, if the network has the classes of a part of ImageNet that timm knows."""
-    subset = timm.data.infer_imagenet_subset(network)
-    return None if subset is None else timm.data.ImageNetInfo(subset).label_descriptions()

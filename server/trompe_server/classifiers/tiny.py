@@ -56,7 +56,7 @@ def load_tiny(path: Path = WEIGHTS) -> TinyNet:
     network = TinyNet()
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            state = {name: torch.from_numpy(_widened(arrays[name])) for name in arrays.files}
+            state = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
         network.load_state_dict(state)
     except (OSError, ValueError, RuntimeError) as error:
         raise ClassifierError(
@@ -71,7 +71,3 @@ def save_tiny(network: TinyNet, path: Path = WEIGHTS) -> None:
     state = {name: tensor.cpu().numpy() for name, tensor in network.state_dict().items()}
     narrow = {name: array.astype(np.float16) if array.ndim > 1 else array for name, array in state.items()}
     np.savez(path, allow_pickle=False, **narrow)
-
-
-def _widened(array: np.ndarray) -> np.ndarray:
-    return array.astype(np.float32) if array.dtype == np.float16 else array

@@ -46,7 +46,7 @@ def load_torchvision(
 
     Raises ``ClassifierError`` if torchvision, the network or the weights are missing or do not fit together.
     """
-    models = _torchvision()
+    models = import_extra("torchvision.models", extra="vision")
     entry, path = _find_weights(models, model, weights)
     names = tuple(classes or entry.meta["categories"])
     transforms = entry.transforms()
@@ -58,11 +58,7 @@ def load_torchvision(
 
 def torchvision_weights(model: str) -> Path:
     """The file with torchvision's default weights of ``model`` in torch's cache. Raises ``ClassifierError``."""
-    return _find_weights(_torchvision(), model, None)[1]
-
-
-def _torchvision() -> Any:
-    return import_extra("torchvision.models", extra="vision")
+    return _find_weights(import_extra("torchvision.models", extra="vision"), model, None)[1]
 
 
 def _find_weights(models: Any, model: str, weights: str | Path | None) -> tuple[Any, Path]:
