@@ -84,9 +84,16 @@ def same(one: AttackState, other: AttackState) -> bool:
 
 
 def objective_of(
-    obj: Object3D, surrogate: Surrogate, *members: WhiteBoxClassifier, goal: Goal | None = None
+    obj: Object3D,
+    surrogate: AnySurrogate,
+    *members: WhiteBoxClassifier,
+    goal: Goal | None = None,
+    masks: torch.Tensor | None = None,
 ) -> Objective:
-    return Objective(textures_of(obj), surrogate, members or (fake_classifier(),), goal or Goal(LABEL), None)
+    """All texels may move."""
+    textures = textures_of(obj)
+    canvas = surrogate.canvas(textures, {name: texture[..., 0] >= 0 for name, texture in textures.items()})
+    return Objective(textures, surrogate, members or (fake_classifier(),), goal or Goal(LABEL), masks, canvas)
 
 
 def mean_loss(obj: Object3D, surrogate: Surrogate, state: AttackState, goal: Goal | None = None) -> float:

@@ -25,7 +25,7 @@ from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Objective, Textures, members_of
 from trompe_server.attack.optimiser import OPTIMISERS, Iterate, Memory
 from trompe_server.attack.perception import perceptual_bounds
-from trompe_server.attack.search import Search
+from trompe_server.attack.search import Search, finished
 from trompe_server.attack.state import AttackState
 from trompe_server.attack.texels import TexelMasks, movable, moving_blocks
 from trompe_server.attack.view_budget import ViewBudget
@@ -112,12 +112,12 @@ def attack(
     )
     point = Iterate(objective.join(state.deltas), _joined(objective, state))
     for step in range(state.step, state.step + steps):
-        if search.finished(point):
+        if finished(point.memory, goal):
             break
         found, point = search.evaluate(point, step)
         point = search.move(point, found, step)
         on_step(Step(step, found.loss, found.fooled, search.shown(point), search.least_left(point, step)))
-    ended = state.step + steps == total or search.finished(point)
+    ended = state.step + steps == total or finished(point.memory, goal)
     delta = search.saved(point.delta) if ended else point.delta
     return AttackState(state.step + steps, objective.split(delta), _split(objective, point.memory))
 

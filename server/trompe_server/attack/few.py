@@ -65,7 +65,8 @@ def few_texels(
     ``attack``; ``on_step`` reports the trials' steps. Deterministic. Raises ``SpecError`` if ``keep`` is out of range
     or leaves no texel.
     """
-    objective = Objective(textures, surrogate, members_of(classifier, goal), goal, masks)
+    canvas = surrogate.canvas(textures, {name: texture[..., 0] >= 0 for name, texture in textures.items()})
+    objective = Objective(textures, surrogate, members_of(classifier, goal), goal, masks, canvas)
     if masks is not None:
         gradients = gradients * masks[..., None].to(gradients)
     total, shown = _scaled(backproject(surrogate, textures, gradients)), 0

@@ -77,14 +77,17 @@ class Goal:
 
         Positive for views that reach the goal.
         """
-        return self._margins(finite(logits))
+        logits = finite(logits)
+        others = logits.index_fill(1, self._subject(logits), -torch.inf)
+        margins = others.topk(self.top_k, dim=1).values[:, -1] - self._own(logits)
+        return margins if self.target is None else -margins
 
     def losses(self, logits: Logits, *, clamped: bool = True) -> PerView:
         """The loss of each view; finite, with a finite gradient.
 
         ``clamped=False`` omits the margin's clamp, so that safely won views have a gradient too.
         """
-        losses = _LOSSES[self.loss](self, finite(logits))
+        losses = _LOSSES[self.loss](self, logits)
         return losses.clamp(max=self.safe) if clamped and self.loss == "margin" else losses
 
     def settled(self, logits: Logits) -> Bool[Tensor, " views"]:
@@ -101,18 +104,13 @@ class Goal:
         """The best logit of the subject."""
         return logits.index_select(1, self._subject(logits)).max(dim=1).values
 
-    def _margins(self, logits: Logits) -> PerView:
-        others = logits.index_fill(1, self._subject(logits), -torch.inf)
-        margins = others.topk(self.top_k, dim=1).values[:, -1] - self._own(logits)
-        return margins if self.target is None else -margins
-
     def _cross_entropy(self, logits: Logits) -> PerView:
-        log_shares = logits.log_softmax(1).index_select(1, self._subject(logits))
+        log_shares = finite(logits).log_softmax(1).index_select(1, self._subject(logits))
         losses = -log_shares.logsumexp(1)  # the probabilities of several classes add up
         return losses if self.target is None else -losses
 
 
 _LOSSES: Final[Mapping[str, Callable[[Goal, Logits], PerView]]] = {
-    "margin": Goal._margins,
+    "margin": Goal.margins,
     "cross_entropy": Goal._cross_entropy,
 }

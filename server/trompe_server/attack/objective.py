@@ -6,7 +6,6 @@ surrogate's canvas.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -62,8 +61,8 @@ class Score(NamedTuple):
 class Objective:
     """Expected loss of a goal over a surrogate's views, averaged over the classifiers.
 
-    masks: pixels (saliency) that pass gradients; all by default. part: texels that may move; all by default. pipeline:
-    what happens to the images before the classifiers; nothing by default. Raises ``SpecError`` if a classifier's image
+    masks: pixels (saliency) that pass gradients; all by default. canvas: the texels that may move. pipeline: what
+    happens to the images before the classifiers; nothing by default. Raises ``SpecError`` if a classifier's image
     size differs from the surrogate's.
     """
 
@@ -72,7 +71,7 @@ class Objective:
     members: tuple[WhiteBoxClassifier, ...]
     goal: Goal
     masks: Bool[Tensor, "views H W"] | None
-    part: AnyCanvas | None = None
+    canvas: AnyCanvas
     pipeline: Drawn | None = None
 
     def __post_init__(self) -> None:
@@ -83,15 +82,6 @@ class Objective:
                     f"The classifier {member.name!r} takes images of {tuple(member.image_size)}, the surrogate renders "
                     f"{tuple(size)}: prepare the surrogate for that size, or resize the images for the classifier."
                 )
-
-    @property
-    def canvas(self) -> AnyCanvas:
-        """The texels that may move."""
-        return self._whole if self.part is None else self.part
-
-    @cached_property
-    def _whole(self) -> AnyCanvas:
-        return self.surrogate.canvas(self.textures, {name: t[..., 0] >= 0 for name, t in self.textures.items()})
 
     @property
     def source(self) -> Flat:

@@ -77,10 +77,6 @@ class Search:
     backgrounds: Backgrounds | None
     pipeline: ImagePipeline | None
 
-    def finished(self, point: Iterate) -> bool:
-        """Whether no step is left to take."""
-        return finished(point.memory, self.objective.goal)
-
     def least_left(self, point: Iterate, step: int) -> int:
         """Number of steps after ``step`` if nearly all views are fooled from now on."""
         goal, most = self.objective.goal, self.total - step - 1

@@ -72,7 +72,8 @@ class ViewBudget:
         """Share by which each texel's channel must shrink; ``None`` if all images are within the bound."""
         leaf = delta.clone().requires_grad_()
         texels = self.objective.texels(leaf)
-        change = [self._change(texels.detach(), number) for number in range(len(self.clean))]
+        colours = (self.objective.surrogate.colours(texels.detach(), number)[0] for number in range(len(self.clean)))
+        change = [(each - clean).abs() for each, clean in zip(colours, self.clean, strict=True)]
         beyond = [each > self.epsilon + TOLERANCE for each in change]
         if not any(each.any() for each in beyond):
             return None
@@ -94,6 +95,3 @@ class ViewBudget:
             (at_texels,) = torch.autograd.grad(texels, leaf, total, retain_graph=True)
             sums.append(at_texels)
         return torch.where(sums[1] > 0, sums[0] / sums[1], 0).clamp(0, 1)
-
-    def _change(self, texels: Tensor, number: int) -> Tensor:
-        return (self.objective.surrogate.colours(texels, number)[0] - self.clean[number]).abs()

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.attack_runs import LABEL, random_state, run, surrogate_of
-from tests.fakes import fake_classifier
+from tests.attack_runs import LABEL, objective_of, random_state, run, surrogate_of
 from trompe_server.attack import Backgrounds, Budget, Goal, movable
 from trompe_server.attack.objective import Objective
 from trompe_server.surrogate import AnySurrogate, SamplingModel, Surrogate, diffuse_surrogate, joined, textures_of
@@ -28,7 +27,7 @@ def parts(square: Object3D) -> tuple[Surrogate, Surrogate, Surrogate]:
 
 
 def objective(obj: Object3D, surrogate: AnySurrogate, masks: torch.Tensor | None = None) -> Objective:
-    return Objective(textures_of(obj), surrogate, (fake_classifier(),), Goal(LABEL, loss="cross_entropy"), masks)
+    return objective_of(obj, surrogate, goal=Goal(LABEL, loss="cross_entropy"), masks=masks)
 
 
 def test_loss_and_gradient_are_those_of_all_parts(square: Object3D, parts: Sequence[Surrogate]) -> None:
