@@ -4,8 +4,12 @@ from trompe_server.pictures.contact_sheet import Verdict, contact_sheet, hardest
 from trompe_server.pictures.difference import difference_strip, texture_sheet
 from trompe_server.pictures.heat import heat_colours
 from trompe_server.pictures.histogram import prediction_histogram
-from trompe_server.pictures.saliency_sheet import saliency_sheet
-from trompe_server.pictures.saliency_texture import heat_textures, saliency_object_sheet, saliency_texture_sheet
+from trompe_server.pictures.saliency import (
+    heat_textures,
+    saliency_object_sheet,
+    saliency_sheet,
+    saliency_texture_sheet,
+)
 
 __all__ = [
     "Verdict",

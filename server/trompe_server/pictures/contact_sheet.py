@@ -19,7 +19,6 @@ from trompe_server.pictures.layout import (
     line,
     sheet,
     shortened,
-    text_width,
     tile,
 )
 from trompe_shared.geometry import Camera, spherical
@@ -100,8 +99,7 @@ def contact_sheet(
     """
     pairs = zip(before, after, verdicts_before, verdicts_after, strict=True)
     cards = [beside([_judged(old, was), _judged(new, now)], gap=2) for old, new, was, now in pairs]
-    legend = line(facts, text_width(facts, size=CAPTION))
-    return sheet(cards, columns=columns, title=f"{title} - left before, right after", legend=legend)
+    return sheet(cards, columns=columns, title=f"{title} - left before, right after", legend=line(facts))
 
 
 def _judged(image: Images, verdict: Verdict) -> Image.Image:

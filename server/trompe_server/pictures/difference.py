@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image
 
-from trompe_server.pictures.layout import INK, Images, beside, captioned, sheet, tile
+from trompe_server.pictures.layout import Images, captioned, framed, sheet
 
 AMPLIFIED: Final = 10
 """Factor by which differences are amplified."""
@@ -33,5 +33,5 @@ def texture_sheet(before: Mapping[str, Images], after: Mapping[str, Images], *, 
 
 
 def _triple(before: Images, after: Images) -> Image.Image:
-    images = {"before": before, "after": after, f"|difference| x{AMPLIFIED}": amplified_difference(before, after)}
-    return beside([captioned(ImageOps.expand(tile(image, TILE), 1, INK), text) for text, image in images.items()])
+    change = amplified_difference(before, after)
+    return framed({"before": before, "after": after, f"|difference| x{AMPLIFIED}": change}, TILE)

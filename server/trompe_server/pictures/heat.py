@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from PIL import Image
 
-from trompe_server.pictures.layout import CAPTION, GAP, INK, PAPER, Images, beside, line, stacked, swatch, text_width
+from trompe_server.pictures.layout import CAPTION, GAP, PAPER, Images, beside, line, stacked, swatch
 
 OUTLINE: Final = (0, 255, 255)
 HEAT: Final = np.array(
@@ -54,13 +54,9 @@ def heat_legend(text: str, *, tau: float | None = None) -> Image.Image:
     ramp = np.linspace(0, 1, BAR[0]) ** 2
     bar = heat_over(np.full((BAR[1], BAR[0], 3), GREY, np.uint8), np.broadcast_to(ramp, BAR[::-1]))
     scale = stacked([Image.fromarray(bar), _ticks()], gap=2)
-    parts = [line(text, text_width(text, size=CAPTION), size=CAPTION), scale]
+    parts = [line(text), scale]
     if tau is not None:
-        words = f"outlined: {tau:g} or more"
-        parts += [
-            swatch((GREY, GREY, GREY), outline=OUTLINE),
-            line(words, text_width(words, size=CAPTION), size=CAPTION),
-        ]
+        parts += [swatch((GREY, GREY, GREY), outline=OUTLINE), line(f"outlined: {tau:g} or more")]
     return beside(parts, gap=2 * GAP)
 
 
@@ -68,8 +64,7 @@ def _ticks() -> Image.Image:
     """The values of the scale, below their colours."""
     picture = Image.new("RGB", (BAR[0], CAPTION + GAP), PAPER)
     for value in TICKS:
-        words = f"{value:g}"
-        word = line(words, text_width(words, size=CAPTION), size=CAPTION, colour=INK)
+        word = line(f"{value:g}")
         x = round(value**0.5 * BAR[0] - word.width / 2)
         picture.paste(word, (min(max(x, 0), BAR[0] - word.width), 0))
     return picture

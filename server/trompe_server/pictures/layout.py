@@ -1,14 +1,14 @@
 """Layout of all report pictures: colours, text, tiles, sheets. Lengths are in pixels."""
 
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from math import ceil
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 Images = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -58,10 +58,11 @@ def text_width(text: str, *, size: int) -> int:
 
 
 def line(
-    text: str, width: int, *, size: int = CAPTION, colour: Colour = INK, ground: Colour = PAPER, align: Align = "left"
+    text: str, width: int | None = None, *, size: int = CAPTION, colour: Colour = INK, align: Align = "left"
 ) -> Image.Image:
-    """A picture of ``width`` with one line of text, shortened to fit."""
-    picture = Image.new("RGB", (width, size + GAP), ground)
+    """A picture of ``width`` with one line of text, shortened to fit; by default as wide as the text."""
+    width = text_width(text, size=size) if width is None else width
+    picture = Image.new("RGB", (width, size + GAP), PAPER)
     text = shortened(text, width, size=size)
     room = width - int(_font(size).getlength(text))
     x = {"left": 0, "centre": room // 2, "right": room}[align]
@@ -89,6 +90,16 @@ def tile(image: Images, width: int) -> Image.Image:
 def captioned(picture: Image.Image, text: str, *, colour: Colour = INK) -> Image.Image:
     """The picture with one centred line of text below, shortened to its width."""
     return stacked([picture, line(text, picture.width, colour=colour, align="centre")], gap=0)
+
+
+def framed(pictures: Mapping[str, Images], width: int) -> Image.Image:
+    """(H, W, 3) images side by side, scaled to ``width`` and framed, each above its caption."""
+    return beside([captioned(frame(image, width), text) for text, image in pictures.items()])
+
+
+def frame(image: Images, width: int) -> Image.Image:
+    """An (H, W, 3) image scaled to ``width``, in a thin frame."""
+    return ImageOps.expand(tile(image, width), 1, INK)
 
 
 def beside(pictures: Sequence[Image.Image], *, gap: int = GAP) -> Image.Image:

@@ -37,7 +37,7 @@ from trompe_server.pictures.layout import (
     stacked,
     text_width,
 )
-from trompe_server.pictures.saliency_sheet import TILE as SALIENCY_TILE
+from trompe_server.pictures.saliency import TILE as SALIENCY_TILE
 
 BLUE = (40, 80, 160)
 BELOW_LEGEND = 120
@@ -251,10 +251,10 @@ def test_the_legend_shows_a_value_in_the_colour_that_a_picture_has_there(value: 
 
 
 @given(st.sampled_from(["left", "centre", "right"]), st.integers(20, 200))
-def test_a_line_stays_within_its_width_on_its_ground(align: Align, width: int) -> None:
-    picture = np.array(line("some words", width, align=align, ground=BLUE, colour=PAPER))
+def test_a_line_stays_within_its_width_on_its_side(align: Align, width: int) -> None:
+    picture = np.array(line("some words", width, align=align))
     assert picture.shape[1] == width
-    letters = np.flatnonzero((picture != BLUE).any(axis=(0, 2)))
+    letters = np.flatnonzero((picture != PAPER).any(axis=(0, 2)))
     room = width - text_width("some words", size=CAPTION)
     if room > 4:
         expected = {"left": 0, "centre": room // 2, "right": room}[align]

@@ -1,4 +1,4 @@
-"""Saliency on the object: sensitivity of the classifier's loss to each texel, over all views."""
+"""Sheets of saliency: sensitivity of the classifier's loss to the pixels of images, and to texels over all views."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -6,10 +6,11 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image
+from scipy.ndimage import binary_erosion
 
-from trompe_server.pictures.heat import heat_legend, heat_over
-from trompe_server.pictures.layout import INK, Images, beside, captioned, sheet, tile
+from trompe_server.pictures.heat import OUTLINE, heat_legend, heat_over
+from trompe_server.pictures.layout import Images, beside, captioned, frame, framed, sheet, tile
 
 TILE: Final = 336
 OBJECT_TILE: Final = 224
@@ -18,6 +19,26 @@ TOP: Final = 0.005
 
 Textures = Mapping[str, Images]
 Scores = Mapping[str, Float[np.ndarray, "H W"]]
+
+
+def saliency_sheet(
+    images: Images, saliency: Float[np.ndarray, "n H W"], *, tau: float | None, title: str
+) -> Image.Image:
+    """Target images (N, H, W, 3) with their saliency in [0, 1] as heat; pixels at or above ``tau`` are outlined."""
+    cards = [_card(image, heat, tau) for image, heat in zip(images, saliency, strict=True)]
+    legend = heat_legend("saliency, 1 is the largest of all views", tau=tau)
+    return sheet(cards, columns=3, title=title, legend=legend)
+
+
+def _card(image: Images, saliency: Float[np.ndarray, "H W"], tau: float | None) -> Image.Image:
+    painted = tile(heat_over(image, saliency), TILE)
+    if tau is None:
+        return captioned(painted, f"largest {saliency.max():.2f}")
+    mask = saliency >= tau
+    large = np.array(Image.fromarray(mask).resize(painted.size, Image.Resampling.NEAREST))
+    outlined = np.array(painted)
+    outlined[large & ~binary_erosion(large)] = OUTLINE  # its pixels with a neighbour outside
+    return captioned(Image.fromarray(outlined), f"{mask.mean():.1%} of pixels at or above {tau:g}")
 
 
 def heat_textures(textures: Textures, scores: Scores) -> dict[str, Images]:
@@ -40,7 +61,7 @@ def _row(name: str, texture: Images, painted: Images, scores: Scores) -> Image.I
     texels = scores[name].size
     half = _texels_with_half(scores[name])
     facts = f"{name}: half of its saliency is on {half / texels:.1%} of its texels" if half else f"{name}: never seen"
-    return captioned(beside([_framed(texture, TILE), _framed(painted, TILE)]), facts)
+    return captioned(beside([frame(texture, TILE), frame(painted, TILE)]), facts)
 
 
 def saliency_object_sheet(
@@ -58,7 +79,7 @@ def saliency_object_sheet(
 def _triple(image: Images, saliency: Float[np.ndarray, "H W"], rendered: Images) -> Image.Image:
     hot = heat_over(image, _scaled({"view": saliency})["view"])
     pictures = {"as it is": image, "saliency of this view": hot, "accumulated on the object": rendered}
-    return beside([captioned(_framed(picture, OBJECT_TILE), text) for text, picture in pictures.items()])
+    return framed(pictures, OBJECT_TILE)
 
 
 def _scaled(scores: Scores) -> dict[str, NDArray[np.float32]]:
@@ -73,7 +94,3 @@ def _texels_with_half(score: Float[np.ndarray, "H W"]) -> int:
     """Smallest number of texels with half of the sum; 0 for an empty map."""
     ranked = np.cumsum(np.sort(score.ravel().astype(np.float64))[::-1])
     return int(np.searchsorted(ranked, ranked[-1] / 2)) + 1 if ranked[-1] > 0 else 0
-
-
-def _framed(image: Images, width: int) -> Image.Image:
-    return ImageOps.expand(tile(image, width), 1, INK)
