@@ -41,7 +41,9 @@ class Tree:
 
     def pictures(self) -> dict[str, bytes]:
         """The image files inside, by their names in materials."""
-        return {name: _bytes(content) for video in self._videos() for name, content in [_picture(video)] if content}
+        return {
+            name: content.properties[5:] for video in self._videos() for name, content in [_picture(video)] if content
+        }
 
     def with_pictures(self, pictures: dict[str, bytes | None]) -> "Tree":
         """The tree with other image files; ``None`` removes a file."""
@@ -54,19 +56,15 @@ class Tree:
 
     def to_bytes(self) -> bytes:
         """The file's bytes."""
-        out = bytearray(MAGIC + struct.pack("<I", self.version))
+        header, out = _header(self.version), bytearray(MAGIC + struct.pack("<I", self.version))
         for node in self.nodes:
-            _write(node, out, self._header)
-        out += bytes(self._header.size + 1)
+            _write(node, out, header)
+        out += bytes(header.size + 1)
         if len(self.footer) < _ID + _END:
             return bytes(out + self.footer)
         out += self.footer[:_ID]
         out += bytes(16 - len(out) % 16) + self.footer[-_END:]
         return bytes(out)
-
-    @property
-    def _header(self) -> struct.Struct:
-        return _header(self.version)
 
 
 def parse_tree(data: bytes) -> Tree:
@@ -119,10 +117,6 @@ def _picture(video: Node) -> tuple[str, Node | None]:
     inside = content is not None and content.properties[:1] == b"R" and len(content.properties) > 5
     name = named.properties[5:].decode("utf-8", "replace") if named is not None else ""
     return base_name(name), content if inside else None
-
-
-def _bytes(content: Node) -> bytes:
-    return content.properties[5:]
 
 
 def _replaced(node: Node, pictures: dict[str, bytes | None]) -> Node:

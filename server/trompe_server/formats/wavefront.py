@@ -62,13 +62,7 @@ def complete(files: Mapping[str, bytes]) -> dict[str, bytes]:
     Complete files stay unchanged. An MTL gets the missing lines and the capitals of the pictures' files. A changed OBJ
     is rewritten.
     """
-    files = _spelled(files)
-    mesh = next(name for name in files if name.lower().endswith(".obj"))
-    libraries = {
-        name: data.decode("utf-8-sig", "replace") for name, data in files.items() if name.lower().endswith(".mtl")
-    }
-    surfaces = parse_surfaces(files[mesh].decode("utf-8-sig", "replace"), mesh)
-    return _Completion(mesh, dict(files), libraries, surfaces).files_of()
+    return _Completion(_spelled(files)).files_of()
 
 
 def _spelled(files: Mapping[str, bytes]) -> dict[str, bytes]:
@@ -111,19 +105,24 @@ def _grey(data: bytes, name: str) -> NDArray[np.uint8]:
 
 
 class _Completion:
-    def __init__(
-        self, mesh: str, files: dict[str, bytes], libraries: dict[str, str], surfaces: Sequence[Surface]
-    ) -> None:
-        self._mesh, self._files, self._libraries, self._surfaces = mesh, files, libraries, surfaces
-        self._library = next(iter(libraries), f"{mesh[:-4]}.mtl")
+    def __init__(self, files: dict[str, bytes]) -> None:
+        self._files = files
+        self._mesh = next(name for name in files if name.lower().endswith(".obj"))
+        self._libraries = {
+            name: data.decode("utf-8-sig", "replace") for name, data in files.items() if name.lower().endswith(".mtl")
+        }
+        self._surfaces = parse_surfaces(files[self._mesh].decode("utf-8-sig", "replace"), self._mesh)
+        self._library = next(iter(self._libraries), f"{self._mesh[:-4]}.mtl")
         self._parts: list[Part] = []
-        self._rewritten = not libraries
+        self._rewritten = not self._libraries
 
     def files_of(self) -> dict[str, bytes]:
         """The completed files."""
         if not self._libraries:
             self._refuse_unnamed_pictures()
-            self._surfaces = [_renamed(surface) for surface in self._surfaces]
+            self._surfaces = tuple(
+                replace(surface, material=safe_name(surface.material, default="default")) for surface in self._surfaces
+            )
             names = dict.fromkeys(surface.material for surface in self._surfaces)
             self._libraries = {self._library: "".join(f"newmtl {name}\n" for name in names)}
         texts = dict(self._libraries)
@@ -178,10 +177,6 @@ class _Completion:
                 if material == surface.material and line.split(maxsplit=1)[:1] == ["Kd"]:
                     return _numbers(line, surface.material)
         return DEFAULT_COLOUR
-
-
-def _renamed(surface: Surface) -> Surface:
-    return replace(surface, material=safe_name(surface.material, default="default"))
 
 
 def _lines(text: str) -> Iterator[tuple[str | None, str]]:

@@ -2,10 +2,9 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from numpy.typing import NDArray
 
@@ -14,6 +13,8 @@ from trompe_server.job.protocol import Artifacts, DamagedFileError, numbered
 from trompe_server.storage.arrays import pack_arrays, unpack_arrays
 from trompe_server.surrogate.calibration import Calibration
 from trompe_server.surrogate.calibration_file import unpack_calibration
+
+T = TypeVar("T")
 
 OPEN: Final = "open"
 """Kind of the time before and between phases."""
@@ -47,47 +48,44 @@ class JobFiles:
 
     def save(self, name: str, **arrays: NDArray[Any]) -> None:
         """Save arrays under ``name``."""
-        self._seal(f"{name}.npz", pack_arrays(arrays))
+        self._seal(name, pack_arrays(arrays))
 
     def load(self, name: str) -> dict[str, NDArray[Any]]:
         """The arrays saved under ``name``. Raises ``DamagedFileError``."""
-        with _whole(name):
-            return unpack_arrays(self._unseal(f"{name}.npz"))
+        return self._unseal(name, unpack_arrays)
 
     def save_state(self, chunk: int, state: AttackState) -> None:
         """Save the state after ``chunk`` chunks. Two files alternate: the state at a chunk's start outlives it."""
-        self._seal(f"state-{chunk % 2}.npz", save_state(state))
+        self._seal(f"state-{chunk % 2}", save_state(state))
 
     def load_state(self, chunk: int, *, step: int) -> AttackState:
         """The state after ``chunk`` chunks, at ``step``.
 
         Raises ``DamagedFileError`` for a damaged file or one of another step.
         """
-        name = f"state-{chunk % 2}"
-        with _whole(name):
-            state = load_state(self._unseal(f"{name}.npz"))
-            if state.step != step:
+
+        def of_step(data: bytes) -> AttackState:
+            if (state := load_state(data)).step != step:
                 raise ValueError(f"it is of step {state.step} instead of {step}")
-        return state
+            return state
+
+        return self._unseal(f"state-{chunk % 2}", of_step)
 
     def save_end(self, state: AttackState) -> None:
         """Save the state after the last step that was taken."""
-        self._seal("state-end.npz", save_state(state))
+        self._seal("state-end", save_state(state))
 
     def load_end(self) -> AttackState:
         """The state of ``save_end``. Raises ``DamagedFileError``."""
-        with _whole("state-end"):
-            return load_state(self._unseal("state-end.npz"))
+        return self._unseal("state-end", load_state)
 
     def save_calibration(self, renderer: int, packed: bytes) -> None:
         """Save the packed calibration of a renderer, by its number."""
-        self._seal(f"{numbered(_CALIBRATION, renderer)}.npz", packed)
+        self._seal(numbered("calibration", renderer), packed)
 
     def load_calibration(self, renderer: int) -> Calibration:
         """The saved calibration of a renderer. Raises ``DamagedFileError``."""
-        name = numbered(_CALIBRATION, renderer)
-        with _whole(name):
-            return unpack_calibration(self._unseal(f"{name}.npz"))
+        return self._unseal(numbered("calibration", renderer), unpack_calibration)
 
     def has_calibration(self, renderer: int) -> bool:
         """Whether a usable calibration is saved."""
@@ -142,16 +140,20 @@ class JobFiles:
         return Spent(sum(each["steps"] for each in spent), evaluations, queries or None, added, renders)
 
     def _seal(self, name: str, data: bytes) -> None:
-        """Write bytes with their hash at the end, which readers of .npz files ignore."""
-        self.artifacts.write(name, data + hashlib.sha256(data).digest())
+        """Write an .npz file with its hash at the end, which readers of such files ignore."""
+        self.artifacts.write(f"{name}.npz", data + hashlib.sha256(data).digest())
 
-    def _unseal(self, name: str) -> bytes:
-        """The bytes that ``_seal`` wrote. Raises ``ValueError`` for a wrong hash."""
-        sealed = self.artifacts.read(name)
-        data, digest = sealed[:-_HASH], sealed[-_HASH:]
-        if hashlib.sha256(data).digest() != digest:
-            raise ValueError("its checksum is wrong")
-        return data
+    def _unseal(self, name: str, unpack: Callable[[bytes], T]) -> T:
+        """What ``unpack`` makes of the bytes that ``_seal`` wrote. Raises ``DamagedFileError`` for a missing or damaged
+        file, so that its phase is run again."""
+        try:
+            sealed = self.artifacts.read(f"{name}.npz")
+            data, digest = sealed[:-_HASH], sealed[-_HASH:]
+            if hashlib.sha256(data).digest() != digest:
+                raise ValueError("its checksum is wrong")
+            return unpack(data)
+        except (FileNotFoundError, ValueError) as error:
+            raise DamagedFileError(f"The file {name!r} of an earlier phase cannot be used: {error}") from error
 
     def _write(self, name: str, value: Any) -> None:
         self.artifacts.write(f"{name}.json", json.dumps(value).encode())
@@ -164,15 +166,5 @@ class JobFiles:
             return None
 
 
-@contextmanager
-def _whole(name: str) -> Iterator[None]:
-    """Translate a missing or damaged file, so that its phase is run again."""
-    try:
-        yield
-    except (FileNotFoundError, ValueError) as error:
-        raise DamagedFileError(f"The file {name!r} of an earlier phase cannot be used: {error}") from error
-
-
-_CALIBRATION: Final = "calibration"
 _LOOK: Final = "look"
 _HASH: Final = hashlib.sha256().digest_size

@@ -153,16 +153,20 @@ class TextureAttack:
         setup = self.setup
         count = len(setup.views) + len(setup.held_out)
         ask = self._asker("prepare", count * len(setup.renderers), on_progress)
-        for number, renderer in enumerate(setup.renderers):
-            own = ask(renderer, setup.obj, renderer.shown(setup.views))
-            held_out = ask(renderer, setup.obj, renderer.shown(setup.held_out, held_out=True))
-            self.files.save(numbered(VIEWS_BEFORE, number), own=own, held_out=held_out)
+        self._render_all(VIEWS_BEFORE, setup.obj, ask)
         if setup.white_box:
             self.files.save("saliency", maps=self._saliency())
         if not any(self._recognised):
             return self._end_without_attack()
         _ = self._masks  # raises for a tau that leaves no pixel, before more images are rendered
         return PhaseReport(self._progress("prepare", 1.0))
+
+    def _render_all(self, name: str, obj: Object3D, ask: Ask) -> None:
+        """Save the images of own and held-out views of ``obj`` in each renderer under ``name``."""
+        for number, renderer in enumerate(self.setup.renderers):
+            own = ask(renderer, obj, renderer.shown(self.setup.views))
+            held_out = ask(renderer, obj, renderer.shown(self.setup.held_out, held_out=True))
+            self.files.save(numbered(name, number), own=own, held_out=held_out)
 
     def _saliency(self) -> NDArray[np.float16]:
         """Saliency of the attacked renderers' images (views, H, W): with tau of all, otherwise of those that the report
@@ -301,11 +305,8 @@ class TextureAttack:
         # The figures and the report take about as long as the images.
         count = len(setup.views) + len(setup.held_out)
         ask = self._asker("judge", 2 * count * len(setup.renderers), on_progress)
-        for number, renderer in enumerate(setup.renderers):
-            own = ask(renderer, painted, renderer.shown(setup.views))
-            held_out = ask(renderer, painted, renderer.shown(setup.held_out, held_out=True))
-            self.files.save(numbered(VIEWS_AFTER, number), own=own, held_out=held_out)
-        scores = None if self._scores is None else _numpy(self._scores)
+        self._render_all(VIEWS_AFTER, painted, ask)
+        scores = self._scores
         seen = [replace(each, painted=painted, scores=scores, **self._attacked(each)) for each in self._seen()]
         headline = worst(seen)
         if scores is not None:
@@ -417,9 +418,12 @@ class TextureAttack:
         return saliency_masks(self._maps, self.spec.paint.tau).to(self.setup.device)
 
     @cached_property
-    def _scores(self) -> Mapping[str, torch.Tensor] | None:
+    def _scores(self) -> Mapping[str, NDArray[np.float32]] | None:
         """Saliency accumulated per texel."""
-        return None if self._maps is None else rank_texels(self._surrogate, self._textures, self._maps)
+        if self._maps is None:
+            return None
+        scores = rank_texels(self._surrogate, self._textures, self._maps)
+        return {name: score.detach().cpu().numpy() for name, score in scores.items()}
 
     def _backgrounds(self, added: Sequence[View] = ()) -> Backgrounds | None:
         """Backgrounds of a pool's views, drawn more often where the object is recognised better."""
@@ -467,7 +471,3 @@ class TextureAttack:
         )
         self.files.save(FEW, **{str(k): few.masks[name].cpu().numpy() for k, name in enumerate(self._textures)})
         return len(gradients) + few.evaluations
-
-
-def _numpy(scores: Mapping[str, torch.Tensor]) -> dict[str, NDArray[np.float32]]:
-    return {name: score.detach().cpu().numpy() for name, score in scores.items()}

@@ -1,7 +1,7 @@
 """From what a judgement has seen to its manifest."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Final
 
@@ -119,13 +119,7 @@ def view_record(view: View) -> ViewRecord:
 def view_of(record: ViewRecord) -> View:
     """Inverse of ``view_record``."""
     camera = Camera(record.distance, record.azimuth, record.elevation, record.roll, record.centre)
-    light = Light(
-        record.light_azimuth,
-        record.light_elevation,
-        record.light_intensity,
-        record.light_ambient,
-        record.light_colour,
-    )
+    light = Light(*(getattr(record, f"light_{each.name}") for each in fields(Light)))
     return View(camera, light, record.background)
 
 

@@ -217,18 +217,8 @@ def _verdicts(when: str, logits: Logits, label: Label) -> list[dict[str, Any]]:
 
 def camera_and_light(view: View) -> dict[str, Any]:
     """Fields of a record of a view."""
-    camera, light = view.camera, view.light
-    return {
-        "azimuth": camera.azimuth,
-        "elevation": camera.elevation,
-        "distance": camera.distance,
-        "roll": camera.roll,
-        "light_azimuth": light.azimuth,
-        "light_elevation": light.elevation,
-        "light_intensity": light.intensity,
-        "light_ambient": light.ambient,
-        "light_colour": light.colour,
-    }
+    camera = {name: getattr(view.camera, name) for name in ("azimuth", "elevation", "distance", "roll")}
+    return camera | {f"light_{name}": value for name, value in vars(view.light).items()}
 
 
 def fooled_as(before: Logits, after: Logits, label: Label) -> dict[int, int]:

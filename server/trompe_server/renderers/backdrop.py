@@ -1,13 +1,13 @@
 """Photographs behind the object, for renderers with uniform backgrounds only."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from trompe_server.renderers.protocol import TargetRenderer
+from trompe_server.renderers.protocol import OnFrame, TargetRenderer
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
@@ -35,12 +35,7 @@ class BackdropTarget:
         return self._target.engine
 
     def render(
-        self,
-        obj: Object3D,
-        views: Sequence[View],
-        *,
-        size: tuple[int, int],
-        on_frame: Callable[[], None] | None = None,
+        self, obj: Object3D, views: Sequence[View], *, size: tuple[int, int], on_frame: OnFrame | None = None
     ) -> Images:
         """Render as ``TargetRenderer.render``, with two images for each view with a backdrop."""
         before = [replace(view, background=(0, 0, 0)) if view.backdrop else view for view in views]

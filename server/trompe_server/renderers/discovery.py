@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_server.renderers.choice import listed
-from trompe_server.renderers.protocol import TargetRenderer
+from trompe_server.renderers.protocol import OnFrame, TargetRenderer
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, RendererLostError
 from trompe_shared.geometry import View
@@ -78,12 +78,7 @@ class DiscoveredRenderers:
         self._looked = time.monotonic()
 
     def render(
-        self,
-        obj: Object3D,
-        views: Sequence[View],
-        *,
-        size: tuple[int, int],
-        on_frame: Callable[[], None] | None = None,
+        self, obj: Object3D, views: Sequence[View], *, size: tuple[int, int], on_frame: OnFrame | None = None
     ) -> NDArray[np.uint8]:
         """Render with the current renderers. Arguments as in ``TargetRenderer.render``."""
         if time.monotonic() - self._looked > RESOLVE_INTERVAL:

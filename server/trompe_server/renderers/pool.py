@@ -6,13 +6,14 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from trompe_server.renderers.protocol import OnFrame
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, RendererLostError
 from trompe_shared.geometry import View
@@ -65,7 +66,7 @@ class RendererPool:
         timeout: float = 120.0,
         suspicion: float = 2.0,
         patience: float = 5.0,
-        rest: float = 5.0,
+        rest: float = REST,
     ) -> None:
         if not addresses:
             raise RendererError("A pool needs at least one renderer address.")
@@ -99,12 +100,7 @@ class RendererPool:
         raise AssertionError("there is at least one worker")
 
     def render(
-        self,
-        obj: Object3D,
-        views: Sequence[View],
-        *,
-        size: tuple[int, int],
-        on_frame: Callable[[], None] | None = None,
+        self, obj: Object3D, views: Sequence[View], *, size: tuple[int, int], on_frame: OnFrame | None = None
     ) -> Images:
         """Render as ``TargetRenderer.render``. Raises ``RendererLostError`` if every worker is lost."""
         _ = self.engine

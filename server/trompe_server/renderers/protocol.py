@@ -10,6 +10,8 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
+OnFrame = Callable[[], None]
+
 
 class TargetRenderer(Protocol):
     """A renderer that gives images and nothing else."""
@@ -20,12 +22,7 @@ class TargetRenderer(Protocol):
         ...
 
     def render(
-        self,
-        obj: Object3D,
-        views: Sequence[View],
-        *,
-        size: tuple[int, int],
-        on_frame: Callable[[], None] | None = None,
+        self, obj: Object3D, views: Sequence[View], *, size: tuple[int, int], on_frame: OnFrame | None = None
     ) -> NDArray[np.uint8]:
         """Images of ``obj``, (views, H, W, 3) uint8, sRGB, row 0 on top, not mirrored; ``size`` is (H, W).
 

@@ -58,7 +58,7 @@ def _saliency(data: ReportData, title: str) -> dict[str, Image.Image]:
         return {}
     some = saliency_views(setup)
     own = data.before["own"][some]
-    sheets = {"saliency.png": saliency_sheet(own, maps[some], tau=data.spec.paint.tau, title=title, columns=3)}
+    sheets = {"saliency.png": saliency_sheet(own, maps[some], tau=data.spec.paint.tau, title=title)}
     if data.scores is not None and data.heated is not None:
         sheets["saliency_textures.png"] = saliency_texture_sheet(setup.obj.textures, data.scores, title=title)
         sheets["saliency_object.png"] = saliency_object_sheet(own, maps[some], data.heated, title=title)

@@ -71,17 +71,13 @@ def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
         seed=spec.search.seed,
         steps=data.spent.steps,
         image_size=setup.size,
-        renderer=data.renderer.engine,
-        renderers=[_in_renderer(each) for each in seen] if len(seen) > 1 else [],
-        surrogate=data.predicted,
-        target=data.target,
-        held_out=data.held_out,
+        renderers=[
+            RendererResult(attacked=each.renderer.attacked, **_figures(each))
+            for each in (seen if len(seen) > 1 else ())
+        ],
         fooled_as=became,
-        transfer_gap=transfer_gap(data.predicted, data.target),
-        **_agreement(data),
-        judges=[_judgement(_judge(network, data), data) for network in setup.judges],
+        judges=[_judgement(network, data) for network in setup.judges],
         image_pipelines=_through_suite(data),
-        **_calibration_fields(data),
         probe_renders=sum(each.calibration.renders for each in seen if each.calibration is not None),
         attacked_views=len(setup.views) + data.spent.added,
         further_renders=data.spent.renders,
@@ -92,34 +88,29 @@ def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
         warnings=[*warnings, *warnings_of(data, seen), *([synonyms] if synonyms else [])],
         seconds={},
         versions=versions(),
-        **_views(data),
+        **({"surrogate_model": spec.search.surrogate, "surrogate_reason": "not built"} | _figures(data)),
     )
 
 
-def _in_renderer(data: ReportData) -> RendererResult:
-    return RendererResult(
-        renderer=data.renderer.engine,
-        attacked=data.renderer.attacked,
-        surrogate=data.predicted,
-        target=data.target,
-        held_out=data.held_out,
-        transfer_gap=transfer_gap(data.predicted, data.target),
-        **_agreement(data),
-        **(_calibration_fields(data) if data.calibration is not None else {}),
-        **_views(data),
-    )
-
-
-def _agreement(data: ReportData) -> dict[str, Any]:
-    return {} if data.agreement is None else data.agreement._asdict()
-
-
-def _views(data: ReportData) -> dict[str, Any]:
-    """Predictions of all views."""
+def _figures(data: ReportData) -> dict[str, Any]:
+    """The figures and views of one renderer, by their names in ``Result`` and in ``RendererResult``."""
     setup, before, after = data.setup, data.logits_before, data.logits_after or {}
     own = view_predictions(setup.views, before["own"], after.get("own"), setup.labels)
-    unseen = view_predictions(setup.held_out, before["held_out"], after.get("held_out"), setup.labels)
-    return {"views": _with_fits(own, data.fits), "held_out_views": unseen}
+    figures: dict[str, Any] = {
+        "renderer": data.renderer.engine,
+        "surrogate": data.predicted,
+        "target": data.target,
+        "held_out": data.held_out,
+        "transfer_gap": transfer_gap(data.predicted, data.target),
+        "views": _with_fits(own, data.fits),
+        "held_out_views": view_predictions(setup.held_out, before["held_out"], after.get("held_out"), setup.labels),
+    }
+    if data.agreement is not None:
+        figures |= data.agreement._asdict()
+    if (calibration := data.calibration) is not None:
+        figures |= {"surrogate_model": calibration.model, "surrogate_reason": calibration.reason}
+        figures["fidelity"] = _rounded(calibration.fidelity.mean())
+    return figures
 
 
 def _with_fits(views: Sequence[ViewPrediction], fits: Sequence[ViewFit | None]) -> list[ViewPrediction]:
@@ -134,17 +125,15 @@ def _goal_reached(data: ReportData) -> float | None:
     return float(data.setup.goal.reached(torch.from_numpy(data.logits_after["own"])).float().mean())
 
 
-def _judge(network: Classifier, data: ReportData) -> Judge:
-    return Judge.of(network, data.spec.goal.label, classes=data.setup.classifier.classes)
+def _judgement(network: Classifier, data: ReportData) -> Judgement:
+    judge = Judge.of(network, data.spec.goal.label, classes=data.setup.classifier.classes)
 
-
-def _judgement(judge: Judge, data: ReportData) -> Judgement:
     def judged(views: str) -> Accuracy:
-        after = None if data.after is None else judge.network.predict(data.after[views])
-        return judge.accuracy(judge.network.predict(data.before[views]), after, distinct=data.distinct(views))
+        after = None if data.after is None else network.predict(data.after[views])
+        return judge.accuracy(network.predict(data.before[views]), after, distinct=data.distinct(views))
 
     held_out = judged("held_out") if data.setup.held_out else None
-    return Judgement(classifier=judge.network.name, target=judged("own"), held_out=held_out)
+    return Judgement(classifier=network.name, target=judged("own"), held_out=held_out)
 
 
 def _through_suite(data: ReportData) -> list[PipelineJudgement]:
@@ -170,17 +159,6 @@ def _ahead(make: Callable[[S], T], items: Iterable[S]) -> Iterator[T]:
             if len(made) > 1:
                 yield made.popleft().result()
         yield from (each.result() for each in made)
-
-
-def _calibration_fields(data: ReportData) -> dict[str, Any]:
-    calibration = data.calibration
-    if calibration is None:
-        return {"surrogate_model": data.spec.search.surrogate, "surrogate_reason": "not built"}
-    return {
-        "surrogate_model": calibration.model,
-        "surrogate_reason": calibration.reason,
-        "fidelity": _rounded(calibration.fidelity.mean()),
-    }
 
 
 def _rounded(figures: Mapping[str, float]) -> dict[str, float]:
