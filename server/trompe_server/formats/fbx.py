@@ -18,7 +18,7 @@ from trompe_server.formats.assembly import assemble, repainted, safe_name
 from trompe_server.formats.fbx_tree import MAGIC, Tree, parse_tree
 from trompe_server.formats.pictures import decode, with_alpha_of
 from trompe_server.formats.upload import Upload, base_name
-from trompe_server.formats.wavefront import complete, dissolved, shrunk
+from trompe_server.formats.wavefront import complete, dissolved
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D, object_from_files
 
@@ -39,14 +39,9 @@ def unit(data: bytes) -> float:
     return float(factor) * CENTIMETRE
 
 
-def read(upload: Upload, max_texture: int | None = None) -> Object3D:
-    """Read an FBX and the textures beside it. Raises ``ObjectError``."""
-    return shrunk(_read(upload), max_texture)
-
-
 def repaint(upload: Upload, painted: Object3D) -> Upload:
     """``upload`` with the textures of ``painted``. Raises ``ObjectError`` for paint on a plain colour."""
-    original, tree = _read(upload), _tree(upload.data)
+    original, tree = read(upload), _tree(upload.data)
     changed = repainted(original, painted)
     beside, inside = upload.flat(), tree.pictures() if tree is not None else {}
     homeless = sorted(name for name in changed if name not in beside and name not in inside)
@@ -66,7 +61,8 @@ def _tree(data: bytes) -> Tree | None:
     return parse_tree(data) if data.startswith(MAGIC) else None
 
 
-def _read(upload: Upload) -> Object3D:
+def read(upload: Upload) -> Object3D:
+    """Read an FBX and the textures beside it. Raises ``ObjectError``."""
     scale, tree = unit(upload.data), _tree(upload.data)
     beside = {name: data for name, data in upload.flat().items() if not name.lower().endswith((".obj", ".mtl"))}
     inside = tree.pictures() if tree is not None else {}

@@ -118,10 +118,9 @@ class Model:
         else:
             picture = flat_picture(factor.tolist(), size)
         slot = self._slot(index, unwrapped=True)
-        name = self._new_file(f"{self._material_name(index)}_albedo.png", b"")
         alpha = None if slot.alpha is None else np.full(size, 255, np.uint8)
-        self.files[name] = _albedo_png(shrink(picture, self.max_texture), alpha, slot)
-        self.slots[slot] = name
+        png = _albedo_png(shrink(picture, self.max_texture), alpha, slot)
+        self.slots[slot] = self._new_file(f"{self._material_name(index)}_albedo.png", png)
 
     def _material(self, index: int | None) -> Material:
         return Material() if index is None else at(self.document.materials, index, "material")
@@ -198,9 +197,8 @@ class Model:
             rgb, _ = decode(data, f"{self._image_name(image)} (a normal map)")
             small = shrink(scaled_normals(rgb, info.scale), self.max_texture)
             ending = _ending(data) if small is rgb else None
-            name = self._new_file(f"{self._image_name(image)}.{ending or 'png'}", b"")
-            self.files[name] = data if ending is not None else encode_png(small)
-            self._converted[key] = name
+            kept = data if ending is not None else encode_png(small)
+            self._converted[key] = self._new_file(f"{self._image_name(image)}.{ending or 'png'}", kept)
         return self._converted[key]
 
     def _metallic(self, material: Material) -> str | None:

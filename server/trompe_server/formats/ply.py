@@ -23,7 +23,6 @@ from trompe_server.formats.assembly import (
 )
 from trompe_server.formats.pictures import decode, with_alpha_of
 from trompe_server.formats.upload import Upload, refusing
-from trompe_server.formats.wavefront import shrunk
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Material, Object3D, encode_png
 from trompe_shared.wavefront import MAX_FACES, Part, Surface, smooth_normals
@@ -48,14 +47,9 @@ class _Header:
     corner_uvs: bool
 
 
-def read(upload: Upload, max_texture: int | None = None) -> Object3D:
-    """Read a PLY and the texture beside it. Raises ``ObjectError``."""
-    return shrunk(_read(upload), max_texture)
-
-
 def repaint(upload: Upload, painted: Object3D) -> Upload:
     """``upload`` with the texture of ``painted``: replaces its texture file, or adds one to a new PLY."""
-    original = _read(upload)
+    original = read(upload)
     changed = repainted(original, painted)
     if not changed:
         return upload
@@ -70,7 +64,8 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
     return upload.with_flat({upload.main.rsplit("/", 1)[-1]: _written(part, place), place: encode_png(rgb)})
 
 
-def _read(upload: Upload) -> Object3D:
+def read(upload: Upload) -> Object3D:
+    """Read a PLY and the texture beside it. Raises ``ObjectError``."""
     header = _header(upload.data)
     surface = _surface(upload.data, header)
     if header.texture is None or surface.uvs is None:

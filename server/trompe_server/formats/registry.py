@@ -11,6 +11,11 @@ from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import MAX_ARCHIVE_BYTES, Object3D, unpack
 
 
+def _reduced(read: Callable[[Upload], Object3D]) -> Callable[[Upload, int | None], Object3D]:
+    """``read``, and reduce the textures afterwards."""
+    return lambda upload, max_texture: wavefront.shrunk(read(upload), max_texture)
+
+
 @dataclass(frozen=True)
 class Format:
     """endings: of the mesh file; one without gets the last. read: also takes the longest side of a texture. Both raise
@@ -23,11 +28,11 @@ class Format:
 
 
 FORMATS: Final = (
-    Format("obj", (".obj",), wavefront.read, wavefront.repaint),
+    Format("obj", (".obj",), _reduced(wavefront.read), wavefront.repaint),
     Format("gltf", (".gltf", ".glb"), gltf.read, gltf_repaint.repaint),
-    Format("fbx", (".fbx",), fbx.read, fbx.repaint),
-    Format("ply", (".ply",), ply.read, ply.repaint),
-    Format("stl", (".stl",), stl.read, stl.repaint),
+    Format("fbx", (".fbx",), _reduced(fbx.read), fbx.repaint),
+    Format("ply", (".ply",), _reduced(ply.read), ply.repaint),
+    Format("stl", (".stl",), _reduced(stl.read), stl.repaint),
 )
 """In order of precedence for archives with meshes of several formats."""
 

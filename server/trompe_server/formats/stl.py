@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from trompe_server.formats.assembly import DEFAULT_COLOUR, check_numbers, painted_object
 from trompe_server.formats.upload import Upload, refusing
-from trompe_server.formats.wavefront import shrunk
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D
 from trompe_shared.wavefront import MAX_FACES, Surface, smooth_normals
@@ -23,7 +22,7 @@ def looks_binary(data: bytes) -> bool:
     return len(data) >= HEADER and len(data) == HEADER + TRIANGLE * int.from_bytes(data[80:HEADER], "little")
 
 
-def read(upload: Upload, max_texture: int | None = None) -> Object3D:
+def read(upload: Upload) -> Object3D:
     """Read an STL with flat-shaded faces. Raises ``ObjectError``."""
     vertices = _corners(upload.data)
     faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
@@ -31,7 +30,7 @@ def read(upload: Upload, max_texture: int | None = None) -> Object3D:
         raise ObjectError(f"The STL has {len(faces)} triangles; expected 1 to {MAX_FACES}.")
     check_numbers(vertices, "The STL")
     surface = Surface("surface", vertices, smooth_normals(vertices, np.arange(len(vertices)), faces), faces)
-    return shrunk(painted_object(upload.stem, surface, DEFAULT_COLOUR), max_texture)
+    return painted_object(upload.stem, surface, DEFAULT_COLOUR)
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:

@@ -16,9 +16,9 @@ from trompe_shared.object3d import Object3D, decode_alpha, decode_rgb, encode_pn
 from trompe_shared.wavefront import Part, Surface, obj_text, parse_mtl, parse_surfaces
 
 
-def read(upload: Upload, max_texture: int | None = None) -> Object3D:
+def read(upload: Upload) -> Object3D:
     """Read an OBJ and the files beside it. Raises ``ObjectError``."""
-    return shrunk(_object(_completed(upload)), max_texture)
+    return _object(_completed(upload))
 
 
 def _completed(upload: Upload) -> Mapping[str, bytes]:
