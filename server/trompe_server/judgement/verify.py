@@ -3,7 +3,6 @@ predictions, and random views, rendered again, get the same classes.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -16,7 +15,6 @@ from trompe_server.judgement.sources import JudgedObject, LocalSources, Sources,
 from trompe_server.judgement.suites import SUITES
 from trompe_server.judging.judge import Judge
 from trompe_server.judging.metrics import margins
-from trompe_server.renderers import TargetRenderer
 from trompe_server.spec.framing import Framing
 from trompe_shared.api import JudgedRenderer, Manifest, Predictions
 from trompe_shared.errors import ClassifierError, LabelError, ObjectError, RendererError
@@ -55,7 +53,8 @@ def verify(manifest: Manifest, folder: Path, *, generator: np.random.Generator) 
         count = len(manifest.views)
         index = np.sort(generator.permutation(count)[:VIEWS_AGAIN])
         for renderer in manifest.renderers:
-            yield from _Again(manifest, sources, objects, judges, index.tolist(), renderer).faults()
+            if renderer.engine is not None:
+                yield from _again(manifest, renderer, sources, objects, judges, index.tolist())
 
 
 def _source(source: str, folder: Path) -> str:
@@ -103,50 +102,38 @@ def _figures(manifest: Manifest) -> Iterator[str]:
             )
 
 
-@dataclass(frozen=True)
-class _Again:
-    """Some views in one renderer again."""
+def _again(
+    manifest: Manifest,
+    renderer: JudgedRenderer,
+    sources: Sources,
+    objects: Mapping[str, JudgedObject],
+    judges: Mapping[str, Judge],
+    index: Sequence[int],
+) -> Iterator[str]:
+    """Another engine, and views with another class, once the views ``index`` are rendered again."""
+    try:
+        with sources.running(renderer.name) as target:
+            if target.engine != renderer.engine:
+                yield f"The renderer here is {target.engine}, the manifest's {renderer.engine}."
+            views = noisy([view_of(manifest.views[k]) for k in index], target.engine, manifest.seed)
+            for kind, each in objects.items():
+                images = target.render(each.obj, views, size=manifest.image_size)
+                for recorded in manifest.predictions:
+                    if recorded.renderer == renderer.name and recorded.network in judges:
+                        yield from _classes(recorded, kind, judges[recorded.network], images, index)
+    except RendererError as error:
+        yield f"The renderer {renderer.name!r} cannot be asked again: {error}"
 
-    manifest: Manifest
-    sources: Sources
-    objects: Mapping[str, JudgedObject]
-    judges: Mapping[str, Judge]
-    index: Sequence[int]
-    renderer: JudgedRenderer
 
-    def faults(self) -> Iterator[str]:
-        """Another engine, and views with another class."""
-        if self.renderer.engine is None:
-            return
-        try:
-            with self.sources.running(self.renderer.name) as target:
-                if target.engine != self.renderer.engine:
-                    yield f"The renderer here is {target.engine}, the manifest's {self.renderer.engine}."
-                yield from self._views(target)
-        except RendererError as error:
-            yield f"The renderer {self.renderer.name!r} cannot be asked again: {error}"
-
-    def _views(self, target: TargetRenderer) -> Iterator[str]:
-        views = noisy([view_of(self.manifest.views[k]) for k in self.index], target.engine, self.manifest.seed)
-        for kind, each in self.objects.items():
-            images = target.render(each.obj, views, size=self.manifest.image_size)
-            for recorded in self.manifest.predictions:
-                if recorded.renderer == self.renderer.name and recorded.network in self.judges:
-                    judge = self.judges[recorded.network]
-                    yield from self._classes(recorded, kind, judge, judge.network.predict(images))
-
-    def _classes(
-        self,
-        recorded: Predictions,
-        kind: str,
-        judge: Judge,
-        logits: NDArray[np.float32],
-    ) -> Iterator[str]:
-        classes, known = getattr(recorded, kind), getattr(recorded, f"{kind}_margins")
-        now = zip(logits.argmax(axis=1).tolist(), margins(logits, judge.labels).tolist(), strict=True)
-        for k, (found, margin) in zip(self.index, now, strict=True):
-            if found != classes[k]:
-                yield (
-                    f"View {k} {kind}, {recorded.network} in {recorded.renderer}: {judge.class_name(found)!r} with "
-                    f"margin {margin:+.2f}, the manifest says {judge.class_name(classes[k])!r} with {known[k]:+.2f}."
-                )
+def _classes(
+    recorded: Predictions, kind: str, judge: Judge, images: NDArray[np.uint8], index: Sequence[int]
+) -> Iterator[str]:
+    logits = judge.network.predict(images)
+    classes, known = getattr(recorded, kind), getattr(recorded, f"{kind}_margins")
+    now = zip(logits.argmax(axis=1).tolist(), margins(logits, judge.labels).tolist(), strict=True)
+    for k, (found, margin) in zip(index, now, strict=True):
+        if found != classes[k]:
+            yield (
+                f"View {k} {kind}, {recorded.network} in {recorded.renderer}: {judge.class_name(found)!r} with "
+                f"margin {margin:+.2f}, the manifest says {judge.class_name(classes[k])!r} with {known[k]:+.2f}."
+            )

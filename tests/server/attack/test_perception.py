@@ -11,7 +11,7 @@ from torch import Tensor
 from tests.attack_runs import run
 from trompe_server.attack import Budget
 from trompe_server.attack.perception import perceptual_bounds
-from trompe_server.judging.perceptual import perceived_change
+from trompe_server.judging.visibility import perceived_change
 from trompe_server.surrogate import Surrogate, textures_of
 from trompe_shared.object3d import Object3D
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trompe_server.judging.perceptual import object_pixels, perceived_change, total_variation
+from trompe_server.judging.visibility import object_pixels, perceived_change, total_variation
 from trompe_shared.api import Visibility
 
 RANDOM = np.random.default_rng(7)
