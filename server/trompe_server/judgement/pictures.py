@@ -50,10 +50,7 @@ def _views(judged: Judged, renderer: str, network: str) -> Image.Image:
     )
     fooled = sum(not new[index].correct for index in recognised)
     return contact_sheet(
-        images["before"][shown],
-        images["after"][shown],
-        [old[index] for index in shown],
-        [new[index] for index in shown],
+        [(images["before"][k], images["after"][k], old[k], new[k]) for k in shown],
         title=f"{network} in {renderer}",
         facts=f"Recognised before in {len(recognised)} of {len(old)} views; {fooled} of these are fooled.",
     )

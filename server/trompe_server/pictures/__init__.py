@@ -2,9 +2,9 @@
 
 from trompe_server.pictures.contact_sheet import Verdict, contact_sheet, hardest_and_easiest, representative
 from trompe_server.pictures.difference import difference_strip, texture_sheet
-from trompe_server.pictures.heat import heat_colours
 from trompe_server.pictures.histogram import prediction_histogram
 from trompe_server.pictures.saliency import (
+    heat_colours,
     heat_textures,
     saliency_object_sheet,
     saliency_sheet,

@@ -84,21 +84,13 @@ def _spread(ranked: NDArray[np.int64], directions: Float[np.ndarray, "n 3"], k: 
 
 
 def contact_sheet(
-    before: Images,
-    after: Images,
-    verdicts_before: Sequence[Verdict],
-    verdicts_after: Sequence[Verdict],
-    *,
-    title: str,
-    facts: str,
-    columns: int = 3,
+    views: Sequence[tuple[Images, Images, Verdict, Verdict]], *, title: str, facts: str, columns: int = 3
 ) -> Image.Image:
-    """Images (N, H, W, 3) of the same views in pairs, framed green if classified as the object and red if not.
+    """Images (H, W, 3) of each view before and after, framed green if classified as the object and red if not.
 
-    facts: a line below the title. Raises ``ValueError`` if the four sequences differ in length.
+    views: with the verdicts on both images. facts: a line below the title. Raises ``ValueError`` if there is no view.
     """
-    pairs = zip(before, after, verdicts_before, verdicts_after, strict=True)
-    cards = [beside([_judged(old, was), _judged(new, now)], gap=2) for old, new, was, now in pairs]
+    cards = [beside([_judged(old, was), _judged(new, now)], gap=2) for old, new, was, now in views]
     return sheet(cards, columns=columns, title=f"{title} - left before, right after", legend=line(facts))
 
 

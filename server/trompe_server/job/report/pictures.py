@@ -76,10 +76,7 @@ def _before_and_after(data: ReportData, after: Images, title: str) -> dict[str, 
     few = distinct[representative(len(distinct), DIFFERENCE_VIEWS)]
     sheets = {
         "contact_sheet.png": contact_sheet(
-            own[shown],
-            after["own"][shown],
-            [verdicts_before[index] for index in shown],
-            [verdicts_after[index] for index in shown],
+            [(own[k], after["own"][k], verdicts_before[k], verdicts_after[k]) for k in shown],
             title=f"{title}, epsilon {data.spec.paint.epsilon:g}",
             facts=_facts([verdicts_after[index].correct for index in recognised], setup),
         ),
