@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from trompe_server.surrogate import AnySurrogate, JointSurrogate, Surrogate
+from trompe_server.surrogate import AnySurrogate, JointSurrogate, Surrogate, joined
 
 STREAM: Final = 4
 """Separates the random numbers of a step's backgrounds from those of its views."""
@@ -50,11 +50,10 @@ class Backgrounds:
     def behind(self, surrogate: AnySurrogate, *, seed: int, step: int) -> AnySurrogate:
         """``surrogate`` in front of the backgrounds ``drawn``."""
         own, now = torch.tensor(list(self.own)), self.drawn(seed=seed, step=step)
-        if isinstance(surrogate, Surrogate):
-            return self._composed(surrogate, own, now)
-        counts = [part.n_views for part in surrogate.parts]
-        views = zip(surrogate.parts, torch.split(own, counts), torch.split(now, counts), strict=True)
-        return JointSurrogate(tuple(self._composed(*each) for each in views))
+        parts = surrogate.parts if isinstance(surrogate, JointSurrogate) else (surrogate,)
+        counts = [part.n_views for part in parts]
+        views = zip(parts, torch.split(own, counts), torch.split(now, counts), strict=True)
+        return joined([self._composed(*each) for each in views])
 
     def _composed(
         self, surrogate: Surrogate, own: Int[Tensor, " views"], drawn: Int[Tensor, " views"]

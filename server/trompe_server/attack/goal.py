@@ -1,6 +1,5 @@
 """Goal of the attack: the loss to maximise, and the condition of success."""
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, get_args
 
@@ -87,8 +86,12 @@ class Goal:
 
         ``clamped=False`` omits the margin's clamp, so that safely won views have a gradient too.
         """
-        losses = _LOSSES[self.loss](self, logits)
-        return losses.clamp(max=self.safe) if clamped and self.loss == "margin" else losses
+        if self.loss == "margin":
+            margins = self.margins(logits)
+            return margins.clamp(max=self.safe) if clamped else margins
+        log_shares = finite(logits).log_softmax(1).index_select(1, self._subject(logits))
+        losses = -log_shares.logsumexp(1)  # the probabilities of several classes add up
+        return losses if self.target is None else -losses
 
     def settled(self, logits: Logits) -> Bool[Tensor, " views"]:
         """Whether each view is safely won, so that its loss has no gradient."""
@@ -103,14 +106,3 @@ class Goal:
     def _own(self, logits: Logits) -> PerView:
         """The best logit of the subject."""
         return logits.index_select(1, self._subject(logits)).max(dim=1).values
-
-    def _cross_entropy(self, logits: Logits) -> PerView:
-        log_shares = finite(logits).log_softmax(1).index_select(1, self._subject(logits))
-        losses = -log_shares.logsumexp(1)  # the probabilities of several classes add up
-        return losses if self.target is None else -losses
-
-
-_LOSSES: Final[Mapping[str, Callable[[Goal, Logits], PerView]]] = {
-    "margin": Goal.margins,
-    "cross_entropy": Goal._cross_entropy,
-}

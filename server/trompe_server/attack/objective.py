@@ -121,8 +121,11 @@ class Objective:
                 losses, won, images = losses + loss, won + reached, images + len(chosen)
                 settled.append(chosen[safe] + views.start)
         count = sum(len(self.surrogate.batches[batch]) for batch in batches)
+        gradient = torch.zeros_like(leaf)
+        if read.grad is not None:
+            gradient = torch.autograd.grad(texels, leaf, read.grad)[0].nan_to_num_(0, 0, 0)
         return Evaluation(
-            self._backward(texels, leaf, read.grad),
+            gradient,
             losses / count,
             won / count,
             torch.cat(settled) if settled else active.new_zeros(0, dtype=torch.long),
@@ -164,12 +167,6 @@ class Objective:
             return images
         first = self.surrogate.batches[batch].start
         return self.pipeline.apply(images, [first + number for number in chosen.tolist()])
-
-    def _backward(self, texels: Tensor, leaf: Flat, by_texels: Tensor | None) -> Flat:
-        if by_texels is None:
-            return torch.zeros_like(leaf)
-        (gradient,) = torch.autograd.grad(texels, leaf, by_texels)
-        return gradient.nan_to_num_(0, 0, 0)
 
     @torch.no_grad()
     def score(self, change: Flat) -> Score:

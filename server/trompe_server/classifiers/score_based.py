@@ -19,7 +19,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from trompe_server.classifiers.drawing import generator_for
+from trompe_server.classifiers.drawing import seeded_generator
 from trompe_server.classifiers.protocol import Classifier, ScoringClassifier, Wrapper
 from trompe_shared.errors import ClassifierError, SpecError
 
@@ -68,7 +68,8 @@ class ScoreBasedClassifier(Wrapper):
 
     def _patterns(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "pairs 3 H W"]:
         """Smooth noise on the object's pixels, seeded by the seed and the image."""
-        generator = generator_for(image, self.seed)
+        seed = self.seed.to_bytes(8, "little", signed=True)
+        generator = seeded_generator(image.detach().cpu().numpy().tobytes(), key=seed)
         height, width = (min(self.cells, side) for side in image.shape[1:])
         coarse = torch.randn((self.queries_per_gradient // 2, 3, height, width), generator=generator)
         smooth = F.interpolate(coarse, image.shape[1:], mode="bilinear").to(image)

@@ -325,19 +325,6 @@ class _RenderViews(Function):
 
 
 @dataclass(frozen=True)
-class _Painted:
-    """A canvas and its arguments."""
-
-    textures: Sequence[Float[Tensor, "H W 3"]]
-    moving: Sequence[Bool[Tensor, "H W"]]
-    canvas: Canvas
-
-    def fits(self, textures: Sequence[Float[Tensor, "H W 3"]], moving: Sequence[Bool[Tensor, "H W"]]) -> bool:
-        """Whether the canvas is for these textures (the same tensors) and masks."""
-        return all(map(operator.is_, self.textures, textures)) and all(map(torch.equal, self.moving, moving))
-
-
-@dataclass(frozen=True)
 class Surrogate:
     """A differentiable model of the target renderer for fixed views.
 
@@ -350,7 +337,10 @@ class Surrogate:
     base: UInt8[Tensor, "views H W 3"]
     shadings: tuple[Shading, ...]
     missed: tuple[Float[Tensor, "pixels 3"], ...] | None = None
-    _last_canvas: list["_Painted"] = field(default_factory=list, init=False, repr=False, compare=False)
+    _canvases: list[tuple[list[Tensor], list[Tensor], Canvas]] = field(
+        default_factory=list, init=False, repr=False, compare=False
+    )
+    """The last canvas with its textures and masks."""
 
     @property
     def n_views(self) -> int:
@@ -396,11 +386,13 @@ class Surrogate:
         """
         geometry, linear = self.geometry, self.geometry.sampling.filtered == "linear"
         whole, masks = ([table[name] for name in geometry.textures] for table in (textures, moving))
-        if not (self._last_canvas and self._last_canvas[0].fits(whole, masks)):
-            rounded = geometry.sampling.mips == "rounded" and not linear
-            canvas = canvas_of(whole, masks, geometry.chains, linear=linear, rounded=rounded)
-            self._last_canvas[:] = [_Painted(whole, masks, canvas)]
-        return self._last_canvas[0].canvas
+        for textures_before, masks_before, canvas in self._canvases:
+            if all(map(operator.is_, textures_before, whole)) and all(map(torch.equal, masks_before, masks)):
+                return canvas
+        rounded = geometry.sampling.mips == "rounded" and not linear
+        canvas = canvas_of(whole, masks, geometry.chains, linear=linear, rounded=rounded)
+        self._canvases[:] = [(whole, masks, canvas)]
+        return canvas
 
     def render(
         self, texels: Float[Tensor, "texels 3"], batch: int, *, masks: Bool[Tensor, "views H W"] | None = None
