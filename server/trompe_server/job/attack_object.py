@@ -67,11 +67,9 @@ def attack_object(
     goal = Goal(labels, safe=SAFE_MARGINS[image_pipeline])
     framing = framing_of(obj, ViewOptions())
     cameras = ViewDistribution(framing.distance, framing.elevation, centre=framing.centre)
-    own = cameras.sample(VIEWS, generator=np.random.default_rng([seed, POOL_STREAM])) if views is None else views
-    unseen = (
-        cameras.sample(VIEWS, generator=np.random.default_rng([seed, HELD_OUT_STREAM]))
-        if held_out is None
-        else held_out
+    own, unseen = (
+        cameras.sample(VIEWS, generator=np.random.default_rng([seed, stream])) if given is None else given
+        for given, stream in ((views, POOL_STREAM), (held_out, HELD_OUT_STREAM))
     )
     budget = budget or Budget(epsilon=0.05, alpha=0.01)
 

@@ -57,20 +57,17 @@ class JobCalibrations:
 
     def surrogate(self, number: int, calibration: Calibration, clean: Image8) -> Surrogate:
         """The surrogate of an attacked renderer."""
-        setup, known = self._setup, self._geometries.get(calibration.sampling)
-        surrogate = build_surrogate(
+        setup = self._setup
+        self._prepare_geometry(calibration.sampling)
+        return build_surrogate(
             calibration,
             setup.obj,
             setup.attacked[number].shown(setup.views),
             clean,
-            geometry=known.result() if known is not None else None,
+            geometry=self._geometries[calibration.sampling].result(),
             backdrops=setup.backdrops,
             device=setup.device,
         )
-        if known is None:
-            self._geometries[calibration.sampling] = Future()
-            self._geometries[calibration.sampling].set_result(surrogate.geometry)
-        return surrogate
 
     def _key(self, number: int, clean: Image8) -> str:
         setup, search, renderer = self._setup, self._search, self._setup.attacked[number]
@@ -127,7 +124,7 @@ class JobCalibrations:
         return found
 
     def _prepare_geometry(self, sampling: SamplingModel) -> None:
-        """Rasterise all views in a thread while the renderer is busy with the probes."""
+        """Rasterise all views once, in a thread: while the renderer is busy with the probes."""
         if sampling in self._geometries:
             return
         setup = self._setup

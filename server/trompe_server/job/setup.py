@@ -276,7 +276,6 @@ def drawn_views(
 
 
 def _grid(spec: JobSpec, framing: Framing) -> tuple[View, ...]:
-    """The views of a grid."""
     grid = grid_views(
         distance=framing.distance,
         elevation=framing.elevation,

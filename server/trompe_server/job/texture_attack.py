@@ -6,7 +6,6 @@ attack-NNN  some steps of the attack in the surrogate; before some of them, furt
 judge       target images of the saved 8-bit texture; report
 """
 
-import logging
 import math
 import time
 from collections import Counter, deque
@@ -51,8 +50,6 @@ from trompe_server.surrogate.calibration import Calibration
 from trompe_shared.api import JobSpec, JobState, Progress
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, encode_png
-
-logger = logging.getLogger(__name__)
 
 CHUNK: Final = 5
 """Attack steps per phase: the most that is lost when a worker dies."""
@@ -306,27 +303,20 @@ class TextureAttack:
         count = len(setup.views) + len(setup.held_out)
         ask = self._asker("judge", 2 * count * len(setup.renderers), on_progress)
         self._render_all(VIEWS_AFTER, painted, ask)
-        scores = self._scores
-        seen = [replace(each, painted=painted, scores=scores, **self._attacked(each)) for each in self._seen()]
+        seen = self._seen(painted)
         headline = worst(seen)
-        if scores is not None:
-            hot, views_shown = setup.obj.with_textures(heat_textures(setup.obj.textures, scores)), saliency_views(setup)
+        if headline.scores is not None:
+            heat, views_shown = heat_textures(setup.obj.textures, headline.scores), saliency_views(setup)
+            hot = setup.obj.with_textures(heat)
             renderer = headline.renderer
             heated = ask(renderer, hot, renderer.shown([setup.views[k] for k in views_shown]))
             seen[headline.number] = replace(headline, heated=heated)
         public = write_report(seen, self.artifacts, seconds=self._seconds)
         return PhaseReport(DONE, JobState.succeeded, None, public)
 
-    def _attacked(self, seen: ReportData) -> dict[str, Any]:
-        """The report's data of a renderer after the attack."""
-        found: dict[str, Any] = {"after": self.files.load(numbered(VIEWS_AFTER, seen.number))}
-        if seen.renderer.attacked:
-            found |= {"surrogate": self._surrogates[seen.number], "calibration": self._found[seen.number]}
-        return found
-
-    def _seen(self) -> list[ReportData]:
-        """The report's data of each renderer before the attack."""
-        count = len(self.setup.views)
+    def _seen(self, painted: Object3D | None = None) -> list[ReportData]:
+        """The report's data of each renderer; ``painted``: after the attack."""
+        count, scores = len(self.setup.views), None if painted is None else self._scores
         return [
             ReportData(
                 spec=self.spec,
@@ -337,6 +327,11 @@ class TextureAttack:
                 if renderer.attacked and self._maps is not None
                 else None,
                 spent=self.files.spent(),
+                after=None if painted is None else self.files.load(numbered(VIEWS_AFTER, number)),
+                painted=painted,
+                scores=scores,
+                surrogate=self._surrogates[number] if painted is not None and renderer.attacked else None,
+                calibration=self._found[number] if painted is not None and renderer.attacked else None,
             )
             for number, renderer in enumerate(self.setup.renderers)
         ]

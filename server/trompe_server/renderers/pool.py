@@ -53,9 +53,8 @@ class RendererPool:
     The views of a request are shared out, the least busy worker first. Another worker takes over the missing views of a
     lost one; a worker with another engine counts as lost. A refusal is final: every worker would refuse.
 
-    engine: the only one accepted; by default that of the first worker that answers. timeout: seconds for any one
-    answer. suspicion: seconds without an image before a worker is checked. patience: seconds a checked worker has to
-    answer.
+    engine: the only one accepted; by default that of the first worker that answers. suspicion: seconds without an image
+    before a worker is checked. patience: seconds a checked worker has to answer.
     """
 
     def __init__(
@@ -63,7 +62,6 @@ class RendererPool:
         addresses: Sequence[Address],
         *,
         engine: EngineInfo | None = None,
-        timeout: float = 120.0,
         suspicion: float = 2.0,
         patience: float = 5.0,
         rest: float = REST,
@@ -71,7 +69,7 @@ class RendererPool:
         if not addresses:
             raise RendererError("A pool needs at least one renderer address.")
         self._workers = [_Worker(address) for address in dict.fromkeys(addresses)]
-        self._timeout, self._engine = timeout, engine
+        self._engine = engine
         self._lock, self._engine_lock = threading.Lock(), threading.Lock()
         self.suspicion, self.patience, self._rest = suspicion, patience, rest
 
@@ -147,7 +145,7 @@ class RendererPool:
         with self._lock:
             if worker.idle:
                 return worker.idle.pop()
-            return SailenvTarget(*worker.address, timeout=self._timeout, engine=self._engine)
+            return SailenvTarget(*worker.address, engine=self._engine)
 
     def take_back(self, worker: _Worker, target: SailenvTarget, *, lost: bool) -> None:
         """Return a connection. For a lost worker all of its connections are closed."""
@@ -298,7 +296,6 @@ class _Request:
             ) from ending
 
     def _abort(self) -> None:
-        """Abort all active assignments."""
         self._todo.clear()
         for assignment in self._assignments:
             assignment.target.abort()

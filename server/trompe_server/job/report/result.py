@@ -12,16 +12,16 @@ import torch
 from trompe_server.classifiers import Classifier
 from trompe_server.image_pipelines import SUITE
 from trompe_server.job.report.data import ReportData
-from trompe_server.job.report.outcome import classes_of_fooled, neighbour_warning
-from trompe_server.job.report.warnings import warnings_of
+from trompe_server.job.report.warnings import neighbour_warning, warnings_of
 from trompe_server.judging.judge import Judge
-from trompe_server.judging.metrics import transfer_gap, view_predictions
+from trompe_server.judging.metrics import fooled_as, transfer_gap, view_predictions
 from trompe_server.judging.visibility import visibility_of
 from trompe_server.surrogate import behind
 from trompe_server.surrogate.fidelity import ViewFit
 from trompe_server.system.versions import versions
 from trompe_shared.api import (
     Accuracy,
+    FooledAs,
     Judgement,
     PipelineJudgement,
     RendererResult,
@@ -53,7 +53,7 @@ def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
     beside = ThreadPoolExecutor(1, thread_name_prefix="visibility")
     visibility = beside.submit(_visibility, data)  # needs no network
     beside.shutdown(wait=False)
-    became = classes_of_fooled(data)
+    became = _classes_of_fooled(data)
     synonyms = neighbour_warning(became, data.target, data.held_out)
     names = [setup.judge.class_name(label) for label in setup.labels] if setup.classifier.classes else None
     return Result(
@@ -90,6 +90,28 @@ def result_of(seen: Sequence[ReportData], warnings: Sequence[str]) -> Result:
         versions=versions(),
         **({"surrogate_model": spec.search.surrogate, "surrogate_reason": "not built"} | _figures(data)),
     )
+
+
+def _classes_of_fooled(data: ReportData) -> list[FooledAs]:
+    """The classes of the views recognised before the attack and not after, the most frequent first."""
+    setup, after = data.setup, data.logits_after
+    if after is None:
+        return []
+    own, held_out = (
+        fooled_as(data.logits_before[views], after[views], setup.labels) if len(after[views]) else {}
+        for views in ("own", "held_out")
+    )
+    found = [
+        FooledAs(
+            label=label,
+            name=setup.judge.class_name(label) if setup.classifier.classes else None,
+            own=own.get(label, 0),
+            held_out=held_out.get(label, 0),
+            neighbour=label in (setup.judge.near or ()),
+        )
+        for label in {**own, **held_out}
+    ]
+    return sorted(found, key=lambda each: (-each.own - each.held_out, each.label))
 
 
 def _figures(data: ReportData) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from trompe_server.job.setup import JobSetup
 from trompe_server.judging.metrics import drop_warning, reach_warning, texels_altered, transfer_gap
 from trompe_server.judging.visibility import faint_warnings
 from trompe_server.surrogate.fidelity import MAX_ERROR, MIN_EXPLAINED
-from trompe_shared.api import MOST_VIEWS, JobSpec
+from trompe_shared.api import MOST_VIEWS, Accuracy, FooledAs, JobSpec
 
 POOR_VIEW: Final = 3.0 / 255
 NAMED_VIEWS: Final = 5
@@ -23,6 +23,9 @@ LOUD: Final = 2.0
 
 MORE_VIEWS: Final = 240
 """A pool size that reaches unseen views for most objects."""
+
+NAMED: Final = 5
+"""Neighbours named in a warning."""
 
 
 def warnings_of(data: ReportData, seen: Sequence[ReportData]) -> Iterator[str]:
@@ -173,3 +176,20 @@ def _named(setup: JobSetup, poor: Mapping[int, float], figure: str) -> str:
         named.append(f"{index} ({where}): {figure.format(poor[index])}")
     more = f", and {len(poor) - NAMED_VIEWS} more" if len(poor) > NAMED_VIEWS else ""
     return "; ".join(named) + more
+
+
+def neighbour_warning(found: Sequence[FooledAs], target: Accuracy, held_out: Accuracy | None) -> str | None:
+    """Warning that held-out views, or else own ones, became neighbours of the object's class; ``None`` if none did."""
+    for views, judged in (("held_out", held_out), ("own", target)):
+        near = [each for each in found if each.neighbour and getattr(each, views)]
+        if not near or judged is None or judged.a_drop is None or judged.a_drop_with_neighbours is None:
+            continue
+        everything, part = (sum(getattr(each, views) for each in some) for some in (found, near))
+        names = [(each.name or "").split(",")[0] for each in near]
+        named = ", ".join(names[:NAMED] + (["..."] if len(names) > NAMED else []))
+        return (
+            f"Of {everything} fooled {views.replace('_', '-')} views, {part} became a neighbour of the object's class "
+            f"({named}): A_drop is {judged.a_drop:.2f}, or {judged.a_drop_with_neighbours:.2f} if all neighbours count "
+            "as the object. If such a class is right too, give it as one more label."
+        )
+    return None
