@@ -78,8 +78,6 @@ class Opacities:
     def _read(self, number: int, uv: Float[Tensor, "n 2"], duv: Float[Tensor, "n 2 2"]) -> Float[Tensor, " n"]:
         """An opacity at texture coordinates."""
         read = torch.zeros(len(uv), device=uv.device)
-        for used, index, weight, blend in reads_of(
-            uv, duv, self.layout.sizes[number], self.layout.starts[number], self.model
-        ):
+        for used, index, weight, blend in reads_of(uv, duv, self.layout.levels(number, uv.device), self.model):
             read.index_add_(0, used, (self.alpha[index] * weight).sum(1) * blend)
         return read

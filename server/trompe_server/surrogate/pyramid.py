@@ -17,6 +17,9 @@ from torch.autograd.function import FunctionCtx
 Reads = Sequence[Int[Tensor, " _"]]
 """For each mip level in the layout's order, texels (row * width + column) in the requested order."""
 
+Levels = Int[Tensor, "levels 3"]
+"""(H, W, first texel in the flat array) of the mip levels of one texture."""
+
 BAND_TEXELS = 2**18
 """Texels of a band; larger levels are computed in bands."""
 
@@ -28,6 +31,11 @@ class MipLayout:
     sizes: tuple[tuple[tuple[int, int], ...], ...]
     starts: tuple[tuple[int, ...], ...]
     total: int
+
+    def levels(self, texture: int, device: torch.device) -> Levels:
+        """The levels of one texture, by its number."""
+        pairs = zip(self.sizes[texture], self.starts[texture], strict=True)
+        return torch.tensor([(*size, start) for size, start in pairs], device=device)
 
 
 def mip_layout(sizes: Sequence[tuple[int, int]]) -> MipLayout:

@@ -246,19 +246,47 @@ def _peeled(
 
 
 Between = tuple[Int[Tensor, " pixels_samples"], Int[Tensor, " pixels_samples"]]
-"""Keys of ``_draw`` that limit the depth at each sample: the farthest and the nearest, both excluded."""
+"""Keys of ``_nearest`` that limit the depth at each sample: the farthest and the nearest, both excluded."""
 
 
 def _nearest(
     planes: Planes, size: tuple[int, int], samples: Samples, drawn: Drawn | None, between: Between | None = None
 ) -> Int[Tensor, "pixels samples"]:
-    """Key of the nearest triangle at each sample, see ``_draw``; -1 for none."""
+    """Key of the nearest triangle at each sample; -1 for none.
+
+    A key is the float bits of 1/depth (monotone for positive values) without those of ``TIE``, above the inverted
+    triangle number.
+    """
     height, width = size
     nearest = torch.full((height * width * len(samples),), -1, dtype=torch.int64, device=planes.face.device)
     extent = (planes.box[:, 2:] - planes.box[:, :2] + 1).clamp(min=0)
     counts = extent[:, 0] * extent[:, 1]
-    for start, stop in chunks(counts):
-        _draw(planes, start, stop, counts, width, samples, drawn, nearest, between)
+
+    def draw(start: int, stop: int) -> None:
+        """Test triangles ``start:stop`` against the pixels of their boxes."""
+        row, within = numbered(counts[start:stop])
+        row += start
+        box = planes.box[row]
+        columns = box[:, 2] - box[:, 0] + 1
+        x, y = box[:, 0] + within % columns, box[:, 1] + within // columns
+        if drawn is not None:
+            row, x, y = (values[drawn(row, x, y)] for values in (row, x, y))
+        edges = planes.edges[row]
+        at_corner = edges[:, 0] * x[:, None] + edges[:, 1] * y[:, None] + edges[:, 2]
+        base = (y * width + x) * len(samples)
+        for index, (sx, sy) in enumerate(samples):
+            value = at_corner + edges[:, 0] * sx + edges[:, 1] * sy
+            inverse_depth = value.sum(1)
+            seen = _inside(value, inverse_depth, planes.near).nonzero()[:, 0]
+            bits = inverse_depth[seen].contiguous().view(torch.int32).long() & ~TIE
+            keys, place = (bits << 32) | (0xFFFFFFFF - row[seen]), base[seen] + index
+            if between is not None:
+                inside = (keys > between[0][place]) & (keys < between[1][place])
+                keys, place = keys[inside], place[inside]
+            nearest.scatter_reduce_(0, place, keys, "amax")
+
+    for run in chunks(counts):
+        draw(*run)
     return nearest.view(-1, len(samples))
 
 
@@ -284,44 +312,10 @@ def chunks(counts: Int[Tensor, " n"]) -> list[tuple[int, int]]:
     return list(itertools.pairwise(bounds))
 
 
-def _draw(
-    planes: Planes,
-    start: int,
-    stop: int,
-    counts: Int[Tensor, " n"],
-    width: int,
-    samples: Samples,
-    drawn: Drawn | None,
-    nearest: Int[Tensor, " pixels_samples"],
-    between: Between | None,
-) -> None:
-    """Test triangles ``start:stop`` against the pixels of their boxes; keep the nearest per sample in ``nearest``.
-
-    A key is the float bits of 1/depth (monotone for positive values) without those of ``TIE``, above the inverted
-    triangle number.
-    """
-    row = torch.arange(start, stop, device=counts.device).repeat_interleave(counts[start:stop])
-    within = (
-        torch.arange(len(row), device=row.device) - (counts[start:stop].cumsum(0) - counts[start:stop])[row - start]
-    )
-    box = planes.box[row]
-    columns = box[:, 2] - box[:, 0] + 1
-    x, y = box[:, 0] + within % columns, box[:, 1] + within // columns
-    if drawn is not None:
-        row, x, y = (values[drawn(row, x, y)] for values in (row, x, y))
-    edges = planes.edges[row]
-    at_corner = edges[:, 0] * x[:, None] + edges[:, 1] * y[:, None] + edges[:, 2]
-    base = (y * width + x) * len(samples)
-    for index, (sx, sy) in enumerate(samples):
-        value = at_corner + edges[:, 0] * sx + edges[:, 1] * sy
-        inverse_depth = value.sum(1)
-        seen = _inside(value, inverse_depth, planes.near).nonzero()[:, 0]
-        bits = inverse_depth[seen].contiguous().view(torch.int32).long() & ~TIE
-        keys, place = (bits << 32) | (0xFFFFFFFF - row[seen]), base[seen] + index
-        if between is not None:
-            inside = (keys > between[0][place]) & (keys < between[1][place])
-            keys, place = keys[inside], place[inside]
-        nearest.scatter_reduce_(0, place, keys, "amax")
+def numbered(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
+    """(Item, number within the item) of all candidates, ``counts`` of each item."""
+    item = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+    return item, torch.arange(len(item), device=counts.device) - (counts.cumsum(0) - counts)[item]
 
 
 def covered(

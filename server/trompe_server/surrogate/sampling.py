@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from trompe_server.surrogate.pixel_filter import KernelName, PixelFilter
-from trompe_server.surrogate.pyramid import MipLayout
+from trompe_server.surrogate.pyramid import Levels, MipLayout
 from trompe_server.surrogate.rasterize import (
     CENTRE,
     MSAA4,
@@ -25,6 +25,7 @@ from trompe_server.surrogate.rasterize import (
     Samples,
     Visibility,
     chunks,
+    numbered,
 )
 from trompe_server.surrogate.shading import Encoding
 
@@ -263,31 +264,29 @@ def taps_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout, 
             fragments.entry
         ]
     )
-    for texture, (sizes, starts) in enumerate(zip(layout.sizes, layout.starts, strict=True)):
+    for texture in range(len(layout.sizes)):
         mine = (mesh.texture[fragments.face] == texture).nonzero()[:, 0]
         uv, duv, entry, part = fragments.uv[mine], fragments.duv[mine], fragments.entry[mine], share[mine]
-        for used, index, weight, blend in reads_of(uv, duv, sizes, starts, model):
+        for used, index, weight, blend in reads_of(uv, duv, layout.levels(texture, uv.device), model):
             entries.append(entry[used, None].expand_as(index).reshape(-1))
             indices.append(index.reshape(-1))
             weights.append((weight * (blend * part[used])[:, None]).reshape(-1))
     return _merged(torch.cat(entries), torch.cat(indices), torch.cat(weights), layout.total)
 
 
-Sizes = tuple[tuple[int, int], ...]
 Reads = Iterator[tuple[Int[Tensor, " m"], Int[Tensor, "m k"], Float[Tensor, "m k"], Float[Tensor, " m"]]]
 """Portions of reads: fragments, flat indices, weights of the texels, and weight of the portion for each fragment."""
 
 
-def reads_of(
-    uv: Float[Tensor, "n 2"], duv: Float[Tensor, "n 2 2"], sizes: Sizes, starts: tuple[int, ...], model: SamplingModel
-) -> Reads:
-    """The reads of fragments from a texture with mip levels of ``sizes`` at ``starts``."""
+def reads_of(uv: Float[Tensor, "n 2"], duv: Float[Tensor, "n 2 2"], levels: Levels, model: SamplingModel) -> Reads:
+    """The reads of fragments from a texture."""
+    texels = duv * levels[0, [1, 0], None]
     if model.anisotropy == 1:
-        return _trilinear(uv, level_of_detail(duv, sizes[0], model), sizes, starts)
-    texels = (duv * torch.tensor([sizes[0][1], sizes[0][0]], device=duv.device)[:, None]).nan_to_num(0.0)
+        return _trilinear(uv, level_of_detail(texels, model), levels)
+    texels = texels.nan_to_num(0.0)
     if model.elongated == "probes":
-        return _probes(uv, duv, texels, sizes, starts, model)
-    return _ellipses(uv, texels, sizes, starts, model)
+        return _probes(uv, duv, texels, levels, model)
+    return _ellipses(uv, texels, levels, model)
 
 
 def _axes(texels: Float[Tensor, "n 2 2"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
@@ -304,8 +303,7 @@ def _probes(
     uv: Float[Tensor, "n 2"],
     duv: Float[Tensor, "n 2 2"],
     texels: Float[Tensor, "n 2 2"],
-    sizes: Sizes,
-    starts: tuple[int, ...],
+    levels: Levels,
     model: SamplingModel,
 ) -> Reads:
     """Trilinear probes along the longer axis (EXT_texture_filter_anisotropic); ``texels``: ``duv`` in texels of level
@@ -313,35 +311,27 @@ def _probes(
     longer, shorter = _axes(texels)
     probes = (longer / shorter - ROUND).ceil().clamp(1, model.anisotropy)
     axis = duv.nan_to_num(0.0).gather(2, texels.norm(dim=1).argmax(1)[:, None, None].expand(-1, 2, 1))[..., 0]
-    count = probes.long()
-    who = torch.arange(len(uv), device=uv.device).repeat_interleave(count)
-    number = torch.arange(len(who), device=uv.device) - (count.cumsum(0) - count)[who]
+    who, number = numbered(probes.long())
     along = (number + 0.5) / probes[who] - 0.5
     level = (longer / probes).log2() + model.bias
-    for used, index, weight, blend in _trilinear(uv[who] + along[:, None] * axis[who], level[who], sizes, starts):
+    for used, index, weight, blend in _trilinear(uv[who] + along[:, None] * axis[who], level[who], levels):
         yield who[used], index, weight, blend / probes[who[used]]
 
 
-def _ellipses(
-    uv: Float[Tensor, "n 2"],
-    texels: Float[Tensor, "n 2 2"],
-    sizes: Sizes,
-    starts: tuple[int, ...],
-    model: SamplingModel,
-) -> Reads:
+def _ellipses(uv: Float[Tensor, "n 2"], texels: Float[Tensor, "n 2 2"], levels: Levels, model: SamplingModel) -> Reads:
     """Gaussian-weighted texels of one mip level in the footprint's ellipse, a texel wider.
 
     The level is that of the shorter axis, but at least that of the longer one divided by ``model.anisotropy``.
     """
     longer, shorter = _axes(texels)
     level = torch.maximum(shorter, longer / model.anisotropy).log2() + model.bias
-    level = level.clamp(0, len(sizes) - 1).floor()
+    level = level.clamp(0, len(levels) - 1).floor()
     scale = torch.minimum(0.5**level, 2 * model.anisotropy / longer)  # bounded if no level is coarse enough
-    size, start = (torch.tensor(table, device=uv.device)[level.long()] for table in (sizes, starts))
+    height, width, start = levels[level.long()].unbind(1)
     u, v = uv.nan_to_num(0.0).remainder(1.0).unbind(1)
-    centre = torch.stack([u * size[:, 1], (1 - v) * size[:, 0]], 1) - 0.5
+    centre = torch.stack([u * width, (1 - v) * height], 1) - 0.5
     for who, x, y, weight in _within(centre, _form(texels * scale[:, None, None])):
-        index = start[who] + y % size[who, 0] * size[who, 1] + x % size[who, 1]
+        index = start[who] + y % height[who] * width[who] + x % width[who]
         yield who, index[:, None], torch.ones_like(weight)[:, None], weight
 
 
@@ -363,9 +353,8 @@ def _within(
     extent = (centre + reach).ceil().long() - first + 1
     counts = extent[:, 0] * extent[:, 1]
     for begin, end in chunks(counts) or [(0, 0)]:
-        some = counts[begin:end]
-        who = torch.arange(begin, end, device=centre.device).repeat_interleave(some)
-        number = torch.arange(len(who), device=centre.device) - (some.cumsum(0) - some)[who - begin]
+        who, number = numbered(counts[begin:end])
+        who += begin
         x, y = first[who, 0] + number % extent[who, 0], first[who, 1] + number // extent[who, 0]
         right, down, (a, b, c) = x - centre[who, 0], y - centre[who, 1], form[who].unbind(1)
         squared = (a * right.square() + 2 * b * right * down + c * down.square()) / (a * c - b.square())
@@ -374,33 +363,27 @@ def _within(
         yield who, x, y, weight / total[who]
 
 
-def _trilinear(uv: Float[Tensor, "n 2"], level: Float[Tensor, " n"], sizes: Sizes, starts: tuple[int, ...]) -> Reads:
+def _trilinear(uv: Float[Tensor, "n 2"], level: Float[Tensor, " n"], levels: Levels) -> Reads:
     """Reads from the finer and the coarser mip level around ``level`` (unclamped)."""
-    level = level.clamp(0, len(sizes) - 1)
-    lower = level.floor().clamp(max=max(len(sizes) - 2, 0))
+    level = level.clamp(0, len(levels) - 1)
+    lower = level.floor().clamp(max=max(len(levels) - 2, 0))
     for step in (0, 1):
         blend = (level - lower) if step else 1 - (level - lower)
         used = (blend > 0).nonzero()[:, 0]
-        yield used, *_bilinear(uv[used], lower[used].long() + step, sizes, starts), blend[used]
+        yield used, *_bilinear(uv[used], lower[used].long() + step, levels), blend[used]
 
 
-def level_of_detail(duv: Float[Tensor, "n 2 2"], size: tuple[int, int], model: SamplingModel) -> Float[Tensor, " n"]:
-    """Mip level (unclamped) for a footprint, by the rule of ``model``; ``size`` is (H, W) of level 0."""
-    texels = duv * torch.tensor([size[1], size[0]], device=duv.device)[:, None]
+def level_of_detail(texels: Float[Tensor, "n 2 2"], model: SamplingModel) -> Float[Tensor, " n"]:
+    """Mip level (unclamped) for a footprint in ``texels`` of level 0, by the rule of ``model``."""
     extent: Tensor = texels.norm(dim=1).amax(1) if model.lod == "longer" else torch.linalg.det(texels).abs().sqrt()
     return extent.nan_to_num(0.0).clamp(min=1e-8).log2() + model.bias
 
 
 def _bilinear(
-    uv: Float[Tensor, "n 2"],
-    level: Int[Tensor, " n"],
-    sizes: tuple[tuple[int, int], ...],
-    starts: tuple[int, ...],
+    uv: Float[Tensor, "n 2"], level: Int[Tensor, " n"], levels: Levels
 ) -> tuple[Int[Tensor, "n 4"], Float[Tensor, "n 4"]]:
     """Flat indices and weights of the four texels around ``uv`` at a mip level; textures repeat."""
-    size = torch.tensor(sizes, device=uv.device)[level]
-    start = torch.tensor(starts, device=uv.device)[level]
-    height, width = size[:, 0], size[:, 1]
+    height, width, start = levels[level].unbind(1)
     u = uv[:, 0].nan_to_num(0.0).remainder(1.0)
     v = (1 - uv[:, 1].nan_to_num(0.0)).remainder(1.0)
     x, y = u * width - 0.5, v * height - 0.5

@@ -538,7 +538,8 @@ def curve_surrogate(
     shown = [torch.from_numpy(probe).to(base.device) for probe in probes]
     uncovered = _behind(geometry, views, backdrops)
     texels = painted(obj, geometry.device).texels(geometry)
-    by_chord = geometry.sampling.slope == "chord" and len(greys) == 2
+    by_chord, encoding = geometry.sampling.slope == "chord" and len(greys) == 2, geometry.sampling.encoding
+    levels = torch.tensor(list(greys), dtype=torch.uint8, device=base.device)
     shadings: list[Shading] = []
     for batch in geometry.batches:
         chord = Chord(batch.of(base), _albedo(geometry, batch, texels)) if by_chord else None
@@ -546,27 +547,14 @@ def curve_surrogate(
         if geometry.sampling.edges == "linear":  # the light behind a pixel's uncovered share is part of its light
             coverage, background = torch.ones_like(coverage), torch.zeros_like(background)
         seen = torch.stack([batch.of(probe) for probe in shown])
-        shadings.append(_fit(geometry.sampling, greys, seen, coverage, background, tone, chord))
+        if encoding == "measured":
+            if tone is None or len(greys) != 2:
+                raise ValueError("a measured tone curve needs a `tone` and two greys")
+            shadings.append(fit_tone(greys[1], seen, coverage, background, tone, chord))
+        else:
+            shadings.append(fit_curve(levels, seen, coverage, background, encoding, chord))
     plain = Surrogate(geometry, "calibrated" if len(greys) == 2 else "curve", base, tuple(shadings))
     return _anchored(plain, texels)
-
-
-def _fit(
-    sampling: SamplingModel,
-    greys: Sequence[int],
-    probes: UInt8[Tensor, "k pixels 3"],
-    coverage: Float[Tensor, "pixels 1"],
-    background: Float[Tensor, "pixels 3"],
-    tone: ToneMap | None,
-    chord: Chord | None,
-) -> Shading:
-    """The colour model of one batch."""
-    if sampling.encoding != "measured":
-        levels = torch.tensor(list(greys), dtype=torch.uint8, device=probes.device)
-        return fit_curve(levels, probes, coverage, background, sampling.encoding, chord)
-    if tone is None or len(greys) != 2:
-        raise ValueError("a measured tone curve needs a `tone` and two greys")
-    return fit_tone(greys[1], probes, coverage, background, tone, chord)
 
 
 def _albedo(geometry: Geometry, batch: ViewBatch, texels: Float[Tensor, "texels 3"]) -> Float[Tensor, "pixels 3"]:
