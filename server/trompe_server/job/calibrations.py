@@ -16,9 +16,9 @@ from trompe_server.job.setup import PROBE_STREAM, JobSetup
 from trompe_server.storage.arrays import pack_arrays, unpack_arrays
 from trompe_server.storage.folders import Folder
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry
-from trompe_server.surrogate.calibration import Ask, Calibration, build_surrogate, calibrate
+from trompe_server.surrogate.calibration import Calibration, build_surrogate, calibrate
 from trompe_server.surrogate.calibration_file import calibration_key, pack_calibration, unpack_calibration
-from trompe_server.surrogate.tone import ToneMap, measure_tone_map
+from trompe_server.surrogate.tone import Ask, ToneMap, measure_tone_map
 from trompe_shared.api import SearchOptions
 from trompe_shared.engine import EngineInfo
 

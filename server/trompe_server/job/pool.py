@@ -6,7 +6,7 @@ safely won, and goes on with them. Where few views show the object recognised at
 more of them, and fewer losses are too many. It never looks at held-out views.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -22,6 +22,7 @@ from trompe_server.job.files import JobFiles
 from trompe_server.job.setup import JobSetup
 from trompe_server.surrogate import Geometry, Surrogate, prepare_geometry
 from trompe_server.surrogate.calibration import Calibration, build_surrogate, painted_grey
+from trompe_server.surrogate.tone import Ask
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
@@ -35,7 +36,6 @@ LEAST_KNOWN: Final = 0.25
 """Share of recognised views below which no more views are looked at."""
 
 Image8 = NDArray[np.uint8]
-Ask = Callable[[Object3D, Sequence[View]], Image8]
 
 
 @dataclass(frozen=True)

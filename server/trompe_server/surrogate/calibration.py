@@ -27,7 +27,7 @@ from trompe_server.surrogate.surrogate import (
     prepare_geometry,
     refiltered,
 )
-from trompe_server.surrogate.tone import ToneMap, measure_tone_map
+from trompe_server.surrogate.tone import Ask, ToneMap, measure_tone_map
 from trompe_shared.api import SurrogateModel
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
@@ -52,8 +52,6 @@ CPU: Final = torch.device("cpu")
 """Device of the search."""
 
 Image8 = NDArray[np.uint8]
-Ask = Callable[[Object3D, Sequence[View]], Image8]
-"""Renders images (views, H, W, 3) uint8 in the target."""
 MeasureToneMap = Callable[[Ask, tuple[int, int]], ToneMap]
 
 

@@ -21,6 +21,7 @@ from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View
 from trompe_shared.object3d import Object3D, encode_png, object_from_files
 
 Ask = Callable[[Object3D, Sequence[View]], NDArray[np.uint8]]
+"""Renders images (views, H, W, 3) uint8 in the target."""
 
 LEVELS: Final = 9
 """Levels of each channel in the table of residuals."""
@@ -191,8 +192,7 @@ def fit_tone(
 def measure_tone_map(ask: Ask, size: tuple[int, int]) -> ToneMap:
     """Measure the target's tone curve with a few images of a colour chart in front of the camera: 4 of 224 x 224.
 
-    ask: renders images (views, H, W, 3) uint8 in the target; ``size``: their (H, W). Raises ``ValueError`` for images
-    too small for a chart.
+    size: (H, W) of the images. Raises ``ValueError`` if they are too small for a chart.
     """
     if (rows := min(ROWS, int(FILLED * min(size) / PITCH))) < 2:
         raise ValueError(f"a tone curve is measured on images of {3 * PITCH} pixels or more, not {size}")
