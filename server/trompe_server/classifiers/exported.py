@@ -1,6 +1,5 @@
 """White-box classifiers from ``.pt2`` files of ``torch.export.save``."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,9 @@ from trompe_server.classifiers.archive import read_program
 from trompe_server.classifiers.contract import broken, check_contract, describe_value, sample_images
 from trompe_server.classifiers.fold import accelerate
 from trompe_server.classifiers.network import NetworkClassifier
-from trompe_server.classifiers.protocol import check_classes
 
 
-def load_exported(
-    path: Path, *, name: str | None = None, classes: Sequence[str] | None = None, device: str = "cpu"
-) -> NetworkClassifier:
+def load_exported(path: Path, device: str) -> NetworkClassifier:
     """Load a ``.pt2`` file as a white-box classifier with frozen parameters, accelerated if that changes nothing.
 
     The file is checked before torch reads it, because ``torch.export.load`` runs code from the file (see ``archive``).
@@ -31,8 +27,7 @@ def load_exported(
     network = program.module(check_guards=False).requires_grad_(False)
     sample = sample_images(size).to(device)
     n_classes = check_contract(network, sample, path.name)
-    names = check_classes(classes, n_classes, path.name)
-    return NetworkClassifier(name or path.stem, accelerate(network, sample), size, n_classes, names, device)
+    return NetworkClassifier(path.stem, accelerate(network, sample), size, n_classes, device=device)
 
 
 def _image_size(program: ExportedProgram, file: str) -> tuple[int, int]:

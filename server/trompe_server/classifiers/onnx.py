@@ -1,6 +1,5 @@
 """Classifiers from ``.onnx`` files, run by onnxruntime: scores only, no gradients."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from trompe_server.classifiers.protocol import (
     Images,
     Logits,
     broken,
-    check_classes,
     predicted,
     refuse_probabilities,
 )
@@ -46,9 +44,7 @@ class OnnxClassifier:
         return torch.cat(chunks).to(images.device)
 
 
-def load_onnx(
-    path: Path, *, name: str | None = None, classes: Sequence[str] | None = None, device: str = "cpu"
-) -> OnnxClassifier:
+def load_onnx(path: Path, device: str = "cpu") -> OnnxClassifier:
     """Load an ``.onnx`` file on ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
 
     Raises ``ClassifierError`` if it breaks the contract, or if this onnxruntime does not support the device.
@@ -65,9 +61,7 @@ def load_onnx(
     if not np.isfinite(logits).all():
         raise broken(path.name, "its output is not finite")
     refuse_probabilities(logits, path.name)
-    n_classes = logits.shape[1]
-    names = check_classes(classes, n_classes, path.name)
-    return OnnxClassifier(name or path.stem, session, size, n_classes, fixed_batch, names)
+    return OnnxClassifier(path.stem, session, size, logits.shape[1], fixed_batch)
 
 
 def _providers(device: str) -> list[str | tuple[str, dict[str, str]]]:

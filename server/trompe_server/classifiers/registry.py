@@ -15,15 +15,16 @@ reference                                classifier
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 
 from trompe_server.classifiers.contract import prepared
 from trompe_server.classifiers.huggingface import huggingface_weights, load_huggingface
 from trompe_server.classifiers.network import NamedNetwork, NetworkClassifier
-from trompe_server.classifiers.onnx import load_onnx
+from trompe_server.classifiers.onnx import OnnxClassifier, load_onnx
 from trompe_server.classifiers.protocol import Classifier, check_classes
 from trompe_server.classifiers.robustbench_networks import load_robustbench, robustbench_weights
 from trompe_server.classifiers.timm_networks import load_timm, timm_weights
@@ -33,14 +34,17 @@ from trompe_shared.errors import ClassifierError
 from trompe_shared.local_files import LOOKED_UP
 
 
-def load_exported(path: Path, **options: Any) -> NetworkClassifier:
+def load_exported(path: Path, device: str) -> NetworkClassifier:
     """As ``exported.load_exported``. Importing ``torch.export`` takes as long as importing torch."""
     from trompe_server.classifiers import exported
 
-    return exported.load_exported(path, **options)
+    return exported.load_exported(path, device)
 
 
-LOADERS: Final[Mapping[str, Callable[..., Classifier]]] = {".pt2": load_exported, ".onnx": load_onnx}
+LOADERS: Final[Mapping[str, Callable[[Path, str], NetworkClassifier | OnnxClassifier]]] = {
+    ".pt2": load_exported,
+    ".onnx": load_onnx,
+}
 """By the ending of the file."""
 
 
@@ -139,8 +143,9 @@ def _from_file(path: Path, name: str | None, classes: Sequence[str] | None, devi
         raise ClassifierError(f"{str(path)!r} is not a supported classifier; give {KNOWN}.")
     if not path.is_file():
         raise ClassifierError(f"There is no classifier file {str(path)!r}; check the path, or give 'tiny'.")
-    load = LOADERS[path.suffix]
-    return load(path, name=name, classes=classes, device=device)
+    loaded = LOADERS[path.suffix](path, device)
+    names = check_classes(classes, loaded.n_classes, path.name)
+    return replace(loaded, name=name or path.stem, classes=names)
 
 
 def _check_device(device: str) -> None:
