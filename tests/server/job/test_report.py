@@ -260,15 +260,16 @@ def logits(right: Sequence[bool]) -> NDArray[np.float32]:
 def test_the_contact_sheet_shows_recognised_views_alone_and_tells_their_number(
     library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sheets: list[tuple[list[Verdict], list[Verdict], str]] = []
+    sheets: list[tuple[list[tuple[Image8, Image8, Verdict, Verdict]], str]] = []
 
-    def drawn(_before: Image8, _after: Image8, old: list[Verdict], new: list[Verdict], *, facts: str, **_: Any) -> Any:
-        sheets.append((old, new, facts))
+    def drawn(views: list[tuple[Image8, Image8, Verdict, Verdict]], *, facts: str, **_: Any) -> Any:
+        sheets.append((views, facts))
         return Image.new("RGB", (8, 8))
 
     monkeypatch.setattr(pictures, "contact_sheet", drawn)
     result = run_job(spec_of(pool=40, elevation=(-89, 89), held_out=0), library).result
-    ((before, after, facts),) = sheets
+    ((views, facts),) = sheets
+    _, _, before, after = zip(*views, strict=True)
     recognised = [view for view in result.views if view.before == result.label]
     assert 0 < len(recognised) < 40
     assert len(before) == min(12, len(recognised))
