@@ -28,6 +28,8 @@ SILENCE = 6.0
 """Seconds without a sign of life after which a dispatcher or a worker counts as dead."""
 FEW = 40
 """Jobs of a short run."""
+SHORT = pytest.mark.timeout(PATIENCE)
+LONG = [pytest.mark.slow, pytest.mark.timeout(2 * PATIENCE)]
 
 OpenSite = Callable[..., AbstractContextManager[Site]]
 
@@ -96,61 +98,51 @@ def survive(
     return run
 
 
-def survive_kills(open_site: OpenSite, expected: Digests, *, every: float, seed: int) -> None:
-    """Kill a process every few seconds until all jobs have ended."""
+def survive_kills(site: Site, expected: Digests, *, every: float, seed: int) -> None:
+    """Kill a process, or a node of a cluster, every few seconds until all jobs have ended."""
+    faults = Faults(site, seed=seed)
+    survive(site, faults, expected, meanwhile=faults.every(every, faults.kill), pause=0.5)
+    assert faults.counts.total() >= 5, faults.story()
+
+
+@pytest.mark.parametrize(
+    ("count", "every", "seed"), [pytest.param(FEW, 3.0, 1, marks=SHORT), pytest.param(200, 5.0, 2, marks=LONG)]
+)
+def test_jobs_end_once_and_alike_whoever_is_killed(
+    open_site: OpenSite, undisturbed: Callable[[int], Digests], count: int, every: float, seed: int
+) -> None:
+    expected = undisturbed(count)
     with open_site(phase_seconds=0.3) as site:
-        faults = Faults(site, seed=seed)
-        survive(site, faults, expected, meanwhile=faults.every(every, faults.kill), pause=0.5)
-        assert faults.counts.total() >= 5, faults.story()
+        survive_kills(site, expected, every=every, seed=seed)
 
 
-def survive_freezing(open_site: OpenSite, expected: Digests, *, beyond: float, phase_seconds: float, seed: int) -> None:
-    """Freeze one worker after another, so long that its job goes to another worker."""
+@pytest.mark.parametrize(("count", "seed"), [pytest.param(FEW, 5, marks=SHORT), pytest.param(200, 6, marks=LONG)])
+def test_jobs_on_a_ray_cluster_end_once_and_alike_whoever_is_killed(
+    postgres: Any, tmp_path: Path, undisturbed: Callable[[int], Digests], count: int, seed: int
+) -> None:
+    """A phase of an attack takes longer there, and a third loss in one phase fails the job."""
+    expected, phase_seconds = undisturbed(count), 0.3
+    with RayNodes(TROMPE_FAKE_SECONDS=str(phase_seconds), OMP_NUM_THREADS="1") as nodes:
+        options: dict[str, Any] = {"scattered": True, "silence": SILENCE, "phase_seconds": phase_seconds}
+        with Site(tmp_path, postgres.database(), nodes=nodes, **options) as site:
+            survive_kills(site, expected, every=5.0, seed=seed)
+
+
+@pytest.mark.parametrize(
+    ("beyond", "phase_seconds", "seed"),
+    [pytest.param(8.0, 0.5, 3, marks=SHORT), pytest.param(45.0, 2.0, 4, marks=LONG)],
+)
+def test_workers_that_were_frozen_do_no_harm(
+    open_site: OpenSite, undisturbed: Callable[[int], Digests], beyond: float, phase_seconds: float, seed: int
+) -> None:
+    """One worker after another is frozen, so long that its job goes to another worker."""
+    expected = undisturbed(FEW)
     with open_site(phase_seconds=phase_seconds) as site:
         faults = Faults(site, seed=seed)
         freezing = faults.every(1.0, lambda: faults.freeze(seconds=SILENCE + beyond))
         run = survive(site, faults, expected, meanwhile=freezing, pause=phase_seconds)
         reasons = [event.message or "" for events in run.events.values() for event in events]
         assert any("no heartbeat for" in reason for reason in reasons), f"nobody lost a job\n{faults.story()}"
-
-
-@pytest.mark.timeout(PATIENCE)
-def test_jobs_end_once_and_alike_whoever_is_killed(open_site: OpenSite, undisturbed: Callable[[int], Digests]) -> None:
-    survive_kills(open_site, undisturbed(FEW), every=3.0, seed=1)
-
-
-def survive_kills_on_ray(url: str, folder: Path, expected: Digests, *, every: float, seed: int) -> None:
-    """Kill a process or a node of a Ray cluster every few seconds until all jobs have ended.
-
-    A phase of an attack takes longer there, and a third loss in one phase fails the job.
-    """
-    phase_seconds = 0.3
-    with RayNodes(TROMPE_FAKE_SECONDS=str(phase_seconds), OMP_NUM_THREADS="1") as nodes:
-        options: dict[str, Any] = {"scattered": True, "silence": SILENCE, "phase_seconds": phase_seconds}
-        with Site(folder, url, nodes=nodes, **options) as site:
-            faults = Faults(site, seed=seed)
-            survive(site, faults, expected, meanwhile=faults.every(every, faults.kill), pause=0.5)
-            assert faults.counts.total() >= 5, faults.story()
-
-
-@pytest.mark.timeout(PATIENCE)
-def test_jobs_on_a_ray_cluster_end_once_and_alike_whoever_is_killed(
-    postgres: Any, tmp_path: Path, undisturbed: Callable[[int], Digests]
-) -> None:
-    survive_kills_on_ray(postgres.database(), tmp_path, undisturbed(FEW), every=5.0, seed=5)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(2 * PATIENCE)
-def test_200_jobs_on_a_ray_cluster_end_once_and_alike_while_something_is_killed_every_5_seconds(
-    postgres: Any, tmp_path: Path, undisturbed: Callable[[int], Digests]
-) -> None:
-    survive_kills_on_ray(postgres.database(), tmp_path, undisturbed(200), every=5.0, seed=6)
-
-
-@pytest.mark.timeout(PATIENCE)
-def test_workers_that_were_frozen_do_no_harm(open_site: OpenSite, undisturbed: Callable[[int], Digests]) -> None:
-    survive_freezing(open_site, undisturbed(FEW), beyond=8.0, phase_seconds=0.5, seed=3)
 
 
 @pytest.mark.timeout(PATIENCE)
@@ -182,19 +174,3 @@ def away(postgres: Any, faults: Faults, *, seconds: float) -> Iterator[None]:
     thread.start()
     yield
     thread.join()
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(2 * PATIENCE)
-def test_200_jobs_end_once_and_alike_while_a_process_is_killed_every_5_seconds(
-    open_site: OpenSite, undisturbed: Callable[[int], Digests]
-) -> None:
-    survive_kills(open_site, undisturbed(200), every=5.0, seed=2)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(2 * PATIENCE)
-def test_workers_that_were_frozen_for_long_do_no_harm(
-    open_site: OpenSite, undisturbed: Callable[[int], Digests]
-) -> None:
-    survive_freezing(open_site, undisturbed(FEW), beyond=45.0, phase_seconds=2.0, seed=4)

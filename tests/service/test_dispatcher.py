@@ -40,20 +40,11 @@ def executed(tmp_path: Path, renderer: int) -> Iterator[Executed]:
     queue.store.close()
 
 
-def dispatcher(executed: Executed, name: str, open: Callable[[], Executor] | None = None) -> tuple[Dispatcher, Clock]:
-    clock = Clock()
-    claims = Claims(executed.store.engine)
-    return Dispatcher(claims, open or executed.open, name=name, silence=30, stall_timeout=60, clock=clock), clock
-
-
-def test_one_dispatches_and_the_other_waits(executed: Executed) -> None:
-    job = executed.submit("gate")
-    (first, _), (second, _) = dispatcher(executed, "first"), dispatcher(executed, "second")
-    assert first.step()
-    assert not second.step()
-    assert executed.state(job).attempts == 1
-    executed.store.request_cancel(job)
-    wait_until(lambda: first.step() and executed.state(job).state.final)
+def dispatcher(
+    executed: Executed, open: Callable[[], Executor], *, stall_timeout: float = 60
+) -> tuple[Dispatcher, Clock]:
+    clock, claims = Clock(), Claims(executed.store.engine)
+    return Dispatcher(claims, open, name="ours", silence=30, stall_timeout=stall_timeout, clock=clock), clock
 
 
 def frozen(executed: Executed) -> Executor:
@@ -65,9 +56,7 @@ def frozen(executed: Executed) -> Executor:
 
 def test_an_attempt_that_never_begins_is_lost_long_before_the_stall_timeout(executed: Executed) -> None:
     job = executed.submit("fine")
-    claims = Claims(executed.store.engine)
-    clock = Clock()
-    ours = Dispatcher(claims, lambda: frozen(executed), name="ours", silence=30, stall_timeout=1800, clock=clock)
+    ours, clock = dispatcher(executed, lambda: frozen(executed), stall_timeout=1800)
     ours.step()
     for seconds in (START_ALLOWANCE, 31):
         assert executed.state(job).attempts == 1
@@ -82,7 +71,7 @@ def test_an_attempt_that_never_begins_is_lost_long_before_the_stall_timeout(exec
 
 def test_a_job_that_stands_still_is_lost_but_not_right_after_the_dispatcher_was_held_up(executed: Executed) -> None:
     job = executed.submit("fine")
-    ours, clock = dispatcher(executed, "ours", lambda: frozen(executed))
+    ours, clock = dispatcher(executed, lambda: frozen(executed))
     ours.step()
     with write(executed.store.engine) as connection:
         connection.execute(events.update().values(time=events.c.time - 100))
@@ -143,41 +132,40 @@ def test_a_job_that_kills_its_dispatcher_is_failed_and_those_beside_it_end(execu
     fine = executed.submit("fine")
     killer = executed.submit("fine")
     jobs = [fine, killer, *(executed.submit("fine", seed=number) for number in range(3))]
-    ours, _ = dispatcher(executed, "ours", open_executor)
+    ours, _ = dispatcher(executed, open_executor)
     while not all(executed.state(job).state.final for job in jobs):
         try:
             ours.step()
         except ServiceError:
-            ours, _ = dispatcher(executed, "ours", open_executor)
+            ours, _ = dispatcher(executed, open_executor)
     assert {job for job in jobs if executed.state(job).state is not JobState.succeeded} == {killer}
     assert "10 dispatchers died" in str(executed.state(killer).error)
 
 
-def test_the_job_of_a_frozen_process_goes_on_in_another(tmp_path: Path, renderer: int) -> None:
-    executed = Executed(tmp_path, "local", renderer, silence=4.0, workers=1)
-    job = executed.submit("gate")
-    with executed.dispatching():
-        wait_until(lambda: executed.in_gate(job))
-        (frozen,) = workers_of(os.getpid())
-        os.kill(frozen, signal.SIGSTOP)
-        wait_until(lambda: executed.state(job).attempts == 2 and executed.in_gate(job))
-        assert "no heartbeat for 4 s" in "".join(event.message or "" for event in executed.store.events(job))
-        executed.open_gate(job)
-        (ended,) = executed.ended(job)
-    executed.store.close()
-    assert ended.state is JobState.succeeded
+def freeze(worker: int) -> None:
+    os.kill(worker, signal.SIGSTOP)
 
 
-def test_a_dead_fork_server_is_replaced(tmp_path: Path, renderer: int) -> None:
-    executed = Executed(tmp_path, "local", renderer, workers=1)
+def kill_with_its_fork_server(worker: int) -> None:
+    for pid in (parent(worker), worker):
+        assert pid is not None
+        os.kill(pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize(
+    ("harm", "silence", "told"), [(freeze, 4.0, "no heartbeat for 4 s"), (kill_with_its_fork_server, 60.0, " died (")]
+)
+def test_the_job_of_a_lost_process_goes_on_in_another(
+    harm: Callable[[int], None], silence: float, told: str, tmp_path: Path, renderer: int
+) -> None:
+    executed = Executed(tmp_path, "local", renderer, silence=silence, workers=1)
     job = executed.submit("gate")
     with executed.dispatching():
         wait_until(lambda: executed.in_gate(job))
         (worker,) = workers_of(os.getpid())
-        for pid in (parent(worker), worker):
-            assert pid is not None
-            os.kill(pid, signal.SIGKILL)
+        harm(worker)
         wait_until(lambda: executed.state(job).attempts == 2 and executed.in_gate(job))
+        assert told in "".join(event.message or "" for event in executed.store.events(job))
         executed.open_gate(job)
         (ended,) = executed.ended(job)
     executed.store.close()
