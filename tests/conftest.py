@@ -7,7 +7,6 @@ import signal
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from hypothesis import HealthCheck, settings
 from numpy.typing import ArrayLike, NDArray
 
 from tests.pretend_device import register
-from tests.served import Served
 from tests.worker_process import started
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files
@@ -105,13 +103,6 @@ def target(worker: tuple[str, int]) -> Iterator[SailenvTarget]:
     target = SailenvTarget(*worker, timeout=240)
     yield target
     target.close()
-
-
-@pytest.fixture
-def serve(tmp_path: Path) -> Iterator[Served]:
-    """A running ``trompe serve`` whose worker runs fake jobs."""
-    with Served(tmp_path / "data") as running:
-        yield running
 
 
 @pytest.fixture(scope="session")

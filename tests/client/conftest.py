@@ -24,27 +24,24 @@ from pydantic import ValidationError
 from pydantic_core import to_json
 
 from trompe_client import Client, _following
+from trompe_client._embedded import embedded_server
 from trompe_client._http import AsyncPort, BlockingPort
 from trompe_client._plan import Upload, object_source
 from trompe_client.cli import main
+from trompe_server.api import examples
 from trompe_shared.api import (
-    AS_RENDERED,
     MANIFEST,
     MANIFEST_PAGE,
     Accuracy,
     BackgroundInfo,
-    Cell,
     ClassifierInfo,
     Event,
     FooledAs,
-    HashedFile,
     Job,
     JobList,
     JobRequest,
     JobSpec,
     JobState,
-    JudgedNetwork,
-    JudgedRenderer,
     Judgement,
     JudgementRequest,
     JudgementSpec,
@@ -165,28 +162,12 @@ JUDGED = [MANIFEST, MANIFEST_PAGE]
 
 
 def manifest_of(job: Job) -> Manifest:
-    """A judgement with the figures of one cell."""
+    """The API's example of a judgement, of this job's objects."""
     assert isinstance(job.spec, JudgementSpec)
-    before, after = (HashedFile(source=each, sha256="0", bytes=1) for each in (job.spec.before, job.spec.after))
-    cell = Cell(renderer="pyrender", network="tiny", pipeline=AS_RENDERED, accuracy=OWN)
-    return Manifest(
-        suite=None,
-        label=job.spec.label,
-        epsilon=job.spec.epsilon,
-        before=before,
-        after=after,
-        networks=[JudgedNetwork(name="tiny", reference="tiny")],
-        renderers=[JudgedRenderer(name="pyrender")],
-        image_size=(128, 128),
-        seed=0,
-        views=[],
-        findings=[],
-        textures=[],
-        cells=[cell],
-        predictions=[],
-        seconds=1.0,
-        versions={},
-    )
+    example = examples.MANIFEST["content"]["application/json"]["example"]
+    files = {name: example[name] | {"source": getattr(job.spec, name)} for name in ("before", "after")}
+    asked = {"suite": None, "label": job.spec.label, "epsilon": job.spec.epsilon}
+    return Manifest.model_validate(example | asked | files)
 
 
 class FakeServer:
@@ -507,6 +488,13 @@ def server() -> Iterator[FakeServer]:
     http.shutdown()
     thread.join()
     http.server_close()
+
+
+@pytest.fixture(scope="package")
+def service() -> Iterator[str]:
+    """The address of a real service, as `trompe serve` starts it."""
+    with embedded_server() as url:
+        yield url
 
 
 @pytest.fixture

@@ -130,9 +130,11 @@ def test_a_script_can_tell_what_went_wrong(
     assert in_words.exit_code in {exit_code, 0}
 
 
-def test_nobody_there_is_3() -> None:
-    done = trompe("jobs", "--server", "http://127.0.0.1:9", "--json")
-    assert done.exit_code == json.loads(done.stderr)["error"]["exit_code"] == 3
+def test_nobody_there_is_3_and_the_remedy_is_named_in_one_paragraph() -> None:
+    done, in_words = (trompe("jobs", "--server", "http://127.0.0.1:9", *more) for more in (["--json"], []))
+    assert in_words.exit_code == done.exit_code == json.loads(done.stderr)["error"]["exit_code"] == 3
+    assert in_words.stderr.count("\n") == 1
+    assert "trompe serve" in in_words.stderr
 
 
 def test_help_lists_the_exit_codes() -> None:

@@ -8,7 +8,6 @@ import shlex
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 
@@ -18,18 +17,10 @@ from click.testing import CliRunner
 import trompe_client
 from tests.client.conftest import FakeServer, zipped
 from tests.documentation import DOCS, blocks
-from trompe_client._embedded import embedded_server
 from trompe_client.cli import main
 from trompe_client.cli.group import EXITS, OWN
 
 QUICKSTART = {heading: code for language in ("python", "sh") for heading, code in blocks("quickstart.md", language)}
-
-
-@pytest.fixture(scope="module")
-def service() -> Iterator[str]:
-    """The address of a real `trompe serve`."""
-    with embedded_server() as url:
-        yield url
 
 
 def run(command: list[str], folder: Path, server: str) -> str:

@@ -37,39 +37,34 @@ def test_it_gives_the_address_it_is_told_and_stops_the_service_at_the_end(
     assert note.read_text() == "stopped"
 
 
-def test_a_service_that_ends_at_its_start_is_an_error_with_its_last_words() -> None:
-    with (
-        pytest.raises(EmbeddedServerError, match=r"(?s)exit code 3.*no port for you"),
-        embedded_server(command=script("import sys; print('no port for you', file=sys.stderr); sys.exit(3)")),
-    ):
-        pytest.fail("it came up")
+SLEEP = "import time; time.sleep(60)"
+SERVE = f"print('trompe serving on http://127.0.0.1:1'); {SLEEP}"
+REFUSED = Unauthorized(Problem(title="Unauthorized", status=401, detail="This needs a token."))
+NO_TOKEN = r"needs a token\. The embedded service .*\(TROMPE_DATA, .*TROMPE_TOKEN"
 
 
-def test_a_service_that_never_comes_up_is_given_up() -> None:
-    with (
-        pytest.raises(EmbeddedServerError, match="within 0 s"),
-        embedded_server(command=script("import time; time.sleep(60)"), start_seconds=0.1),
-    ):
-        pytest.fail("it came up")
-
-
-def test_a_service_that_dies_is_told_apart_from_a_server_elsewhere() -> None:
-    code = "print('out of memory\\ntrompe serving on http://127.0.0.1:1')"
-    with (
-        pytest.raises(EmbeddedServerError, match=r"(?s)has ended.*out of memory"),
-        embedded_server(command=script(f"{code}; import time; time.sleep(60)")),
-    ):
-        raise ServerUnreachable("nobody there")
-
-
-def test_data_with_tokens_are_told_of_where_none_was_given() -> None:
-    code = "print('trompe serving on http://127.0.0.1:1', flush=True); import time; time.sleep(60)"
-    asked = Problem(title="Unauthorized", status=401, detail="This needs a token.")
-    with (
-        pytest.raises(Unauthorized, match=r"needs a token\. The embedded service .*\(TROMPE_DATA, .*TROMPE_TOKEN"),
-        embedded_server(command=script(code)),
-    ):
-        raise Unauthorized(asked)
+@pytest.mark.parametrize(
+    ("code", "seconds", "raised", "error", "words"),
+    [
+        pytest.param(
+            "import sys; print('no port for you', file=sys.stderr); sys.exit(3)",
+            *(180, None, EmbeddedServerError, r"(?s)exit code 3.*no port for you"),
+            id="ends at its start",
+        ),
+        pytest.param(SLEEP, 0.1, None, EmbeddedServerError, "within 0 s", id="never comes up"),
+        pytest.param(
+            f"print('out of memory'); {SERVE}",
+            *(180, ServerUnreachable("nobody there"), EmbeddedServerError, r"(?s)has ended.*out of memory"),
+            id="dies, unlike a server elsewhere",
+        ),
+        pytest.param(SERVE, 180, REFUSED, Unauthorized, NO_TOKEN, id="has data with tokens"),
+    ],
+)
+def test_what_goes_wrong_with_the_service_is_told(
+    code: str, seconds: float, raised: Exception | None, error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words), embedded_server(command=script(code), start_seconds=seconds):
+        raise raised or AssertionError("it came up")
 
 
 def test_a_terminated_command_takes_its_service_along(tmp_path: Path) -> None:

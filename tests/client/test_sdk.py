@@ -26,7 +26,7 @@ from trompe_client import (
     Unauthorized,
     WaitTimeout,
 )
-from trompe_shared.api import JobRequest, JobSpec, JobState, ViewRanges
+from trompe_shared.api import JobRequest, JobState, ViewRanges
 from trompe_shared.errors import ObjectError, SpecError
 
 
@@ -34,19 +34,6 @@ def answering(status: int, body: bytes, **headers: str) -> Client:
     """A client whose every request is answered so."""
     transport = httpx.MockTransport(lambda _request: httpx.Response(status, content=body, headers=headers))
     return Client(transport=transport, retries=Retries(limit=0))
-
-
-def test_an_attack_on_a_stored_object_submits_the_spec_and_waits_for_its_result(
-    client: Client, server: FakeServer
-) -> None:
-    options: dict[str, Any] = {"label": "mug", "epsilon": 0.1, "elevation": (5.0, 40.0), "judges": ["tiny"], "seed": 7}
-    job = client.attack("mug", **options)
-    assert job.state is JobState.queued
-    assert job.status.spec == JobSpec.of("mug", **options)
-    assert job.wait(timeout=20).state is JobState.succeeded
-    assert (held_out := job.result().held_out) is not None
-    assert held_out.views == 17
-    assert server.uploads == {}
 
 
 def test_files_are_uploaded_and_the_job_names_them_by_id(

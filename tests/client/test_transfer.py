@@ -64,21 +64,21 @@ def test_what_is_there_is_not_brought_again(job: JobHandle, server: FakeServer, 
     assert asked(server) == [(None, None), (None, f'"{hashlib.sha256(DATA).hexdigest()}"')]
 
 
-def test_a_part_of_another_file_is_of_no_use(job: JobHandle, server: FakeServer, tmp_path: Path) -> None:
-    other = hashlib.sha256(b"other").hexdigest()
-    (tmp_path / f".big.bin.{other}.part").write_bytes(b"oth")
-    assert job.download(tmp_path)[0].read_bytes() == DATA
-    assert [file.name for file in tmp_path.iterdir()] == ["big.bin"]
-
-
-@pytest.mark.parametrize("extra", [b"", b"more"], ids=["all of it", "more than all"])
+@pytest.mark.parametrize(
+    ("of", "part", "requests"),
+    [
+        pytest.param(b"other", b"oth", 1, id="of another file"),
+        pytest.param(DATA, DATA, 1, id="all of it"),
+        pytest.param(DATA, DATA + b"more", 2, id="more than all"),
+    ],
+)
 def test_a_part_that_is_no_part_is_checked_and_brought_anew_if_need_be(
-    job: JobHandle, server: FakeServer, tmp_path: Path, extra: bytes
+    job: JobHandle, server: FakeServer, tmp_path: Path, of: bytes, part: bytes, requests: int
 ) -> None:
-    (tmp_path / f".big.bin.{hashlib.sha256(DATA).hexdigest()}.part").write_bytes(DATA + extra)
+    (tmp_path / f".big.bin.{hashlib.sha256(of).hexdigest()}.part").write_bytes(part)
     assert job.download(tmp_path)[0].read_bytes() == DATA
     assert [file.name for file in tmp_path.iterdir()] == ["big.bin"]
-    assert len(asked(server)) == 1 + bool(extra)
+    assert len(asked(server)) == requests
 
 
 def test_wrong_bytes_are_brought_again(job: JobHandle, server: FakeServer, tmp_path: Path) -> None:

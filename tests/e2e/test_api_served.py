@@ -3,7 +3,6 @@
 The jobs are fake.
 """
 
-import json
 import os
 import re
 import shutil
@@ -13,7 +12,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from http.client import HTTPConnection
 from pathlib import Path
@@ -130,26 +129,6 @@ def test_a_revoked_token_is_worthless_within_moments(serve: Serve) -> None:
         serve.tokens.revoke("guest")
         time.sleep(FRESH + 0.1)
         assert guest.get("/v1/jobs").status_code == 401
-
-
-def test_a_stream_of_events_is_taken_up_again_where_it_broke_off(serve: Serve) -> None:
-    job = serve.submit("gate")
-    seen: list[int] = []
-
-    def follow(*, until: Callable[[dict[str, Any]], bool]) -> None:
-        last = {"Last-Event-ID": str(seen[-1])} if seen else {}
-        with serve.reader.stream("GET", f"/v1/jobs/{job}/events", headers=last) as stream:
-            for line in stream.iter_lines():
-                if line.startswith("data: "):
-                    event = json.loads(line.removeprefix("data: "))
-                    seen.append(event["id"])
-                    if until(event):
-                        return
-
-    follow(until=lambda event: event["progress"]["phase"] == "attack-001")
-    (serve.settings.data / "jobs" / job / "go").touch()
-    follow(until=lambda event: event["state"] == "succeeded")
-    assert seen == list(range(1, len(seen) + 1))
 
 
 def test_streams_end_when_the_server_stops_and_it_stops_at_once(tmp_path: Path) -> None:

@@ -15,6 +15,13 @@ from tests.served import CHILD, Served, parent, wait_until
 from trompe_shared.api import JobRequest
 
 
+@pytest.fixture(scope="module")
+def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A running ``trompe serve`` whose worker runs fake jobs; each test leaves it whole for the next."""
+    with Served(tmp_path_factory.mktemp("serve") / "data") as running:
+        yield running
+
+
 def gone(pid: int) -> bool:
     """Whether a process has ended (a zombie has)."""
     try:
@@ -52,13 +59,6 @@ def test_a_job_is_followed_live_through_a_lost_connection_and_a_killed_worker(se
     assert ends == [f"end {phase}" for phase in PHASES]
 
 
-def test_a_job_is_cancelled_over_http(serve: Served) -> None:
-    job = serve.submit("gate")
-    wait_until(lambda: serve.in_gate(job))
-    assert serve.http.post(f"/v1/jobs/{job}/cancel").json()["state"] == "running"
-    wait_until(lambda: serve.state(job).state == "cancelled")  # its gate is closed: the phase would never end
-
-
 def test_a_renderer_that_is_killed_comes_back_at_the_same_address(serve: Served) -> None:
     before = wait_until(lambda: "worker" in (children := serve.children()) and children)
     renderers = wait_until(serve.engines)
@@ -86,19 +86,13 @@ def test_a_second_serve_on_the_same_data_is_refused(serve: Served) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
-def test_nothing_is_left_running_when_serve_ends(serve: Served, number: signal.Signals) -> None:
+def test_nothing_is_left_running_when_serve_ends_and_its_job_outlives_it(serve: Served, number: signal.Signals) -> None:
     job = serve.submit("gate")
     wait_until(lambda: serve.in_gate(job))
     children = serve.children()
     assert set(children) == {"worker", "render"}
     assert serve.stop(number) == (-number if number is signal.SIGKILL else 0)
     wait_until(lambda: all(gone(pid) for pid in children.values()))
-
-
-def test_jobs_outlive_the_service(serve: Served) -> None:
-    job = serve.submit("gate")
-    wait_until(lambda: serve.in_gate(job))
-    serve.stop()
     serve.start()
     serve.open_gate(job)
     wait_until(lambda: serve.state(job).state == "succeeded")

@@ -174,20 +174,21 @@ def test_a_worker_ends_with_its_parent(service: Service) -> None:
 
 
 def test_workers_of_a_service_are_counted_together_and_those_elsewhere_serve_their_own(
-    serve: Served, tmp_path: Path, renderer: int
+    tmp_path: Path, renderer: int
 ) -> None:
     def scraped(url: str) -> dict[str, float]:
         families = text_string_to_metric_families(httpx.get(url, timeout=120).text)
         return {"".join([s.name, *s.labels.values()]): s.value for family in families for s in family.samples}
 
-    done = serve.submit("fine")
-    wait_until(lambda: serve.state(done).state.final)
-    first = serve.children()["worker"]
-    os.kill(first, signal.SIGKILL)
-    wait_until(lambda: serve.children().get("worker", first) != first)
-    again = serve.submit("fine")
-    wait_until(lambda: serve.state(again).state.final)
-    found = scraped(f"{serve.url}/metrics")
+    with Served(tmp_path / "data") as serve:
+        done = serve.submit("fine")
+        wait_until(lambda: serve.state(done).state.final)
+        first = serve.children()["worker"]
+        os.kill(first, signal.SIGKILL)
+        wait_until(lambda: serve.children().get("worker", first) != first)
+        again = serve.submit("fine")
+        wait_until(lambda: serve.state(again).state.final)
+        found = scraped(f"{serve.url}/metrics")
     assert (found["trompe_attack_steps_total"], found["trompe_target_renders_total"]) == (20, 6)
     assert {"trompe_phase_seconds_totalattack", "trompe_phase_seconds_totalprepare"} <= found.keys()
 
