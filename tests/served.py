@@ -139,11 +139,11 @@ class Served(Queue):
 
     def children(self) -> dict[str, int]:
         """Process ids of the children, by command; an attack worker is ``worker``."""
-        found: dict[str, int] = {}
-        for entry in Path("/proc").iterdir():
-            if entry.name.isdecimal() and self.process.pid in ancestors(int(entry.name)):
-                command = command_of(entry)
-                found |= {command: int(entry.name)} if command is not None else {}
+        table, found = process_table(), dict[str, int]()
+        for pid in table:
+            if pid != self.process.pid and self.process.pid in ancestry(pid, table):
+                command = command_of(Path("/proc", str(pid)))
+                found |= {command: pid} if command is not None else {}
         return found
 
 
@@ -160,25 +160,30 @@ def command_of(process: Path) -> str | None:
     if CHILD[-1] in words:
         return words[words.index(CHILD[-1]) + 1]
     forked = any("multiprocessing.forkserver" in word for word in words)
-    return "worker" if forked and command_line(Path("/proc", str(parent(int(process.name))))) == words else None
-
-
-def ancestors(pid: int) -> list[int]:
-    """Parent and grandparent of a process."""
-    above = [parent(pid)]
-    above += [parent(above[0])] if above[0] else []
-    return [each for each in above if each]
+    above = process_table().get(int(process.name)) if forked else None
+    return "worker" if above and command_line(Path("/proc", str(above))) == words else None
 
 
 def workers_of(service: int) -> list[int]:
     """Ids of the attack workers of a process."""
-    entries = [entry for entry in Path("/proc").iterdir() if entry.name.isdecimal()]
-    found = [int(entry.name) for entry in entries if service in ancestors(int(entry.name))]
+    table = process_table()
+    found = [pid for pid in table if pid != service and service in ancestry(pid, table)]
     return [pid for pid in found if command_of(Path("/proc", str(pid))) == "worker"]
 
 
-def parent(pid: int) -> int | None:
-    try:
-        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-    except (FileNotFoundError, ProcessLookupError):
-        return None
+def process_table() -> dict[int, int]:
+    """Parent of each living process."""
+    table = {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(FileNotFoundError, ProcessLookupError):
+            state, parent = (entry / "stat").read_text().rpartition(")")[2].split()[:2]
+            if state != "Z":
+                table[int(entry.name)] = int(parent)
+    return table
+
+
+def ancestry(pid: int, table: Mapping[int, int]) -> Iterator[int]:
+    """A process, its parent, and so on."""
+    while pid in table:
+        yield pid
+        pid = table[pid]

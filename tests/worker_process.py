@@ -37,13 +37,16 @@ class Worker:
 
 
 @contextmanager
-def started(*options: str, code: str | None = None, log: IO[str] | None = None) -> Iterator[Worker]:
+def started(
+    *options: str, code: str | None = None, log: IO[str] | None = None, folder: Path | None = None
+) -> Iterator[Worker]:
     """A worker for the time of a ``with``: ``trompe render`` with ``options``, or Python ``code`` in its place.
 
-    ``log`` receives its standard error.
+    ``log`` receives its standard error. It runs in ``folder``.
     """
     program = ["-m", "trompe_renderer", "--port", "0", *options] if code is None else ["-c", code]
-    with subprocess.Popen([sys.executable, *program], stdout=subprocess.PIPE, stderr=log, text=True) as process:
+    command, pipe = [sys.executable, *program], subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=log, text=True, cwd=folder) as process:
         try:
             assert process.stdout is not None
             ready = READY.fullmatch(process.stdout.readline())

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.fake_job import PHASES, trace
-from tests.served import CHILD, Served, parent, wait_until
+from tests.served import CHILD, Served, process_table, wait_until
 from trompe_shared.api import JobRequest
 
 
@@ -20,14 +20,6 @@ def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A running ``trompe serve`` whose worker runs fake jobs; each test leaves it whole for the next."""
     with Served(tmp_path_factory.mktemp("serve") / "data") as running:
         yield running
-
-
-def gone(pid: int) -> bool:
-    """Whether a process has ended (a zombie has)."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return True
 
 
 def events(serve: Served, job: str, *, after: int = 0) -> Iterator[dict[str, Any]]:
@@ -62,8 +54,7 @@ def test_a_job_is_followed_live_through_a_lost_connection_and_a_killed_worker(se
 def test_a_renderer_that_is_killed_comes_back_at_the_same_address(serve: Served) -> None:
     before = wait_until(lambda: "worker" in (children := serve.children()) and children)
     renderers = wait_until(serve.engines)
-    pids = [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdecimal()]
-    assert [pid for pid in pids if parent(pid) == before["render"]] == []  # serve alone supervises it
+    assert before["render"] not in process_table().values()  # serve alone supervises it
     os.kill(before["render"], signal.SIGKILL)
     come_back = {before["render"], None}  # if we are held up, before we look
     wait_until(lambda: serve.http.get("/readyz").status_code == 503 or serve.children().get("render") not in come_back)
@@ -92,7 +83,7 @@ def test_nothing_is_left_running_when_serve_ends_and_its_job_outlives_it(serve: 
     children = serve.children()
     assert set(children) == {"worker", "render"}
     assert serve.stop(number) == (-number if number is signal.SIGKILL else 0)
-    wait_until(lambda: all(gone(pid) for pid in children.values()))
+    wait_until(lambda: not process_table().keys() & children.values())
     serve.start()
     serve.open_gate(job)
     wait_until(lambda: serve.state(job).state == "succeeded")

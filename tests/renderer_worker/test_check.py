@@ -5,7 +5,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -105,18 +105,9 @@ def encoded(light: Levels) -> Levels:
 def painted(change: Callable[[Picture], NDArray[Any]]) -> Fault:
     def aim(world: Snapshot, *_: int) -> Snapshot:
         def other(each: Instance) -> Instance:
-            obj = each.model.obj
-            return replace(
-                each,
-                model=model_of(
-                    obj.with_textures(
-                        {
-                            name: np.ascontiguousarray(change(texture)).astype(np.uint8)
-                            for name, texture in obj.textures.items()
-                        }
-                    )
-                ),
-            )
+            images = {name: change(texture) for name, texture in each.model.obj.textures.items()}
+            new = {name: np.ascontiguousarray(image).astype(np.uint8) for name, image in images.items()}
+            return replace(each, model=model_of(each.model.obj.with_textures(new)))
 
         return replace(world, instances=tuple(map(other, world.instances)))
 
@@ -141,45 +132,34 @@ def upright(world: Snapshot, *_: int) -> Snapshot:
     return replace(world, camera=camera)
 
 
-def cached_by(key: Callable[[Instance], str]) -> Callable[[Engine], Engine]:
-    """Draws the first object with an equal ``key`` again."""
+Known = dict[str, Instance]
+
+
+def keeping(shown: Callable[[Known, Sequence[Instance]], Iterable[Instance]]) -> Fault:
+    """Shows ``shown`` of what it keeps, which that may change, and of the world's objects."""
 
     def wrong(engine: Engine) -> Engine:
-        known: dict[str, Instance] = {}
-        return Wrong(
-            engine,
-            aim=lambda world, *_: replace(
-                world, instances=tuple(known.setdefault(key(each), each) for each in world.instances)
-            ),
-        )
+        known: Known = {}
+        return aimed(lambda world, *_: replace(world, instances=tuple(shown(known, world.instances))))(engine)
 
     return wrong
 
 
-frozen, by_name = cached_by(lambda each: each.model.shape), cached_by(lambda each: each.model.obj.name)
-
-
-def late(engine: Engine) -> Engine:
+def late(known: Known, now: Sequence[Instance]) -> list[Instance]:
     """A repaint shows one picture later."""
-    last: dict[str, Instance] = {}
-
-    def aim(world: Snapshot, *_: int) -> Snapshot:
-        shown = tuple(last.get(each.model.shape, each) for each in world.instances)
-        last.update({each.model.shape: each for each in world.instances})
-        return replace(world, instances=shown)
-
-    return Wrong(engine, aim=aim)
+    shown = [known.get(each.model.shape, each) for each in now]
+    known.update({each.model.shape: each for each in now})
+    return shown
 
 
-def hoarding(engine: Engine) -> Engine:
+def hoarded(known: Known, now: Sequence[Instance]) -> Iterable[Instance]:
     """Never removes an object."""
-    known: dict[str, Instance] = {}
+    known.update({each.model.shape: each for each in now})
+    return known.values()
 
-    def aim(world: Snapshot, *_: int) -> Snapshot:
-        known.update({each.model.shape: each for each in world.instances})
-        return replace(world, instances=tuple(known.values()))
 
-    return Wrong(engine, aim=aim)
+frozen = keeping(lambda known, now: [known.setdefault(each.model.shape, each) for each in now])
+by_name = keeping(lambda known, now: [known.setdefault(each.model.obj.name, each) for each in now])
 
 
 def grain(sigma: float, seed: Callable[[Snapshot], int | None]) -> See:
@@ -209,47 +189,29 @@ def adapting(engine: Engine) -> Engine:
     return Wrong(engine, see=see)
 
 
-def on_object(change: Callable[[Levels], Levels]) -> See:
-    """``change`` of all but the background."""
+def on_object(change: Callable[[Levels], Levels], *, background: bool = False) -> See:
+    """``change`` of all but the background, or of that alone."""
 
     def see(picture: Levels, world: Snapshot) -> Levels:
         asked = np.round(255 * np.array(world.background))
-        return np.where((picture == asked).all(axis=-1, keepdims=True), picture, change(picture))
+        behind = (picture == asked).all(axis=-1, keepdims=True)
+        return np.where(behind == background, change(picture), picture)
 
     return see
 
 
-def off_background(change: Callable[[Levels], Levels]) -> See:
-    def see(picture: Levels, world: Snapshot) -> Levels:
-        asked = np.round(255 * np.array(world.background))
-        return np.where((picture == asked).all(axis=-1, keepdims=True), change(asked), picture)
-
-    return see
+def slow(picture: Levels, _: Snapshot) -> Levels:
+    time.sleep(0.1)
+    return picture
 
 
-def slow(engine: Engine) -> Engine:
-    def see(picture: Levels, _: Snapshot) -> Levels:
-        time.sleep(0.1)
-        return picture
-
-    return Wrong(engine, see=see)
-
-
-def square_only(engine: Engine) -> Engine:
-    return lens(lambda aspect: (1 / aspect, 1))(engine)
-
-
-def padded(engine: Engine) -> Engine:
+def padded(picture: Levels, _: Snapshot) -> Levels:
     """Rows are read as if they were multiples of four bytes."""
-
-    def see(picture: Levels, _: Snapshot) -> Levels:
-        height, width = picture.shape[:2]
-        row = -(-3 * width // 4) * 4
-        flat = np.zeros(height * row)
-        flat[: picture.size] = picture.ravel()
-        return flat.reshape(height, row)[:, : 3 * width].reshape(picture.shape)
-
-    return Wrong(engine, see=see)
+    height, width = picture.shape[:2]
+    row = -(-3 * width // 4) * 4
+    flat = np.zeros(height * row)
+    flat[: picture.size] = picture.ravel()
+    return flat.reshape(height, row)[:, : 3 * width].reshape(picture.shape)
 
 
 def attached(light: WorldLight, world: Snapshot) -> WorldLight:
@@ -278,11 +240,11 @@ FAULTS = [
     pytest.param("field of view", wide(62), id="62 degrees"),
     pytest.param("field of view", wide(45), id="45 degrees"),
     pytest.param("field of view", wide(59), id="59 degrees"),
-    pytest.param("aspect", square_only, id="a square camera"),
+    pytest.param("aspect", lens(lambda aspect: (1 / aspect, 1)), id="a square camera"),
     pytest.param("aspect", lens(lambda aspect: (1.04, 1)), id="4 percent too narrow"),
     pytest.param("aspect", lens(lambda aspect: (1 / aspect, 1 / aspect)), id="horizontal field of view"),
     pytest.param("aspect", lens(lambda aspect: (1 / min(aspect, 1),) * 2), id="field of view of the shorter side"),
-    pytest.param("sheared", padded, id="padded rows"),
+    pytest.param("sheared", seen(padded), id="padded rows"),
     pytest.param("channel order", seen(lambda picture, _: picture[..., ::-1]), id="BGR"),
     pytest.param("channel order", seen(lambda picture, _: picture[..., [1, 2, 0]]), id="GBR"),
     pytest.param("gamma twice", seen(on_object(lambda picture: encoded(picture / 255))), id="encoded twice"),
@@ -299,8 +261,8 @@ FAULTS = [
     pytest.param("shifted", shifted(0, -0.5), id="half a pixel up"),
     pytest.param("shifted", shifted(-2, 3), id="left and down"),
     pytest.param("frozen texture", frozen, id="frozen"),
-    pytest.param("late texture", late, id="late"),
-    pytest.param("stale scene", hoarding, id="earlier objects"),
+    pytest.param("late texture", keeping(late), id="late"),
+    pytest.param("stale scene", keeping(hoarded), id="earlier objects"),
     pytest.param("stale object", by_name, id="cached by name"),
     pytest.param("light reversed", lit(lambda light, _: turned(light, -np.eye(3))), id="light reversed"),
     pytest.param("light direction", lit(lambda light, _: turned(light, np.diag([-1, 1, 1]))), id="light mirrored"),
@@ -315,8 +277,14 @@ FAULTS = [
     pytest.param(
         "ambient missing", aimed(lambda world, *_: replace(world, ambient=(0.0, 0.0, 0.0))), id="no ambient light"
     ),
-    pytest.param("background", seen(off_background(lambda asked: asked + 3 * np.sign(127 - asked))), id="3 levels off"),
-    pytest.param("background", seen(off_background(lambda asked: 255 * linear(asked))), id="background not encoded"),
+    pytest.param(
+        "background",
+        seen(on_object(lambda asked: asked + 3 * np.sign(127 - asked), background=True)),
+        id="3 levels off",
+    ),
+    pytest.param(
+        "background", seen(on_object(lambda asked: 255 * linear(asked), background=True)), id="background not encoded"
+    ),
     pytest.param("axes", turned_world([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), id="z up world"),
     pytest.param("axes", turned_world([[-1, 0, 0], [0, 1, 0], [0, 0, -1]]), id="from behind"),
     pytest.param("axes", turned_world([[-1, 0, 0], [0, 1, 0], [0, 0, 1]]), id="left-handed world"),
@@ -438,7 +406,7 @@ def test_light_on_encoded_colours_is_a_warning(engine: Engine) -> None:
 
 def test_a_slow_adapter_is_told_by_a_warning(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(questions, "SLOW", 0.1)
-    (told,) = (each for each in check(EngineRender(slow(engine)), engine.info) if each.level != "ok")
+    (told,) = (each for each in check(EngineRender(seen(slow)(engine)), engine.info) if each.level != "ok")
     assert (told.level, told.name) == ("warning", "slow")
 
 

@@ -15,7 +15,6 @@ from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D
 
 SIZE = (60, 80)
-GREY = (90, 90, 90)
 AMBIENT = Light(intensity=0.0, ambient=1.0)
 """Light in which every surface shows its albedo (apart from gamma 2.2 instead of sRGB)."""
 
@@ -62,11 +61,7 @@ def test_each_side_is_seen_from_its_side(
     assert np.abs(picture[SIZE[0] // 2, SIZE[1] // 2].astype(int) - color).max() < 12
 
 
-def test_left_is_left_up_is_up_and_from_straight_above_the_front_is_at_the_bottom(target: SailenvTarget) -> None:
-    picture = show(target, boxes(), Camera(0.3, 30, 30), background=GREY)
-    front, right, top = (where(picture, color) for color in ((200, 0, 200), (200, 0, 0), (0, 0, 200)))
-    assert right[1] > front[1] + 5
-    assert top[0] < front[0] - 5
+def test_from_straight_above_the_front_is_at_the_bottom(target: SailenvTarget) -> None:
     picture = show(target, boxes(((0.02, 0, 0.06), (0.02, 0.01, 0.04))), Camera(0.3, 0, 90))
     row, column = where(picture, (0, 0, 200))
     assert row > SIZE[0] / 2 + 5
@@ -113,33 +108,6 @@ def test_a_box_is_where_the_camera_puts_it_to_a_fraction_of_a_pixel(
     assert np.abs(np.array([(cover * x).sum(), (cover * y).sum()]) / cover.sum() - middle).max() <= 0.13
 
 
-@settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
-@given(st.tuples(*[st.integers(0, 255)] * 3))
-def test_the_background_is_exactly_the_colour_asked_for(target: SailenvTarget, color: tuple[int, int, int]) -> None:
-    picture = show(target, boxes(), Camera(0.5, 10, 10), background=color)
-    assert (picture[0, 0] == color).all()
-
-
-def test_light_comes_from_its_direction(target: SailenvTarget) -> None:
-    box, camera = boxes(textures=WHITE), Camera(0.35, 45, 30)
-    spots = on_screen(camera, np.array([[0.1, 0, 0], [0, 0.06, 0], [0, 0, 0.04]])).astype(int)
-    for brightest, (azimuth, elevation) in enumerate([(90, 0), (0, 90), (0, 0)]):
-        light = Light(azimuth=azimuth, elevation=elevation, intensity=1.0, ambient=0.1)
-        picture = show(target, box, camera, light)
-        levels = [int(picture[row, column, 0]) for column, row in spots]
-        assert levels[brightest] > 200
-        assert max(level for side, level in enumerate(levels) if side != brightest) < 110
-
-
-def test_at_intensity_one_a_white_wall_that_faces_the_light_is_white(target: SailenvTarget) -> None:
-    box = boxes(textures=WHITE)
-    centres = [
-        linear(show(target, box, Camera(0.3, 0, 0), Light(0, 0, intensity, 0.0)))[30, 40, 0]
-        for intensity in (0.0, 0.25, 0.5, 1.0)
-    ]
-    assert np.allclose(centres, [0, 0.25, 0.5, 1.0], atol=0.06)
-
-
 def test_reflected_light_is_linear_in_the_lights_intensity(target: SailenvTarget) -> None:
     box = boxes(maps={"metallic": plain(80, 80, 80, 128)})
     intensities = np.linspace(0, 0.8, 9)
@@ -151,12 +119,6 @@ def test_reflected_light_is_linear_in_the_lights_intensity(target: SailenvTarget
     for channel in np.transpose(levels):
         line = np.polyval(np.polyfit(intensities, channel, 1), intensities)
         assert np.abs(channel - line).max() < 0.005  # a level of 255 in the middle of the range
-
-
-def test_ambient_light_reaches_every_side(target: SailenvTarget) -> None:
-    box = boxes(textures=WHITE)
-    picture = show(target, box, Camera(0.3, 0, -90), Light(0, 90, 1.0, ambient=0.5))
-    assert np.allclose(linear(picture)[30, 40], 0.5, atol=0.02)
 
 
 def test_repainting_a_side_changes_that_side_alone(target: SailenvTarget) -> None:

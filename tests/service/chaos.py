@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from tests.fake_job import PHASES, trace
-from tests.served import CHILD, FAKE, command_line, command_of, reserved_port, wait_until
+from tests.served import CHILD, FAKE, ancestry, command_line, command_of, process_table, reserved_port, wait_until
 from tests.service.ray_nodes import ACCESS, RayNodes
 from trompe_client import Client, Retries
 from trompe_client._job import JobHandle
@@ -417,26 +417,6 @@ def _letter(event: Event) -> str:
     if event.state is JobState.queued:
         return "q"
     return "s" if event.message is not None and event.message.startswith(("started", "continued by")) else "r"
-
-
-def process_table() -> dict[int, int]:
-    """Parent of each living process."""
-    table = {}
-    for entry in Path("/proc").iterdir():
-        with suppress(FileNotFoundError, ProcessLookupError, ValueError):
-            state, parent = (
-                (entry / "stat").read_text().rpartition(")")[2].split()[:2] if entry.name.isdecimal() else "Z0"
-            )
-            if state != "Z":
-                table[int(entry.name)] = int(parent)
-    return table
-
-
-def ancestry(pid: int, table: Mapping[int, int]) -> Iterator[int]:
-    """A process, its parent, and so on."""
-    while pid in table:
-        yield pid
-        pid = table[pid]
 
 
 def kind_of(pid: int) -> str | None:

@@ -13,8 +13,8 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tests.served import Served
-from tests.service.chaos import KINDS, ancestry, kind_of, process_table
+from tests.served import Served, ancestry, process_table
+from tests.service.chaos import KINDS, kind_of
 
 MIB: Final = 2**20
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.served import FAKE, parent, wait_until, workers_of
+from tests.served import FAKE, process_table, wait_until, workers_of
 from tests.service.executors import Executed
 from trompe_server.errors import ServiceError
 from trompe_server.executor.dispatcher import Dispatcher, dispatcher_name
@@ -147,8 +147,7 @@ def freeze(worker: int) -> None:
 
 
 def kill_with_its_fork_server(worker: int) -> None:
-    for pid in (parent(worker), worker):
-        assert pid is not None
+    for pid in (process_table()[worker], worker):
         os.kill(pid, signal.SIGKILL)
 
 

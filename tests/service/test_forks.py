@@ -11,15 +11,15 @@ import pytest
 
 from tests.served import wait_until, workers_of
 from tests.service.executors import NAME, Executed
+from tests.service.records import claim
 from trompe_server.executor import task
 from trompe_server.executor.attempts import MARK
 from trompe_server.executor.forks import Forks
 from trompe_server.executor.process import READY, Setup
 from trompe_server.executor.task import run_forked
-from trompe_server.queue.claims import Claim, Claims
 from trompe_server.queue.leases import DISPATCHER, take_lease
 from trompe_server.storage.folders import open_folder
-from trompe_shared.api import JobState, Needs
+from trompe_shared.api import JobState
 
 
 @pytest.fixture(scope="module")
@@ -34,20 +34,14 @@ def executed(tmp_path: Path, renderer: int) -> Iterator[Executed]:
     queue.store.close()
 
 
-def claim(executed: Executed, label: str) -> Claim:
-    executed.submit(label)
-    found = Claims(executed.store.engine).claim(Needs(), "here")
-    assert found is not None
-    return found
-
-
 def test_attempts_of_a_task_share_a_process_until_one_kills_it(
     forks: Forks, executed: Executed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pickled = pickle.dumps(executed.setup)
 
     def run(label: str) -> tuple[str | None, set[int]]:
-        said = run_forked(forks.address, pickled, pickle.dumps(claim(executed, label)))
+        executed.submit(label)
+        said = run_forked(forks.address, pickled, pickle.dumps(claim(executed.store, "here")))
         return said, set(workers_of(os.getpid()))
 
     (first, its), (second, same), (died, none) = run("fine"), run("fine"), run("deadly")

@@ -19,9 +19,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from tests.service.records import DONE, claim, claims_of, create, request
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.queue import migrations
-from trompe_server.queue.claims import ALONE_AFTER, MAX_ORPHANED, START_ALLOWANCE, Claim, Claims, Ending, LostJobError
+from trompe_server.queue.claims import ALONE_AFTER, MAX_ORPHANED, START_ALLOWANCE, Claim, Ending, LostJobError
 from trompe_server.queue.leases import end_lease, take_lease
 from trompe_server.queue.migrations import HEAD
 from trompe_server.queue.store import JobStore
@@ -29,31 +30,10 @@ from trompe_server.queue.tables import events, jobs, metadata, workers
 from trompe_server.queue.workers import Worker, forget_workers, record_workers
 from trompe_server.storage import tokens
 from trompe_server.storage.database import write
-from trompe_shared.api import JobRequest, JobState, Needs, Progress
+from trompe_shared.api import JobState, Needs, Progress
 from trompe_shared.errors import SpecError
 
-DONE = Ending(JobState.succeeded, note="done")
 HALF = Progress(phase="attack", fraction=0.5)
-
-
-def request(**options: Any) -> JobRequest:
-    return JobRequest.of(**{"object": "mug", "label": "mug"} | options)
-
-
-def create(store: JobStore, **options: Any) -> str:
-    return store.create(request(**options))[0].id
-
-
-def claims_of(store: JobStore) -> Claims:
-    return Claims(store.engine)
-
-
-def claim(store: JobStore, worker: str = "w") -> Claim:
-    """Claim the next job, whatever it needs."""
-    claims = claims_of(store)
-    found = claims.claim(claims.upcoming()[0], worker)
-    assert found is not None
-    return found
 
 
 def test_a_job_is_kept_as_it_was_asked_for(store: JobStore) -> None:

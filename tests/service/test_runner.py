@@ -13,13 +13,14 @@ from typing import Any, TypeVar
 import pytest
 from prometheus_client import REGISTRY
 
+from tests.service.records import claim, claims_of, create
 from trompe_server.executor.runner import JobRunner
 from trompe_server.job.protocol import DamagedFileError, OnProgress, PhaseReport
 from trompe_server.queue.claims import Claims, Ending
 from trompe_server.queue.store import JobStore
 from trompe_server.storage.database import DatabaseDownError
 from trompe_server.storage.folders import LocalArtifacts
-from trompe_shared.api import JobRequest, JobState, Needs, Progress
+from trompe_shared.api import JobState, Progress
 from trompe_shared.errors import RendererError
 
 pytestmark = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
@@ -53,17 +54,10 @@ def runner_of(claims: Claims, job: Scripted, **options: Any) -> JobRunner:
     return JobRunner(claims, lambda _: nullcontext(job), retry_waits=(0.001, 0.01), **options)
 
 
-def submit(store: JobStore) -> str:
-    return store.create(JobRequest.of("mug", label="mug"))[0].id
-
-
 def run(store: JobStore, scripted: Scripted, *, claims: Claims | None = None, **options: Any) -> JobState | None:
     """Submit a job and run it."""
-    job = submit(store)
-    runner = runner_of(claims or Claims(store.engine), scripted, **options)
-    claim = runner.claims.claim(Needs(), "w")
-    assert claim is not None
-    state = runner.run(claim)
+    job = create(store)
+    state = runner_of(claims or claims_of(store), scripted, **options).run(claim(store))
     assert state is None or store.get(job).state is state
     return state
 
@@ -192,7 +186,7 @@ def test_a_job_that_is_lost_unwinds_at_its_next_write(store: JobStore) -> None:
         on_progress(Progress(phase="a", fraction=0.5))
         pytest.fail("it went on")
 
-    claims = Claims(store.engine)
+    claims = claims_of(store)
     pipeline = Scripted(a=robbed, b=nothing)
     assert run(store, pipeline, claims=claims) is None
     assert pipeline.ran == ["a"]
@@ -211,10 +205,9 @@ def test_a_lost_attempt_tidies_up_after_itself_where_nobody_else_will(
     store: JobStore, meanwhile: str, kept: list[list[str]]
 ) -> None:
     def overtaken(on_progress: OnProgress) -> None:
-        other = Claims(store.engine)
+        other = claims_of(store)
         other.lose_unknown({}, "it was silent")
-        taken = other.claim(Needs(), "other")
-        assert taken is not None
+        taken = claim(store, "other")
         if meanwhile != "taken":
             other.finish(taken, Ending(JobState.succeeded, public=("result.json",)))
         if meanwhile == "deleted":
@@ -223,11 +216,9 @@ def test_a_lost_attempt_tidies_up_after_itself_where_nobody_else_will(
         pytest.fail("it went on")
 
     tidied: list[list[str]] = []
-    job = submit(store)
-    runner = runner_of(Claims(store.engine), Scripted(a=overtaken), tidy_job=lambda _, names: tidied.append(names))
-    claim = runner.claims.claim(Needs(), "w")
-    assert claim is not None
-    assert runner.run(claim) is None
+    job = create(store)
+    runner = runner_of(claims_of(store), Scripted(a=overtaken), tidy_job=lambda _, names: tidied.append(names))
+    assert runner.run(claim(store)) is None
     assert tidied == kept
 
 

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.service.records import DONE, claim, claims_of, create
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.library import Library
-from trompe_server.queue.claims import Claims, Ending
 from trompe_server.queue.retention import Retention, delete_job
 from trompe_server.queue.store import JobStore
 from trompe_server.storage.database import connect
 from trompe_server.storage.folders import Folder, JobArtifacts, LocalArtifacts, job_artifacts, open_folder
 from trompe_server.system.files import exclusive
-from trompe_shared.api import JobRequest, JobState, Needs
+from trompe_shared.api import JobState
 from trompe_shared.errors import ClassifierError, SpecError
 from trompe_shared.object3d import pack_zip
 
@@ -211,11 +211,11 @@ def test_a_classifier_whose_stored_bytes_are_damaged_is_not_loaded(tmp_path: Pat
 
 def test_retention_deletes_what_is_old_and_nothing_else(store: JobStore, tmp_path: Path) -> None:
     files = open_folder(tmp_path / "files")
-    old, running, queued = (_job(store) for _ in range(3))
+    old, running, queued = (create(store) for _ in range(3))
     for job in (old, running, queued):
         job_artifacts(files, job, attempt=1).write("result.json", b"{}")
-    _end(store)
-    assert Claims(store.engine).claim(Needs(), "w") is not None
+    claims_of(store).finish(claim(store), DONE)
+    claim(store)
     calibrations = LocalArtifacts(tmp_path / "files" / "library" / "calibrations")
     for name, age in (("used.npz", 0.0), ("unused.npz", 10 * 86400.0)):
         calibrations.write(name, b"0")
@@ -247,12 +247,12 @@ def test_retention_looks_often_enough_that_little_is_kept_for_longer(
 def test_a_job_whose_files_cannot_be_deleted_stays_until_they_can(
     store: JobStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    files, job = open_folder(f"memory://{secrets.token_hex(4)}"), _job(store)
+    files, job = open_folder(f"memory://{secrets.token_hex(4)}"), create(store)
     job_artifacts(files, job, attempt=1).write("result.json", b"{}")
     with pytest.raises(ConflictError, match="Cancel it first"):
         delete_job(store, files, job)
     assert job_artifacts(files, job).names() == ["result.json"]
-    _end(store)
+    claims_of(store).finish(claim(store), DONE)
 
     def away(*_: Any, **__: Any) -> None:
         raise ConnectionError("nobody there")
@@ -286,18 +286,6 @@ def test_a_lock_is_held_by_one_and_free_again_afterwards(tmp_path: Path) -> None
         pytest.fail("two hold one lock")
     with exclusive(lock, "taken"):
         pass
-
-
-def _job(store: JobStore) -> str:
-    return store.create(JobRequest.of("mug", label="mug"))[0].id
-
-
-def _end(store: JobStore) -> None:
-    """Claim the next job and end it."""
-    claims = Claims(store.engine)
-    claim = claims.claim(Needs(), "w")
-    assert claim is not None
-    claims.finish(claim, Ending(JobState.succeeded))
 
 
 def test_a_database_url_that_cannot_be_used_is_quoted_without_its_password() -> None:
