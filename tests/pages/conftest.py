@@ -4,17 +4,38 @@ import base64
 import io
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from axe_playwright_python.sync_playwright import Axe
+from fastapi import FastAPI
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, expect, sync_playwright
+from playwright.sync_api import (
+    Browser,
+    BrowserContext,
+    ConsoleMessage,
+    Locator,
+    Page,
+    Request,
+    Route,
+    expect,
+    sync_playwright,
+)
 
 from tests.served import Served
 from trompe_client import Client
+from trompe_server.api.services import Services
+from trompe_server.library import Library
+from trompe_server.queue.store import JobStore
+from trompe_server.service.app import create_app
+from trompe_server.service.dispatch import prepare_data
+from trompe_server.settings import Settings
+from trompe_server.storage.folders import open_folder
+from trompe_server.storage.tokens import Tokens
 
 FLAGS = [
     "--no-sandbox",
@@ -88,6 +109,36 @@ def turntables(page: Page) -> list[NDArray[np.int16]]:
     shown = [canvas.evaluate("canvas => canvas.toDataURL()") for canvas in page.locator(".turntable canvas").all()]
     pictures = [Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))) for data in shown]
     return [np.asarray(picture.convert("RGB"), np.int16) for picture in pictures]
+
+
+def width(image: Locator) -> int:
+    """Pixels of a picture from left to right, once it is decoded."""
+    found: int = image.evaluate("image => image.decode().then(() => image.naturalWidth)")
+    return found
+
+
+def inaccessible(page: Page) -> dict[str, str]:
+    """Serious faults of accessibility, each with its first place."""
+    found = Axe().run(page).response["violations"]
+    return {each["id"]: each["nodes"][0]["html"] for each in found if each["impact"] in {"serious", "critical"}}
+
+
+def held_back(page: Page, address: str) -> list[Route]:
+    """The requests to an address, held back until they are continued."""
+    held: list[Route] = []
+    page.route(address, lambda route: held.append(route))
+    return held
+
+
+@contextmanager
+def app_on(folder: Path, **settings: Any) -> Iterator[tuple[FastAPI, JobStore]]:
+    """The application on a folder of its own, without a process, and its record of jobs."""
+    chosen = Settings(data=folder, **settings)
+    prepare_data(chosen)
+    store, files = JobStore(chosen.database_url), open_folder(chosen.store_url)
+    library = Library(files.within("library"))
+    yield create_app(Services(chosen, library, store, files, Tokens(store.engine), list, list)), store
+    store.close()
 
 
 def slowed(context: BrowserContext, page: Page, *, bytes_per_second: int) -> None:

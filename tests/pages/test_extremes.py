@@ -12,19 +12,11 @@ from bench.pages import served
 from PIL import Image
 from playwright.sync_api import BrowserContext, Page, expect
 
-from tests.pages.conftest import REPORTED, Service, slowed, turntables
+from tests.pages.conftest import REPORTED, Service, app_on, slowed, turntables, width
 from tests.pages.test_orbit import opened, pixels, turned
-from trompe_server.api.services import Services
 from trompe_server.formats import write_glb
 from trompe_server.job.protocol import VIEWS_AFTER, VIEWS_BEFORE
-from trompe_server.library import Library
-from trompe_server.queue.store import JobStore
-from trompe_server.service.app import create_app
-from trompe_server.service.dispatch import prepare_data
-from trompe_server.settings import Settings
 from trompe_server.storage.arrays import pack_arrays, unpack_arrays
-from trompe_server.storage.folders import open_folder
-from trompe_server.storage.tokens import Tokens
 from trompe_shared.api import Result
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
@@ -41,14 +33,10 @@ LARGE = 30_000_000
 @pytest.fixture
 def many(tmp_path: Path) -> Iterator[str]:
     """Address of a server with ten thousand jobs."""
-    settings = Settings(data=tmp_path, rate_limit=1e6)
-    prepare_data(settings)
-    store, files = JobStore(settings.database_url), open_folder(settings.store_url)
-    fill(store, MANY)
-    library = Library(files.within("library"))
-    with served(create_app(Services(settings, library, store, files, Tokens(store.engine), list, list))) as client:
-        yield str(client.base_url).rstrip("/")
-    store.close()
+    with app_on(tmp_path, rate_limit=1e6) as (app, store):
+        fill(store, MANY)
+        with served(app) as client:
+            yield str(client.base_url).rstrip("/")
 
 
 def test_ten_thousand_jobs_are_listed_a_page_at_a_time(many: str, page: Page) -> None:
@@ -114,7 +102,7 @@ def test_a_result_of_two_thousand_views_shows_and_keeps_them_all(
     last = max(range(VIEWS), key=lambda k: (result.held_out_views[k].azimuth % 360, result.held_out_views[k].elevation))
     shown = page.locator("trompe-viewer img.after")
     expect(shown).to_have_attribute("src", f"/jobs/{job}/pictures/held_out/{last}/after.png")
-    assert shown.evaluate("image => image.decode().then(() => image.naturalWidth)") == result.image_size[1]
+    assert width(shown) == result.image_size[1]
     confidence = result.held_out_views[last].after_confidence
     assert f"{confidence:.0%}" in page.inner_text("trompe-viewer .sides")
 

@@ -9,15 +9,8 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from trompe_server.api.services import Services
-from trompe_server.library import Library
+from tests.pages.conftest import app_on
 from trompe_server.pages.serving import _code
-from trompe_server.queue.store import JobStore
-from trompe_server.service.app import create_app
-from trompe_server.service.dispatch import prepare_data
-from trompe_server.settings import Settings
-from trompe_server.storage.folders import open_folder
-from trompe_server.storage.tokens import Tokens
 from trompe_shared.api import JobRequest
 
 JOBS = 120
@@ -44,17 +37,12 @@ class Browserless:
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browserless]:
-    settings = Settings(data=tmp_path_factory.mktemp("list"))
-    prepare_data(settings)
-    store, files = JobStore(settings.database_url), open_folder(settings.store_url)
-    for seed in range(JOBS):
-        labels = {"sweep": "even" if seed % 2 == 0 else "odd"} | ({"experiment": "few"} if seed < len(TAUS) else {})
-        tau = TAUS[seed] if seed < len(TAUS) else None
-        store.create(JobRequest.of("mug", label=MUG if seed % 2 == 0 else "mug", tau=tau, seed=seed, labels=labels))
-    library = Library(files.within("library"))
-    app = create_app(Services(settings, library, store, files, Tokens(store.engine), list, list))
-    yield Browserless(app)
-    store.close()
+    with app_on(tmp_path_factory.mktemp("list")) as (app, store):
+        for seed in range(JOBS):
+            labels = {"sweep": "even" if seed % 2 == 0 else "odd"} | ({"experiment": "few"} if seed < len(TAUS) else {})
+            tau = TAUS[seed] if seed < len(TAUS) else None
+            store.create(JobRequest.of("mug", label=MUG if seed % 2 == 0 else "mug", tau=tau, seed=seed, labels=labels))
+        yield Browserless(app)
 
 
 def jobs_on(page: str) -> list[str]:
@@ -93,12 +81,14 @@ def test_an_experiment_shows_of_jobs_that_wait_the_options_in_which_they_differ(
     assert [line[:3] for line in lines] == [["0.05", "0.2", "2"], ["0.05", "0.05", "1"], ["0.05", "–", "0"]]
 
 
-@pytest.mark.parametrize("query", ["state=gone", "label=nocolon", "cursor=x"])
-def test_a_filter_that_makes_no_sense_is_told(client: Browserless, query: str) -> None:
-    answer = client.get(f"/jobs?{query}", headers={"Accept": "text/html"})
-    assert answer.status_code in {400, 422}
+@pytest.mark.parametrize("wrong", ["?state=gone", "?label=nocolon", "?cursor=x", "/0123456789abcdef"])
+def test_a_filter_that_makes_no_sense_and_a_job_that_is_not_there_are_told_on_a_page(
+    client: Browserless, wrong: str
+) -> None:
+    answer = client.get(f"/jobs{wrong}", headers={"Accept": "text/html"})
+    assert answer.status_code in ({404} if wrong.startswith("/") else {400, 422})
     assert answer.headers["content-type"].startswith("text/html")
-    assert "<h1>" in answer.text
+    assert ("<h1>Not Found" if wrong.startswith("/") else "<h1>") in answer.text
 
 
 def test_names_of_options_are_shown_as_code() -> None:

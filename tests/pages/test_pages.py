@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
-from playwright.sync_api import Browser, BrowserContext, Page, Response, Route, expect
+from playwright.sync_api import Browser, BrowserContext, Page, Response, expect
 
-from tests.pages.conftest import LIMIT, REPORTED, Service, drop, slowed, turntables
+from tests.pages.conftest import LIMIT, REPORTED, Service, drop, held_back, inaccessible, slowed, turntables, width
 from trompe_shared.api import OPTIONS
 
 pytestmark = pytest.mark.timeout(1200)
@@ -46,9 +45,7 @@ def test_the_start_page_shows_an_example_before_there_is_any_job(service: Servic
     assert before - after >= 70
     expect(page.locator(".hero")).to_contain_text("trompe attack teapot --label teapot --classifier mobilenet_v2.pt2")
     for kind in ("before", "after"):
-        assert page.locator(f"trompe-viewer img.{kind}").evaluate(
-            "image => image.decode().then(() => image.naturalWidth)"
-        )
+        assert width(page.locator(f"trompe-viewer img.{kind}"))
     assert sum(len(each.body()) for each in responses if "stream" not in each.url) < 150_000
 
 
@@ -140,15 +137,19 @@ def test_the_divider_is_dragged_and_views_are_chosen_by_key_and_on_the_map(
     assert "difference" in (shown.get_attribute("src") or "")
 
 
-def test_the_list_shows_what_came_of_a_job_and_deletes_it(service: Service, page: Page) -> None:
-    job = service.finished(labels={"fate": "short"})
+def test_a_new_job_appears_in_the_list_by_itself_with_what_came_of_it_and_is_deleted(
+    service: Service, page: Page, done: str
+) -> None:
+    page.goto(f"{service.url}/jobs")
+    expect(page.locator(f"#job-{done}")).to_be_visible()
+    job = service.submit()
+    row = page.locator(f"#job-{job}")
+    expect(row.locator(".state")).to_have_text("succeeded", timeout=600_000)
     with service.client() as client:
         result = client.job(job).result()
     assert result.held_out is not None
-    page.goto(f"{service.url}/jobs?label=fate:short")
-    row = page.locator(f"#job-{job}")
     expect(row).to_contain_text(f"{result.held_out.a_drop:.2f} held-out")
-    assert row.locator("img").evaluate("image => image.decode().then(() => image.naturalWidth)") > 100
+    assert width(row.locator("img")) > 100
 
     page.once("dialog", lambda dialog: dialog.dismiss())
     row.get_by_role("button", name="Delete").click()
@@ -195,18 +196,8 @@ def test_a_running_job_is_cancelled_from_the_list(service: Service, page: Page) 
     expect(page.locator(f"#job-{job} .state")).to_have_text("cancelled")
 
 
-def test_a_new_job_appears_in_the_list_by_itself(service: Service, page: Page, done: str) -> None:
-    page.goto(f"{service.url}/jobs")
-    expect(page.locator(f"#job-{done}")).to_be_visible()
-
-    job = service.submit(steps=1)
-
-    expect(page.locator(f"#job-{job}")).to_be_visible()
-    expect(page.locator(f"#job-{job} .state")).to_have_text("succeeded", timeout=600_000)
-
-
 def test_the_list_is_sorted_and_filtered(service: Service, page: Page, done: str, stronger: str) -> None:
-    service.finished(epsilon=0.1, steps=1)
+    service.submit(epsilon=0.1, steps=1)
     page.goto(f"{service.url}/jobs")
     epsilons = page.locator("tbody tr:visible td:nth-child(4)")
     for order in (sorted, lambda found: sorted(found, reverse=True)):
@@ -242,13 +233,6 @@ def test_an_experiment_shows_its_jobs_as_points_that_open(service: Service, page
     page.locator(".chart a").first.click()
 
     expect(page).to_have_url(f"{service.url}/jobs/{done}")
-
-
-def test_a_job_that_is_not_there_is_told_on_a_page(service: Service, page: Page, faults: list[str]) -> None:
-    page.goto(f"{service.url}/jobs/0123456789abcdef")
-
-    expect(page.get_by_role("heading", level=1)).to_have_text("Not Found")
-    faults.clear()
 
 
 def test_a_result_is_judged_with_the_form_and_its_page_is_shown(
@@ -296,12 +280,7 @@ def test_the_picture_of_an_object_that_is_no_longer_chosen_is_not_shown(service:
     page.goto(f"{service.url}/jobs/new")
     drawn = page.get_by_text("In the target renderer", exact=True)
     expect(drawn).to_be_visible()
-    held: list[Route] = []
-
-    def hold(route: Route) -> None:
-        held.append(route)
-
-    page.route("**/turntable/ball.png*", hold)
+    held = held_back(page, "**/turntable/ball.png*")
     page.select_option("[name=object]", "ball")
     page.select_option("[name=object]", "mug")
     expect(drawn).to_be_visible()
@@ -311,30 +290,6 @@ def test_the_picture_of_an_object_that_is_no_longer_chosen_is_not_shown(service:
     page.wait_for_timeout(1000)
     (kept,) = turntables(page)
     assert (kept == shown).all()
-
-
-@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.thorough)])
-def test_no_serious_fault_of_accessibility(service: Service, browser: Browser, done: str, scheme: Any) -> None:
-    context = browser.new_context(color_scheme=scheme)
-    context.set_default_timeout(LIMIT)
-    page = context.new_page()
-    for path in (
-        "/",
-        "/jobs",
-        "/jobs/new",
-        "/judgements/new",
-        f"/jobs/{done}",
-        f"/jobs/compare?job={done}&job={done}",
-        "/experiments/tries",
-        "/docs",
-        "/login",
-    ):
-        page.goto(service.url + path)
-        page.wait_for_timeout(500)
-        found = Axe().run(page).response["violations"]
-        serious = {each["id"]: each["nodes"][0]["html"] for each in found if each["impact"] in {"serious", "critical"}}
-        assert serious == {}, path
-    context.close()
 
 
 SHIFTS = """
@@ -358,11 +313,18 @@ def inked(page: Page) -> float:
     return min(float(half.mean()) for half in (drawn[:height], drawn[height:], drawn[:, :width], drawn[:, width:]))
 
 
-@pytest.mark.parametrize(("width", "height"), [pytest.param(360, 740, id="phone"), pytest.param(1280, 800, id="desk")])
-def test_no_page_is_too_wide_cut_off_half_empty_or_moves_while_it_loads(
-    service: Service, browser: Browser, done: str, width: int, height: int
+@pytest.mark.parametrize(
+    ("wide", "high", "scheme"),
+    [
+        pytest.param(360, 740, "light", id="phone"),
+        pytest.param(1280, 800, "light", id="desk"),
+        pytest.param(1280, 800, "dark", id="dark", marks=pytest.mark.thorough),
+    ],
+)
+def test_every_page_is_accessible_and_none_is_too_wide_cut_off_half_empty_or_moves_while_it_loads(
+    service: Service, browser: Browser, done: str, wide: int, high: int, scheme: Any
 ) -> None:
-    context = browser.new_context(viewport={"width": width, "height": height})
+    context = browser.new_context(viewport={"width": wide, "height": high}, color_scheme=scheme)
     context.set_default_timeout(LIMIT)
     context.add_init_script(SHIFTS)
     page = context.new_page()
@@ -372,16 +334,18 @@ def test_no_page_is_too_wide_cut_off_half_empty_or_moves_while_it_loads(
         "/jobs/new",
         "/judgements/new",
         f"/jobs/{done}",
+        f"/jobs/compare?job={done}&job={done}",
         "/experiments",
         "/experiments/tries",
         "/docs",
     ):
         page.goto(service.url + path)
-        page.wait_for_timeout(300)
-        assert page.evaluate("document.documentElement.scrollWidth") <= width, path
+        page.wait_for_timeout(500)
+        assert page.evaluate("document.documentElement.scrollWidth") <= wide, path
         assert page.evaluate(TOO_WIDE) == [], path
         assert page.evaluate("window.shifted") < 0.02, path
         assert inked(page) > 0.005, path
+        assert inaccessible(page) == {}, path
     context.close()
 
 
@@ -392,19 +356,13 @@ def test_on_a_slow_network_a_result_is_read_before_its_viewer_is_there_and_3d_sa
     with service.client() as client:
         result = client.job(done).result()
     slowed(context, page, bytes_per_second=150_000)
-    held: list[Route] = []
-
-    def hold(route: Route) -> None:
-        held.append(route)
-
-    page.route("**/viewer.js*", hold)
-
+    held = held_back(page, "**/viewer.js*")
     page.goto(f"{service.url}/jobs/{done}", wait_until="commit")
     expect(page.locator(".lead")).to_contain_text("views hidden from the attack")
     expect(page.get_by_role("cell", name=f"{result.target.a_after:.2f}", exact=True).first).to_be_visible()
     assert page.evaluate("customElements.get('trompe-viewer') === undefined")
     held[0].continue_()
-    assert page.locator("trompe-viewer img.after").evaluate("image => image.decode().then(() => image.naturalWidth)")
+    assert width(page.locator("trompe-viewer img.after"))
 
     page.evaluate(REPORTED, "trompe-orbit [role=status]")
     page.get_by_role("button", name="Show it in 3D").click()
@@ -460,6 +418,9 @@ def test_with_tokens_it_asks_for_one_and_goes_on_to_where_one_wanted(
 ) -> None:
     page.goto(f"{guarded.url}/jobs?state=queued")
     assert page.url == f"{guarded.url}/login?next=/jobs%3Fstate%3Dqueued"
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+        assert inaccessible(page) == {}
     page.fill("[name=token]", "trompe_wrong")
     page.get_by_role("button", name="Sign in").click()
     expect(page.get_by_role("alert")).to_contain_text("not a valid token")
