@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from tests.experiments.test_run import Silent
 from tests.fakes import FakeTarget
 from trompe_experiments.in_process import Done, run_job
 from trompe_experiments.run import run_experiment
@@ -25,7 +26,7 @@ from trompe_experiments.stability.disturbed_engine import Disturbance, Disturbed
 from trompe_experiments.stability.service import DisturbedService
 from trompe_experiments.table import ResultRow
 from trompe_experiments.variants import ATTACK, export_variants
-from trompe_renderer.check import EngineRender, check
+from trompe_renderer.check import EngineRender
 from trompe_renderer.engines.pyrender import PyrenderEngine, PyrenderOptions
 from trompe_server.classifiers import NetworkClassifier, WhiteBoxClassifier, load_classifier
 from trompe_server.renderers import SailenvTarget
@@ -71,12 +72,6 @@ def test_a_disturbed_worker_says_what_it_is_and_its_noise_is_another_in_every_pi
         first, second = (noisy.render(mug, VIEWS[:1], size=SIZE) for _ in range(2))
     for other in (second, target.render(mug, VIEWS[:1], size=SIZE)):
         assert 2 < np.abs(first.astype(int) - other).mean() < 12
-
-
-def test_the_check_names_the_field_of_view_of_a_disturbed_worker() -> None:
-    with disturbed_renderer(field_of_view=61) as wide:
-        (fault,) = (each for each in check(wide.render, wide.engine) if each.level == "fault")
-    assert (fault.name, "61.0 degrees" in fault.seen) == ("field of view", True)
 
 
 def test_changed_networks_say_nearly_the_same_and_mask_or_keep_gradients() -> None:
@@ -136,22 +131,6 @@ def test_cases_of_the_suite_have_names_of_their_own_and_a_reference() -> None:
     assert not any("|" in name for name in CASES)
 
 
-class Silent:
-    """Collects cases as their jobs end."""
-
-    def __init__(self) -> None:
-        self.ended: list[str] = []
-
-    def begin(self, *, total: int, done: int) -> None:
-        self.total = total
-
-    def look(self, row: object, job: object) -> None:
-        """Nothing to collect."""
-
-    def end(self, row: object, finished: object) -> None:
-        self.ended.append(row.place.case)  # type: ignore[attr-defined]
-
-
 @pytest.fixture
 def fake_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "disturbed_renderer", lambda **_: nullcontext(FakeTarget()))
@@ -165,7 +144,7 @@ def suite(folder: Path, only: str) -> tuple[tuple[ResultRow, ...], Silent]:
 
 def test_the_suite_runs_what_is_missing_and_keeps_the_order_of_its_cases(tmp_path: Path, fake_disturbed: None) -> None:
     rows, show = suite(tmp_path, "JPEG, quality 75")
-    assert [row.case for row in rows] == ["JPEG, quality 75", "unforeseen: JPEG, quality 75"] == show.ended
+    assert [row.case for row in rows] == ["JPEG, quality 75", "unforeseen: JPEG, quality 75"] == show.cases
     assert rows[0].experiment == "stability_targets"
     assert rows[0].key != rows[1].key
     again, show = suite(tmp_path, "JPEG, quality 75")

@@ -114,11 +114,12 @@ class FakeService(Service):
 
 
 class Silent:
-    """Counts calls."""
+    """Counts calls, with the states and the cases of the jobs that end."""
 
     def __init__(self) -> None:
         self.began: dict[str, int] = {}
         self.ended: list[str] = []
+        self.cases: list[str] = []
 
     def begin(self, *, total: int, done: int) -> None:
         self.began = {"total": total, "done": done}
@@ -128,6 +129,7 @@ class Silent:
 
     def end(self, row: Row, finished: Any) -> None:
         self.ended.append(finished.state)
+        self.cases.append(row.place.case)
 
 
 @pytest.fixture(autouse=True)

@@ -1,6 +1,5 @@
 """Comparison of configurations: means over the same objects, Pareto front, and the same front in pages and reports."""
 
-from dataclasses import replace
 from itertools import pairwise, product
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +12,7 @@ from trompe_experiments.pareto import configurations
 from trompe_experiments.table import ResultRow
 from trompe_server.pages.chart import chart
 from trompe_server.pages.experiment import differing_options, points_of
-from trompe_shared.comparison import Job, Mean, charged, means_of, pareto_front
+from trompe_shared.comparison import Job, Mean, means_of, pareto_front
 
 
 def job(object: str, configuration: str, cost: float, drop: float, seed: int = 0) -> Job[str]:
@@ -75,13 +74,6 @@ def test_an_object_counts_once_however_many_seeds_it_has() -> None:
     means, _ = means_of([job("a", "c", 10, 1.0), job("a", "c", 30, 0.8, seed=1), job("b", "c", 40, 0.1)])
     assert len(means) == 1
     assert (means[0].cost, means[0].drop) == pytest.approx((30, 0.5))
-
-
-def test_a_job_is_charged_for_a_calibration_of_another_job() -> None:
-    paid = replace(job("mug", "a", 20, 0.5), calibration=(124, 8.0), same_probes="mug")
-    reused = replace(job("mug", "b", 12, 0.5), calibration=(0, 0.5), same_probes="mug")
-    other = replace(job("mug", "c", 9, 0.5), calibration=(0, 0.5), same_probes="cup")
-    assert [each.cost for each in charged([paid, reused, other])] == [20.0, 19.5, 9.0]
 
 
 def test_a_page_and_a_report_show_the_same_front_for_the_same_jobs() -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from trompe_server.renderers import SailenvTarget
 from trompe_server.surrogate import SamplingModel, curve_surrogate, prepare_geometry
-from trompe_server.surrogate.calibration import CURVE_GREYS, calibrate, painted_noise
+from trompe_server.surrogate.calibration import CURVE_GREYS, calibrate, painted_grey, painted_noise
 from trompe_server.surrogate.fidelity import Fidelity, measure_fidelity
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
@@ -32,7 +32,7 @@ def found(obj: Object3D, views: Sequence[View], ask: Ask) -> tuple[SamplingModel
     """The calibrated sampling model, its fidelity and the default model's, on another repaint."""
     clean = ask(obj, views)
     sampling = calibrate(obj, views, clean, ask, wanted="curve", generator=np.random.default_rng(0)).sampling
-    probes = np.stack([ask(painted(obj, grey), views) for grey in CURVE_GREYS])
+    probes = np.stack([ask(painted_grey(obj, grey), views) for grey in CURVE_GREYS])
     repainted = painted_noise(obj, np.random.default_rng(1))
     images = ask(repainted, views)
 
@@ -42,10 +42,6 @@ def found(obj: Object3D, views: Sequence[View], ask: Ask) -> tuple[SamplingModel
         return measure_fidelity(surrogate, obj, clean, repainted, images)
 
     return sampling, fidelity(sampling), fidelity(SamplingModel())
-
-
-def painted(obj: Object3D, grey: int) -> Object3D:
-    return obj.with_textures({name: np.full((4, 4, 3), grey, np.uint8) for name in obj.textures})
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from PIL import Image
 from trompe_server.job.report.warnings import POOR_VIEW
 from trompe_server.renderers import SailenvTarget
 from trompe_server.surrogate import SamplingModel, Surrogate, curve_surrogate, prepare_geometry
-from trompe_server.surrogate.calibration import CURVE_GREYS, build_surrogate, calibrate, painted_noise
+from trompe_server.surrogate.calibration import CURVE_GREYS, build_surrogate, calibrate, painted_grey, painted_noise
 from trompe_server.surrogate.fidelity import Fidelity, measure_fidelity
 from trompe_server.surrogate.sampling import Gather
 from trompe_shared.geometry import Camera, View
@@ -59,11 +59,8 @@ class Shown:
 
 
 def show(obj: Object3D, target: SailenvTarget, views: Sequence[View]) -> Shown:
-    def grey(level: int) -> Object3D:
-        return obj.with_textures({name: np.full_like(image, level) for name, image in obj.textures.items()})
-
     clean = target.render(obj, views, size=SIZE)
-    probes = np.stack([target.render(grey(level), views, size=SIZE) for level in CURVE_GREYS])
+    probes = np.stack([target.render(painted_grey(obj, level), views, size=SIZE) for level in CURVE_GREYS])
     geometry = prepare_geometry(obj, views, size=SIZE, sampling=SamplingModel())
     surrogate = curve_surrogate(geometry, obj, views, clean, CURVE_GREYS, probes)
     repainted = painted_noise(obj, np.random.default_rng(1))
