@@ -3,7 +3,7 @@
 import json
 import re
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 DOCS: Final = Path(__file__).parents[1] / "docs"
 
@@ -20,8 +20,5 @@ def blocks(page: str, language: str) -> list[tuple[str, str]]:
 
 def cells(notebook: str) -> list[str]:
     """The code cells of a notebook."""
-    return ["".join(cell["source"]) for cell in _read(notebook)["cells"] if cell["cell_type"] == "code"]
-
-
-def _read(notebook: str) -> Any:
-    return json.loads((DOCS / notebook).read_text())
+    read = json.loads((DOCS / notebook).read_text())
+    return ["".join(cell["source"]) for cell in read["cells"] if cell["cell_type"] == "code"]

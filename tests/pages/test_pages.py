@@ -419,7 +419,7 @@ def test_with_tokens_it_asks_for_one_and_goes_on_to_where_one_wanted(
     page.goto(f"{guarded.url}/jobs?state=queued")
     assert page.url == f"{guarded.url}/login?next=/jobs%3Fstate%3Dqueued"
     for scheme in ("light", "dark"):
-        page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+        page.emulate_media(color_scheme=scheme)
         assert inaccessible(page) == {}
     page.fill("[name=token]", "trompe_wrong")
     page.get_by_role("button", name="Sign in").click()

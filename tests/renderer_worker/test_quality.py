@@ -21,6 +21,8 @@ Make = Callable[..., Any]
 Show = Callable[..., NDArray[np.int64]]
 
 SIZE = (60, 80)
+WAYS = (("--set", "msaa=1"), (), ("--set", "supersample=4"))
+"""Options for more and more samples a pixel."""
 AMBIENT = Light(intensity=0.0, ambient=1.0)
 RACKET = Path(os.environ.get("TROMPE_ASSETS", "none")) / "objects" / "tennis_racket"
 PIXEL = 2 * 0.5 * np.tan(np.radians(30)) / SIZE[0]
@@ -44,8 +46,7 @@ def show(running_worker: Callable[..., Any], worker: tuple[str, int]) -> Iterato
 
 @pytest.mark.thorough
 def test_more_samples_a_pixel_show_more_levels_of_an_edge(show: Show) -> None:
-    ways = (("--set", "msaa=1"), (), ("--set", "supersample=4"))
-    levels = [len(np.unique(show(options, boxes(textures=WHITE), Camera(0.5, 30, 20)))) for options in ways]
+    levels = [len(np.unique(show(options, boxes(textures=WHITE), Camera(0.5, 30, 20)))) for options in WAYS]
     assert levels[:2] == [2, 5]
     assert levels[2] > 10
 
@@ -53,8 +54,7 @@ def test_more_samples_a_pixel_show_more_levels_of_an_edge(show: Show) -> None:
 def test_thin_structures_keep_their_share_of_the_picture_the_more_samples_there_are(show: Show) -> None:
     """Seven bars, a third of a pixel wide and 40 pixels high, each shifted further against the pixel grid."""
     bars = [((PIXEL * (8.13 * k - 25), 0, 0), (PIXEL / 6, 20 * PIXEL, 1e-6)) for k in range(7)]
-    ways = (("--set", "msaa=1"), (), ("--set", "supersample=4"))
-    covered = [show(options, boxes(*bars, textures=WHITE), Camera(0.5, 0, 0))[..., 0].sum() / 255 for options in ways]
+    covered = [show(options, boxes(*bars, textures=WHITE), Camera(0.5, 0, 0))[..., 0].sum() / 255 for options in WAYS]
     errors = [abs(area / (7 * 40 / 3) - 1) for area in covered]
     assert errors[0] > 0.2
     assert errors[1] < 0.2
@@ -65,8 +65,7 @@ def test_thin_structures_keep_their_share_of_the_picture_the_more_samples_there_
 @pytest.mark.skipif(not RACKET.is_dir(), reason="TROMPE_ASSETS does not name the folder with the real objects")
 def test_the_strings_of_a_racket_are_smooth(show: Show) -> None:
     obj, camera, light = load_object(RACKET), Camera(0.7, 20, 30), Light(0, 75, 1.0, 0.5)
-    ways = (("--set", "msaa=1"), (), ("--set", "supersample=4"))
-    images = [show(options, obj, camera, light) for options in ways]
+    images = [show(options, obj, camera, light) for options in WAYS]
     jagged, smooth = (np.abs(image - images[2]).mean() for image in images[:2])
     assert smooth < 0.6 * jagged
 

@@ -57,6 +57,7 @@ async def _stop_and_start(services: Services, postgres: Any, followed: threading
         for method, path in [("GET", "/v1/jobs"), ("GET", "/readyz"), ("GET", "/metrics"), ("POST", "/v1/jobs")] * 2:
             answer = await asyncio.wait_for(client.request(method, path, json=JOB), 60)
             assert (answer.status_code, answer.headers["retry-after"]) == (503, "5"), (method, path)
+            assert "not available" in answer.text, (method, path)
         assert (await client.get("/healthz")).status_code == 200
         assert not stream.done(), "followers wait until it is back"
 

@@ -1,12 +1,11 @@
 """``trompe serve`` with renderers elsewhere: it uses and lists them."""
 
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.served import Served
+from tests.served import Served, reserved_port
 from tests.service.processes import listening
 from trompe_client import Client, ServerFault
 from trompe_client._core import Request
@@ -18,9 +17,8 @@ from trompe_server.settings import Settings
 @pytest.fixture
 def nobody() -> Iterator[int]:
     """A port that refuses connections and stays reserved."""
-    with socket.socket() as bound:
-        bound.bind(("127.0.0.1", 0))
-        yield bound.getsockname()[1]
+    with reserved_port() as port:
+        yield port
 
 
 def supervisor(folder: Path, elsewhere: RendererAddresses) -> Supervisor:

@@ -15,7 +15,6 @@ from prometheus_client.parser import text_string_to_metric_families
 from tests.fake_job import PHASES, trace
 from tests.served import Served, reserved_port, wait_until, workers_of
 from tests.service.processes import Service
-from trompe_server.errors import ServiceError
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import LocalArtifacts
 from trompe_shared.api import JobState
@@ -24,8 +23,9 @@ from trompe_shared.api import JobState
 def test_jobs_run_one_after_the_other_and_each_ends_as_its_pipeline_says(service: Service) -> None:
     labels = ["fine", "hopeless", "broken", "bug", "no object", "flaky renderer"]
     jobs = {label: service.submit(label) for label in labels}
-    with service.worker():
+    with service.worker(TROMPE_LOG="json") as running:
         ended = {label: service.ended(job) for label, job in jobs.items()}
+        lines = [json.loads(line) for line in running.words().splitlines() if line.startswith("{")]
 
     assert {label: job.state for label, job in ended.items()} == {
         "fine": JobState.succeeded,
@@ -47,6 +47,10 @@ def test_jobs_run_one_after_the_other_and_each_ends_as_its_pipeline_says(service
     starts = [started for label in labels if (started := ended[label].started)]
     assert starts == sorted(starts)
     assert len(starts) == len(labels)
+    (told,) = [line for line in lines if line["level"] == "error" and line["job"] == jobs["bug"]]
+    assert told["message"] == f"job {jobs['bug']} failed"
+    assert "ZeroDivisionError" in told["traceback"]
+    assert all({"time", "level", "logger", "message", "process"} <= line.keys() for line in lines)
     for label in ("broken", "bug"):
         assert trace(service.folder(jobs[label])).count("begin attack-001") == 1, "failing phases are not tried again"
 
@@ -200,17 +204,6 @@ def test_workers_of_a_service_are_counted_together_and_those_elsewhere_serve_the
     elsewhere.store.close()
 
 
-def test_lines_of_the_log_are_json_and_name_the_job_where_that_is_asked_for(service: Service) -> None:
-    job = service.submit("bug")
-    with service.worker(TROMPE_LOG="json") as running:
-        service.ended(job)
-        lines = [json.loads(line) for line in running.words().splitlines() if line.startswith("{")]
-    (failed,) = [line for line in lines if line["level"] == "error"]
-    assert (failed["job"], failed["message"]) == (job, f"job {job} failed")
-    assert "ZeroDivisionError" in failed["traceback"]
-    assert all({"time", "level", "logger", "message", "process"} <= line.keys() for line in lines)
-
-
 class TestOutage:
     """PostgreSQL goes away and comes back."""
 
@@ -234,15 +227,6 @@ class TestOutage:
             assert service.ended(after).state is JobState.succeeded
         assert (found.state, found.attempts) == (JobState.succeeded, 1)
         assert trace(service.folder(job)).count("end judge") == 1
-
-    def test_the_api_s_side_says_so_and_goes_on(self, service: Service, postgres: Any) -> None:
-        job = service.submit("fine")
-        postgres.stop()
-        for call in (lambda: service.state(job), lambda: service.submit("fine"), service.store.counts):
-            with pytest.raises(ServiceError, match="is not available"):
-                call()
-        postgres.start()
-        assert service.state(job).state is JobState.queued
 
     def test_a_stop_while_the_database_is_down_does_not_hang(self, service: Service, postgres: Any) -> None:
         job = service.submit("gate")

@@ -21,7 +21,6 @@ from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
 
 Make = Callable[..., Any]
-Build = Callable[[Object3D, Sequence[View]], Surrogate]
 SIZE = (32, 32)
 SAMPLING = [
     pytest.param(SamplingModel(), id="msaa"),

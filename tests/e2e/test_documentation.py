@@ -1,17 +1,19 @@
-"""The code of docs/library.md runs on a real renderer and does what the page says."""
+"""The code of docs/library.md and of the notebook runs on a real renderer and does what they say."""
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.documentation import blocks
+from tests.documentation import blocks, cells
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
+pytestmark = pytest.mark.thorough
 
-@pytest.mark.thorough
+
 def test_the_page_runs_from_its_beginning_to_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -35,3 +37,14 @@ def test_the_page_runs_from_its_beginning_to_its_end(
     assert 0 < int(texels[1]) <= 0.05 * sum(texture[..., 0].size for texture in clean.textures.values()) + 1
     assert "calibrated good enough with two probes a view" in said
     assert said.endswith("2 steps\n")
+
+
+def test_the_notebook_runs_from_top_to_bottom() -> None:
+    names: dict[str, Any] = {}
+    for number, code in enumerate(cells("first_attack.ipynb")):
+        exec(compile(code, f"first_attack.ipynb, cell {number}", "exec"), names)
+    held_out = names["attacked"].held_out
+    assert held_out.a_after <= held_out.a_before / 2
+    (_, fooled), (clean, hardened) = names["recognised"].values()
+    assert hardened > fooled
+    assert clean >= 0.5
