@@ -66,6 +66,12 @@ def boxes(
     return object_from_files(files | {f"{name}.png": encode_png(image) for name, image in (maps or {}).items()})
 
 
+def linear(picture: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Linear light of sRGB levels from 0 to 255."""
+    level = picture / 255
+    return np.asarray(np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4))
+
+
 def pixel_rays(size: tuple[int, int]) -> NDArray[np.float64]:
     """Points (H, W, 3) at depth 1, in camera coordinates, behind the pixel centres of a picture of (height, width)."""
     height, width = size

@@ -16,6 +16,7 @@ import pytest
 from click.testing import CliRunner
 from numpy.typing import NDArray
 
+from tests.wire import linear
 from tests.worker_process import started
 from trompe_renderer.check import REMEDIES, EngineRender, check, questions
 from trompe_renderer.command import render
@@ -91,11 +92,6 @@ def lit(change: Callable[[WorldLight, Snapshot], WorldLight]) -> Fault:
 def turned(light: WorldLight, matrix: Levels) -> WorldLight:
     x, y, z = (matrix @ np.array(light.direction)).tolist()
     return replace(light, direction=(x, y, z))
-
-
-def linear(picture: Levels) -> Levels:
-    level = picture / 255
-    return np.asarray(np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4))
 
 
 def encoded(light: Levels) -> Levels:
@@ -223,74 +219,59 @@ def headlight(light: WorldLight, world: Snapshot) -> WorldLight:
     return replace(light, direction=(x, y, z))
 
 
-FAULTS = [
-    pytest.param("not repeatable", one_pixel, id="one pixel"),
-    pytest.param("not repeatable", seen(grain(3, lambda _: None)), id="grain"),
-    pytest.param("not repeatable", adapting, id="adaptive exposure"),
-    pytest.param("noise not numbered", seen(grain(3, lambda _: None), RANDOM), id="noise without seed"),
-    pytest.param("noise number ignored", seen(grain(3, lambda _: 7), RANDOM), id="noise with a constant seed"),
-    pytest.param("noise number ignored", seen(lambda picture, _: picture, RANDOM), id="noise declared, and none"),
-    pytest.param("mirrored", seen(lambda picture, _: picture[:, ::-1]), id="mirrored"),
-    pytest.param("upside down", seen(lambda picture, _: picture[::-1]), id="upside down"),
-    pytest.param("v flipped", painted(lambda texture: texture[::-1]), id="v flipped"),
-    pytest.param("u flipped", painted(lambda texture: texture[:, ::-1]), id="u flipped"),
-    pytest.param("texture turned", painted(lambda texture: texture.swapaxes(0, 1)), id="transposed"),
-    pytest.param("untextured", painted(lambda texture: np.full_like(texture, 180)), id="no textures"),
-    pytest.param("field of view", wide(61), id="61 degrees"),
-    pytest.param("field of view", wide(62), id="62 degrees"),
-    pytest.param("field of view", wide(45), id="45 degrees"),
-    pytest.param("field of view", wide(59), id="59 degrees"),
-    pytest.param("aspect", lens(lambda aspect: (1 / aspect, 1)), id="a square camera"),
-    pytest.param("aspect", lens(lambda aspect: (1.04, 1)), id="4 percent too narrow"),
-    pytest.param("aspect", lens(lambda aspect: (1 / aspect, 1 / aspect)), id="horizontal field of view"),
-    pytest.param("aspect", lens(lambda aspect: (1 / min(aspect, 1),) * 2), id="field of view of the shorter side"),
-    pytest.param("sheared", seen(padded), id="padded rows"),
-    pytest.param("channel order", seen(lambda picture, _: picture[..., ::-1]), id="BGR"),
-    pytest.param("channel order", seen(lambda picture, _: picture[..., [1, 2, 0]]), id="GBR"),
-    pytest.param("gamma twice", seen(on_object(lambda picture: encoded(picture / 255))), id="encoded twice"),
-    pytest.param("gamma missing", seen(on_object(lambda picture: 255 * linear(picture))), id="not encoded"),
-    pytest.param(
-        "texture not decoded", painted(lambda texture: np.round(encoded(texture / 255))), id="texture not decoded"
-    ),
-    pytest.param(
-        "texture decoded twice",
-        painted(lambda texture: np.round(255 * linear(texture.astype(float)))),
-        id="decoded twice",
-    ),
-    pytest.param("shifted", shifted(0.5, 0), id="half a pixel right"),
-    pytest.param("shifted", shifted(0, -0.5), id="half a pixel up"),
-    pytest.param("shifted", shifted(-2, 3), id="left and down"),
-    pytest.param("frozen texture", frozen, id="frozen"),
-    pytest.param("late texture", keeping(late), id="late"),
-    pytest.param("stale scene", keeping(hoarded), id="earlier objects"),
-    pytest.param("stale object", by_name, id="cached by name"),
-    pytest.param("light reversed", lit(lambda light, _: turned(light, -np.eye(3))), id="light reversed"),
-    pytest.param("light direction", lit(lambda light, _: turned(light, np.diag([-1, 1, 1]))), id="light mirrored"),
-    pytest.param(
-        "light direction", lit(lambda light, _: turned(light, np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]))), id="z up"
-    ),
-    pytest.param("light follows camera", lit(attached), id="camera light"),
-    pytest.param("light follows camera", lit(headlight), id="headlight"),
-    pytest.param("light missing", lit(lambda light, _: replace(light, intensity=0.0)), id="no light"),
-    pytest.param("light intensity", lit(lambda light, _: replace(light, intensity=0.6)), id="constant light"),
-    pytest.param("light colour", lit(lambda light, _: replace(light, color=(255, 255, 255))), id="white light"),
-    pytest.param(
-        "ambient missing", aimed(lambda world, *_: replace(world, ambient=(0.0, 0.0, 0.0))), id="no ambient light"
-    ),
-    pytest.param(
-        "background",
-        seen(on_object(lambda asked: asked + 3 * np.sign(127 - asked), background=True)),
-        id="3 levels off",
-    ),
-    pytest.param(
-        "background", seen(on_object(lambda asked: 255 * linear(asked), background=True)), id="background not encoded"
-    ),
-    pytest.param("axes", turned_world([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), id="z up world"),
-    pytest.param("axes", turned_world([[-1, 0, 0], [0, 1, 0], [0, 0, -1]]), id="from behind"),
-    pytest.param("axes", turned_world([[-1, 0, 0], [0, 1, 0], [0, 0, 1]]), id="left-handed world"),
-    pytest.param("camera", aimed(upright), id="looks at the origin"),
-    pytest.param("invisible", aimed(lambda world, *_: replace(world, instances=())), id="nothing"),
-]
+FAULTS: dict[str, tuple[str, Fault]] = {
+    "one pixel": ("not repeatable", one_pixel),
+    "grain": ("not repeatable", seen(grain(3, lambda _: None))),
+    "adaptive exposure": ("not repeatable", adapting),
+    "noise without seed": ("noise not numbered", seen(grain(3, lambda _: None), RANDOM)),
+    "noise with a constant seed": ("noise number ignored", seen(grain(3, lambda _: 7), RANDOM)),
+    "noise declared, and none": ("noise number ignored", seen(lambda picture, _: picture, RANDOM)),
+    "mirrored": ("mirrored", seen(lambda picture, _: picture[:, ::-1])),
+    "upside down": ("upside down", seen(lambda picture, _: picture[::-1])),
+    "v flipped": ("v flipped", painted(lambda texture: texture[::-1])),
+    "u flipped": ("u flipped", painted(lambda texture: texture[:, ::-1])),
+    "transposed": ("texture turned", painted(lambda texture: texture.swapaxes(0, 1))),
+    "no textures": ("untextured", painted(lambda texture: np.full_like(texture, 180))),
+    "61 degrees": ("field of view", wide(61)),
+    "62 degrees": ("field of view", wide(62)),
+    "45 degrees": ("field of view", wide(45)),
+    "59 degrees": ("field of view", wide(59)),
+    "a square camera": ("aspect", lens(lambda aspect: (1 / aspect, 1))),
+    "4 percent too narrow": ("aspect", lens(lambda aspect: (1.04, 1))),
+    "horizontal field of view": ("aspect", lens(lambda aspect: (1 / aspect, 1 / aspect))),
+    "field of view of the shorter side": ("aspect", lens(lambda aspect: (1 / min(aspect, 1),) * 2)),
+    "padded rows": ("sheared", seen(padded)),
+    "BGR": ("channel order", seen(lambda picture, _: picture[..., ::-1])),
+    "GBR": ("channel order", seen(lambda picture, _: picture[..., [1, 2, 0]])),
+    "encoded twice": ("gamma twice", seen(on_object(lambda picture: encoded(picture / 255)))),
+    "not encoded": ("gamma missing", seen(on_object(lambda picture: 255 * linear(picture)))),
+    "texture not decoded": ("texture not decoded", painted(lambda texture: np.round(encoded(texture / 255)))),
+    "decoded twice": ("texture decoded twice", painted(lambda texture: np.round(255 * linear(texture.astype(float))))),
+    "half a pixel right": ("shifted", shifted(0.5, 0)),
+    "half a pixel up": ("shifted", shifted(0, -0.5)),
+    "left and down": ("shifted", shifted(-2, 3)),
+    "frozen": ("frozen texture", frozen),
+    "late": ("late texture", keeping(late)),
+    "earlier objects": ("stale scene", keeping(hoarded)),
+    "cached by name": ("stale object", by_name),
+    "light reversed": ("light reversed", lit(lambda light, _: turned(light, -np.eye(3)))),
+    "light mirrored": ("light direction", lit(lambda light, _: turned(light, np.diag([-1, 1, 1])))),
+    "z up": ("light direction", lit(lambda light, _: turned(light, np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])))),
+    "camera light": ("light follows camera", lit(attached)),
+    "headlight": ("light follows camera", lit(headlight)),
+    "no light": ("light missing", lit(lambda light, _: replace(light, intensity=0.0))),
+    "constant light": ("light intensity", lit(lambda light, _: replace(light, intensity=0.6))),
+    "white light": ("light colour", lit(lambda light, _: replace(light, color=(255, 255, 255)))),
+    "no ambient light": ("ambient missing", aimed(lambda world, *_: replace(world, ambient=(0.0, 0.0, 0.0)))),
+    "3 levels off": ("background", seen(on_object(lambda asked: asked + 3 * np.sign(127 - asked), background=True))),
+    "background not encoded": ("background", seen(on_object(lambda asked: 255 * linear(asked), background=True))),
+    "z up world": ("axes", turned_world([[1, 0, 0], [0, 0, -1], [0, 1, 0]])),
+    "from behind": ("axes", turned_world([[-1, 0, 0], [0, 1, 0], [0, 0, -1]])),
+    "left-handed world": ("axes", turned_world([[-1, 0, 0], [0, 1, 0], [0, 0, 1]])),
+    "looks at the origin": ("camera", aimed(upright)),
+    "nothing": ("invisible", aimed(lambda world, *_: replace(world, instances=()))),
+}
+"""Name in the check, and fault, of wrong adapters."""
 
 
 @pytest.fixture(scope="module")
@@ -308,7 +289,7 @@ def faults(engine: Engine) -> set[str]:
     return {each.name for each in check(EngineRender(engine), engine.info) if each.level != "ok"} - {"stopped"}
 
 
-@pytest.mark.parametrize(("name", "fault"), FAULTS)
+@pytest.mark.parametrize(("name", "fault"), FAULTS.values(), ids=FAULTS)
 def test_the_fault_of_an_adapter_is_named_and_no_other(name: str, fault: Fault, engine: Engine) -> None:
     assert faults(fault(engine)) == {name}
 
@@ -352,17 +333,17 @@ def composited_in_light(engine: Engine) -> Engine:
     return Wrong(engine, see=see)
 
 
-RIGHT = [
-    *(pytest.param(toned(curve), id=curve.__name__) for curve in (reinhard, aces, agx)),
-    pytest.param(grained, id="film with grain"),
-    pytest.param(composited_in_light, id="edges mixed in linear light"),
-    pytest.param(seen(on_object(lambda picture: 255 * (picture / 255) ** (2.2 / 2.0))), id="gamma 2.0"),
-    pytest.param(wide(60.3), id="60.3 degrees"),
-    pytest.param(shifted(0.15, -0.15), id="0.15 pixels"),
-]
+RIGHT: dict[str, Fault] = {
+    **{curve.__name__: toned(curve) for curve in (reinhard, aces, agx)},
+    "film with grain": grained,
+    "edges mixed in linear light": composited_in_light,
+    "gamma 2.0": seen(on_object(lambda picture: 255 * (picture / 255) ** (2.2 / 2.0))),
+    "60.3 degrees": wide(60.3),
+    "0.15 pixels": shifted(0.15, -0.15),
+}
 
 
-@pytest.mark.parametrize("adapter", RIGHT)
+@pytest.mark.parametrize("adapter", RIGHT.values(), ids=RIGHT)
 def test_a_right_adapter_passes(adapter: Fault, engine: Engine) -> None:
     assert faults(adapter(engine)) == set()
 
@@ -371,10 +352,6 @@ def test_a_right_adapter_passes(adapter: Fault, engine: Engine) -> None:
 def test_our_own_engine_passes_with_all_settings(setting: str) -> None:
     with started("--set", setting) as worker, contextlib.closing(SailenvTarget(*worker.address)) as target:
         assert {each.level for each in check(target.render, target.engine)} == {"ok"}
-
-
-def by_id(name: str) -> tuple[str, Fault]:
-    return next((str(each.values[0]), each.values[1]) for each in FAULTS if each.id == name)  # type: ignore[return-value]
 
 
 @pytest.mark.parametrize(
@@ -393,12 +370,12 @@ def by_id(name: str) -> tuple[str, Fault]:
     ],
 )
 def test_two_faults_at_once_are_both_named(one: str, other: str, engine: Engine) -> None:
-    (first, spoil), (second, spoil_too) = by_id(one), by_id(other)
+    (first, spoil), (second, spoil_too) = FAULTS[one], FAULTS[other]
     assert faults(spoil_too(spoil(engine))) == {first, second}
 
 
 def test_light_on_encoded_colours_is_a_warning(engine: Engine) -> None:
-    old = by_id("not encoded")[1](by_id("texture not decoded")[1](engine))
+    old = FAULTS["not encoded"][1](FAULTS["texture not decoded"][1](engine))
     levels = {each.name: each.level for each in check(EngineRender(old), old.info)}
     assert levels.pop("light on encoded colours") == "warning"
     assert set(levels.values()) == {"ok"}
@@ -422,13 +399,13 @@ def test_a_slow_adapter_is_told_by_a_warning(engine: Engine, monkeypatch: pytest
     ],
 )
 def test_a_fault_is_told_with_its_figure(fault: str, words: str, engine: Engine) -> None:
-    wrong = by_id(fault)[1](engine)
+    wrong = FAULTS[fault][1](engine)
     said = " ".join(each.seen for each in check(EngineRender(wrong), wrong.info) if each.level == "fault")
     assert re.search(words, said), said
 
 
 def test_each_fault_has_a_test_and_a_remedy() -> None:
-    tested = {each.values[0] for each in FAULTS} | {"slow", "light on encoded colours"}
+    tested = {name for name, _ in FAULTS.values()} | {"slow", "light on encoded colours"}
     assert tested == set(REMEDIES)
 
 

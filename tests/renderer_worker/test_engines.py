@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tests.documentation import blocks
 from tests.made_objects import CANDLE, FLAG, GLASS, LATTICE, lantern
 from tests.served import ancestry, process_table, wait_until
-from tests.wire import Wire, boxes, on_screen, plain
+from tests.wire import Wire, boxes, linear, on_screen, plain
 from tests.worker_process import Worker, started
 from trompe_renderer.engines.loading import ENGINES, engine_maker
 from trompe_server.formats import read_object
@@ -84,11 +84,6 @@ def picture(target: SailenvTarget, obj: Object3D, camera: Camera, light: Light =
     size = options.pop("size")
     image: Picture = target.render(obj, [View(camera, light, **options)], size=size)[0].astype(float)
     return image
-
-
-def linear(image: Picture) -> Picture:
-    encoded = image / 255
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def sphere(make_object: Make, radius: float) -> Object3D:
