@@ -15,6 +15,7 @@ from datetime import timedelta
 from functools import partial
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import click
@@ -481,13 +482,6 @@ def test_a_token_that_is_given_opens_the_service_of_the_command_too(server: Fake
         assert client.objects()
 
 
-class Command:
-    """An entry point of a command of another package."""
-
-    def __init__(self, name: str, load: Callable[[], click.Command]) -> None:
-        self.name, self.load = name, load
-
-
 @pytest.fixture
 def commands(monkeypatch: pytest.MonkeyPatch) -> None:
     """Installed commands: one that works, one that cannot be loaded, one that finds out when it is called."""
@@ -496,12 +490,12 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ModuleNotFoundError("No module named 'uvicorn'", name="uvicorn")
 
     made = {"worker": lacking, "paint": lambda: click.echo("painted")}
-    found = [Command("serve", lacking)]
-    found += [Command(name, partial(click.Command, name, callback=callback)) for name, callback in made.items()]
+    loads = {"serve": lacking}
+    loads |= {name: partial(click.Command, name, callback=callback) for name, callback in made.items()}
 
     def entry_points(*, group: str, name: str | None = None) -> metadata.EntryPoints:
         assert group == "trompe.commands"
-        chosen: Any = [each for each in found if name in {None, each.name}]
+        chosen: Any = [SimpleNamespace(name=each, load=load) for each, load in loads.items() if name in {None, each}]
         return metadata.EntryPoints(chosen)
 
     monkeypatch.setattr(metadata, "entry_points", entry_points)

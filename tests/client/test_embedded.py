@@ -13,16 +13,16 @@ from trompe_shared.api import Problem
 
 NOTE_AND_WAIT = """
 import os, pathlib, signal, sys, time
-folder = pathlib.Path(sys.argv[1]); folder.mkdir(exist_ok=True)
+folder = pathlib.Path(sys.argv[2]); folder.mkdir(exist_ok=True)
 def stop(*_):
-    pathlib.Path(sys.argv[2]).write_text("stopped"); sys.exit(0)
+    pathlib.Path(sys.argv[1]).write_text("stopped"); sys.exit(0)
 signal.signal(signal.SIGTERM, stop)
 print("warming up"); print("trompe serving on http://127.0.0.1:4711"); time.sleep(60)
 """
 
 
-def script(code: str) -> tuple[str, ...]:
-    return (sys.executable, "-c", code)
+def script(code: str, *words: object) -> tuple[str, ...]:
+    return (sys.executable, "-c", code, *map(str, words))
 
 
 def test_it_gives_the_address_it_is_told_and_stops_the_service_at_the_end(
@@ -30,8 +30,7 @@ def test_it_gives_the_address_it_is_told_and_stops_the_service_at_the_end(
 ) -> None:
     monkeypatch.setenv("TROMPE_DATA", str(tmp_path / "data"))
     note = tmp_path / "note"
-    code = f"import sys; sys.argv.append({str(note)!r})\n{NOTE_AND_WAIT}"
-    with embedded_server(command=script(code)) as url:
+    with embedded_server(command=script(NOTE_AND_WAIT, note)) as url:
         assert url == "http://127.0.0.1:4711"
         assert (tmp_path / "data").is_dir()
     assert note.read_text() == "stopped"
@@ -69,7 +68,6 @@ def test_what_goes_wrong_with_the_service_is_told(
 
 def test_a_terminated_command_takes_its_service_along(tmp_path: Path) -> None:
     note = tmp_path / "note"
-    code = f"import sys; sys.argv.append({str(note)!r})\n{NOTE_AND_WAIT}"
-    with pytest.raises(SystemExit, match="143"), embedded_server(command=script(code)):
+    with pytest.raises(SystemExit, match="143"), embedded_server(command=script(NOTE_AND_WAIT, note)):
         os.kill(os.getpid(), signal.SIGTERM)
     assert note.read_text() == "stopped"

@@ -12,7 +12,6 @@ import pytest
 
 from tests.fake_job import PHASES, trace
 from tests.served import CHILD, Served, process_table, wait_until
-from trompe_shared.api import JobRequest
 
 
 @pytest.fixture(scope="module")
@@ -88,33 +87,6 @@ def test_nothing_is_left_running_when_serve_ends_and_its_job_outlives_it(serve: 
     serve.open_gate(job)
     wait_until(lambda: serve.state(job).state == "succeeded")
     assert serve.get("/v1/jobs?state=succeeded")["jobs"][0]["id"] == job
-
-
-@pytest.mark.thorough
-def test_an_attack_whose_renderer_and_worker_are_killed_ends_with_the_same_bytes(tmp_path: Path) -> None:
-    few = {"grid": True, "azimuths": 2, "elevations": 2, "held_out": 2, "steps": 30}
-    spec = JobRequest.of("mug", label="mug", **few).model_dump(mode="json")
-    with Served(tmp_path / "data", environment={"TROMPE_RENDERER_PATIENCE": "120"}) as serve:
-
-        def submit() -> str:
-            return str(serve.http.post("/v1/jobs", json=spec).raise_for_status().json()["id"])
-
-        whole = submit()
-        wait_until(lambda: serve.state(whole).state == "succeeded", seconds=120)
-        os.kill(serve.children()["render"], signal.SIGSTOP)  # holds the next job in its first phase
-        cut = submit()
-        wait_until(lambda: serve.state(cut).state == "running", seconds=120)
-        os.kill(serve.children()["render"], signal.SIGKILL)
-        wait_until(lambda: serve.state(cut).progress.phase in {"calibrate", "attack"}, seconds=120)
-        os.kill(serve.children()["render"], signal.SIGKILL)
-        wait_until(lambda: (serve.state(cut).progress.step or 0) > 10, seconds=120)
-        os.kill(serve.children()["worker"], signal.SIGKILL)
-        wait_until(lambda: serve.state(cut).state == "succeeded", seconds=120)
-
-        assert [serve.state(job).attempts for job in (whole, cut)] == [1, 2]
-        assert serve.log.read_text().count("the renderer worker ended (status -9)") == 2
-        adversarial = [serve.http.get(f"/v1/jobs/{job}/artifacts/mug-adversarial.zip") for job in (whole, cut)]
-        assert adversarial[0].raise_for_status().content == adversarial[1].raise_for_status().content
 
 
 def test_serve_says_so_where_no_renderer_comes_up(tmp_path: Path) -> None:
