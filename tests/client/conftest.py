@@ -103,37 +103,29 @@ FIGURES: dict[str, Any] = {
 """Figures of an attack; None if nothing was recognised."""
 
 
+def example_of(content: examples.Content) -> dict[str, Any]:
+    found: dict[str, Any] = content["content"]["application/json"]["example"]
+    return found
+
+
 def result_of(spec: JobSpec, *, applicable: bool = True) -> Result:
-    """A result with figures for all rows of a table."""
-    return Result(
-        spec=spec,
-        object=spec.object,
-        label=3,
-        label_name="mug",
-        labels=[3, 1],
-        label_names=["mug", "cup"],
-        classifier=spec.victim.classifier,
-        epsilon=spec.paint.epsilon,
-        alpha=spec.alpha,
-        tau=spec.paint.tau,
-        surrogate_model="calibrated",
-        surrogate_reason="error 0.4/255 is within tolerance",
-        seed=spec.search.seed,
-        steps=spec.search.steps,
-        image_size=(32, 32),
-        target=OWN if applicable else NOT_RECOGNISED,
-        judges=[Judgement(classifier=judge, target=OWN) for judge in spec.judges.networks],
-        queries=48_000 if applicable and spec.victim.queries else None,
-        warnings=["the [racket] is thin"],
-        seconds={"calibrate": 1.25, "attack": 7.5},
-        probe_renders=120,
-        attacked_views=60,
-        further_renders=0,
-        versions={"trompe": "0"},
-        views=[],
-        held_out_views=[],
-        **(FIGURES if applicable else dict.fromkeys(FIGURES) | {"fooled_as": [], "image_pipelines": []}),
-    )
+    """The API's example of a result, with figures for all rows of a table."""
+    paint, search, classifier = spec.paint, spec.search, spec.victim.classifier
+    asked = {"spec": spec, "object": spec.object, "classifier": classifier, "seed": search.seed, "steps": search.steps}
+    asked |= {"epsilon": paint.epsilon, "alpha": spec.alpha, "tau": paint.tau}
+    found = {
+        "label": 3,
+        "labels": [3, 1],
+        "label_names": ["mug", "cup"],
+        "surrogate_model": "calibrated",
+        "surrogate_reason": "error 0.4/255 is within tolerance",
+        "target": OWN if applicable else NOT_RECOGNISED,
+        "judges": [Judgement(classifier=judge, target=OWN) for judge in spec.judges.networks],
+        "queries": 48_000 if applicable and spec.victim.queries else None,
+        "seconds": {"calibrate": 1.25, "attack": 7.5},
+    }
+    figures = FIGURES if applicable else dict.fromkeys(FIGURES) | {"fooled_as": [], "image_pipelines": []}
+    return Result.model_validate(example_of(examples.RESULT) | asked | found | figures)
 
 
 def trompe(*words: object) -> testing.Result:
@@ -164,7 +156,7 @@ JUDGED = [MANIFEST, MANIFEST_PAGE]
 def manifest_of(job: Job) -> Manifest:
     """The API's example of a judgement, of this job's objects."""
     assert isinstance(job.spec, JudgementSpec)
-    example = examples.MANIFEST["content"]["application/json"]["example"]
+    example = example_of(examples.MANIFEST)
     files = {name: example[name] | {"source": getattr(job.spec, name)} for name in ("before", "after")}
     asked = {"suite": None, "label": job.spec.label, "epsilon": job.spec.epsilon}
     return Manifest.model_validate(example | asked | files)

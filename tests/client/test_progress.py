@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from tests.client.conftest import NOW, SPEC, FakeServer
-from trompe_client import Client, JobCancelled, _progress
+from tests.client.conftest import NOW, SPEC
+from trompe_client import Client, _progress
 from trompe_shared.api import Event, JobState, Progress
 
 RUNNING: dict[str, Any] = {"id": 1, "time": NOW, "state": JobState.running}
@@ -126,9 +126,3 @@ def test_progress_can_be_a_function_of_ones_own(client: Client, capsys: pytest.C
     client.submit(SPEC).wait(timeout=20, progress=events.append)
     assert [event.id for event in events] == [1, 2, 3, 4, 5]
     assert capsys.readouterr() == ("", "")
-
-
-def test_the_bar_is_put_away_when_the_job_does_not_succeed(client: Client, server: FakeServer) -> None:
-    server.ending = JobState.cancelled
-    with pytest.raises(JobCancelled):
-        client.submit(SPEC).wait(timeout=20, progress=True)

@@ -6,6 +6,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.shared.test_comparison import HARD_AND_EASY
 from trompe_server.pages.chart import Point, chart
 from trompe_server.pages.experiment import differing_options, points_of
 from trompe_shared.comparison import Job
@@ -19,16 +20,8 @@ def drawn(*points: Point) -> Any:
     return chart(points, measure="A_drop")
 
 
-HARD_AND_EASY = [
-    point("easy", "short", 10, 1.0),
-    point("hard", "short", 12, 0.2),
-    point("easy", "long", 100, 1.0),
-    point("hard", "long", 120, 0.8),
-]
-
-
 def test_a_job_on_an_easy_object_does_not_beat_jobs_on_a_hard_one() -> None:
-    made = drawn(*HARD_AND_EASY)
+    made = drawn(*(Point(f"{job.object}-{job.configuration}", job) for job in HARD_AND_EASY))
     assert made.best == ["short: A_drop 0.60 in 11 s", "long: A_drop 0.90 in 110 s"]
     assert [mean["title"] for mean in made.means] == made.best
     assert len(made.front.split()) == 2

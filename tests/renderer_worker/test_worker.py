@@ -63,17 +63,6 @@ def test_unused_bits_add_no_view(agent: Wire, unused: int) -> None:
     assert agent.ask("get_position") == (0, 0, 0)
 
 
-def test_an_object_is_placed_turned_and_scaled_as_unity_would(wire: Connect) -> None:
-    agent = wire(size=(64, 64))
-    agent.look(Camera(0.5, 0, 0))
-    agent.spawn(boxes(((0.05, 0, 0), (0.02, 0.01, 0.01))), rotation=(0, 0, 90), scale=(2, 1, 1))
-    rows, columns = np.nonzero((agent.picture() != 255).any(axis=-1))
-    assert rows.max() < 32  # x became up
-    assert 2.5 * np.ptp(columns) < np.ptp(rows) < 6 * np.ptp(columns)
-    agent.ask("move_object", instance=1, position=(0, -0.2, 0), rotation=(0, 0, 90))
-    assert np.nonzero((agent.picture() != 255).any(axis=-1))[0].min() > 32
-
-
 def test_lights_keep_their_settings(agent: Wire) -> None:
     assert agent.ask("get_lights_names") == ["Main Light", "Rim Light"]
     assert agent.ask("get_light_type", light="Main Light") == "Directional"
