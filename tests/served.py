@@ -75,16 +75,53 @@ class Queue:
         return Path(self.settings.store_url) / "jobs" / job
 
 
-class Served(Queue):
-    """``trompe serve`` on the folder ``data``; a context manager. Its messages go to ``log``.
+class Child:
+    """A command of ``trompe`` as a process that ends with its standard input. Its messages go to ``log``."""
+
+    process: "subprocess.Popen[str]"
+
+    def __init__(self, log: Path, environment: Mapping[str, str]) -> None:
+        self.log, self._environment = log, os.environ | environment
+
+    def launch(self, *arguments: str) -> str:
+        """Start it. Returns the first line that it prints."""
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        command, pipe = [*CHILD, *arguments], subprocess.PIPE
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                command, stdin=pipe, stdout=pipe, stderr=log, text=True, env=self._environment
+            )
+        assert self.process.stdout is not None
+        return self.process.stdout.readline()
+
+    def words(self) -> str:
+        """Its messages so far."""
+        return self.log.read_text()
+
+    def end(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """Send a signal and return the exit status."""
+        self.process.send_signal(number)
+        return self.process.wait(120)
+
+    def close(self) -> None:
+        """Kill it, if it has not ended, and close its pipes."""
+        self.process.kill()
+        self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe is not None
+            pipe.close()
+
+
+class Served(Queue, Child):
+    """``trompe serve`` on the folder ``data``; a context manager.
 
     It takes a free port, and the same one after a restart.
     """
 
     def __init__(self, data: Path, *options: str, environment: Mapping[str, str] = FAKE) -> None:
-        super().__init__(Settings(data=data))
-        self.data, self.log, self.port = data, data.parent / f"{data.name}.log", 0
-        self._options, self._environment = options, os.environ | environment
+        Queue.__init__(self, Settings(data=data))
+        Child.__init__(self, data.parent / f"{data.name}.log", environment)
+        self.data, self.port, self._options = data, 0, options
 
     @property
     def url(self) -> str:
@@ -92,16 +129,8 @@ class Served(Queue):
 
     def start(self) -> Self:
         """Start it and wait until it serves."""
-        command = [*CHILD, "serve", "--port", str(self.port), "--data", str(self.data), *self._options]
-        self.data.parent.mkdir(parents=True, exist_ok=True)
-        with self.log.open("ab") as log:
-            pipe = subprocess.PIPE
-            self.process = subprocess.Popen(
-                command, stdin=pipe, stdout=pipe, stderr=log, text=True, env=self._environment
-            )
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line.startswith("trompe serving on http://127.0.0.1:"), self.log.read_text()
+        line = self.launch("serve", "--port", str(self.port), "--data", str(self.data), *self._options)
+        assert line.startswith("trompe serving on http://127.0.0.1:"), self.words()
         self.port = int(line.rpartition(":")[2])
         self.http = self.client_of()
         return self
@@ -109,11 +138,8 @@ class Served(Queue):
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
         """End it and return its exit status."""
         self.http.close()
-        self.process.send_signal(number)
-        status = self.process.wait(120)
-        for pipe in (self.process.stdin, self.process.stdout):
-            assert pipe is not None
-            pipe.close()
+        status = self.end(number)
+        self.close()
         return status
 
     def __enter__(self) -> Self:

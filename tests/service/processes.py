@@ -1,16 +1,14 @@
 """``trompe worker`` as a real process with fake jobs, and the API's side of its queue."""
 
-import os
 import signal
 import socket
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import Final
+from typing import Final, Self
 
-from tests.served import CHILD, FAKE, Queue, wait_until
+from tests.served import FAKE, Child, Queue, wait_until
 from trompe_server.queue.leases import DISPATCHER, end_lease, lease_holder
 from trompe_server.service.dispatch import prepare_data
 from trompe_server.settings import Settings
@@ -43,52 +41,23 @@ def _greet(server: socket.socket) -> None:
                     connection.sendall(COMMANDS["get_light_type"].encode_reply(LIGHT_NOT_FOUND))
 
 
-class WorkerProcess:
-    """A ``trompe worker`` of ``settings`` with its log in a file."""
+class WorkerProcess(Child):
+    """A ``trompe worker`` of ``settings``."""
 
     def __init__(self, settings: Settings, renderers: list[str], **environment: str) -> None:
-        self.log = settings.data / f"worker-{time.monotonic_ns()}.log"
-        settings.data.mkdir(parents=True, exist_ok=True)
-        own = FAKE | {
+        own = {
             "TROMPE_DATA": str(settings.data),
             "TROMPE_DATABASE": settings.database_url,
             "TROMPE_STORE": settings.store_url,
             "TROMPE_SILENCE": str(settings.silence),
         }
-        with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [*CHILD, "worker", *renderers],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                text=True,
-                env=os.environ | own | environment,
-            )
+        super().__init__(settings.data / f"worker-{time.monotonic_ns()}.log", FAKE | own | environment)
+        self._renderers = renderers
 
-    def ready(self) -> "WorkerProcess":
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
+    def start(self) -> Self:
+        line = self.launch("worker", *self._renderers)
         assert line == "trompe worker ready\n", self.words()
         return self
-
-    def send(self, number: signal.Signals) -> None:
-        self.process.send_signal(number)
-
-    def end(self, number: signal.Signals) -> int:
-        """Send a signal and return the exit status."""
-        self.send(number)
-        return self.process.wait(120)
-
-    def words(self) -> str:
-        """Standard error of the process so far."""
-        return self.log.read_text()
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout):
-            assert pipe is not None
-            pipe.close()
 
 
 class Service(Queue):
@@ -104,7 +73,7 @@ class Service(Queue):
         """A running worker."""
         running = WorkerProcess(self.settings, renderers or ["--renderer", f"127.0.0.1:{self.renderer}"], **environment)
         try:
-            yield running.ready()
+            yield running.start()
         finally:
             running.close()
 
