@@ -3,7 +3,6 @@
 The slow run sends TROMPE_FUZZ_INPUTS (200,000) inputs; ``--log-cli-level=INFO`` shows the figures.
 """
 
-import itertools
 import logging
 import os
 import random
@@ -12,12 +11,15 @@ import struct
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.served import wait_until
 from tests.wire import Wire, boxes
 from tests.worker_process import Worker
 from trompe_renderer.world.model import content_key
@@ -156,7 +158,7 @@ def send(address: tuple[str, int], data: bytes) -> None:
             pass
 
 
-def fuzz(address: tuple[str, int], *, first: int, last: int) -> None:
+def fuzz(address: tuple[str, int], first: int, last: int) -> None:
     """Send the inputs with these numbers. An input that hangs raises ``TimeoutError``."""
     fuzzer = Fuzzer(SEED + first)
     for _ in range(first, last):
@@ -205,31 +207,16 @@ class Witness:
 )
 def test_no_input_crashes_hangs_or_fills_a_worker_or_disturbs_another_agent(inputs: int, own_worker: Worker) -> None:
     worker = own_worker
-    fuzz(worker.address, first=0, last=300)  # warms caches up
+    fuzz(worker.address, 0, 300)  # warms caches up
     memory, before = worker.memory, worker.open
-    failures: list[BaseException] = []
-
-    def run(first: int, last: int) -> None:
-        try:
-            fuzz(worker.address, first=first, last=last)
-        except BaseException as error:
-            failures.append(error)
-
     with closing(Wire(worker.address)) as agent, Witness(agent) as witness:
         bounds = [300 + inputs * k // FUZZERS for k in range(FUZZERS + 1)]
-        threads = [threading.Thread(target=run, args=pair) for pair in itertools.pairwise(bounds)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    assert failures == []
+        with ThreadPoolExecutor(FUZZERS) as threads:
+            list(threads.map(partial(fuzz, worker.address), bounds[:-1], bounds[1:]))
     assert witness.frames > 10
     assert witness.wrong == 0
     assert worker.process.poll() is None, "the worker crashed"
-    deadline = time.monotonic() + 120
-    while worker.open > before and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert worker.open <= before
+    wait_until(lambda: worker.open <= before)
     log.info(
         "%d inputs: another agent took %d frames, the slowest %.2f s; memory %.1f to %.1f MiB",
         *(inputs, witness.frames, witness.slowest, memory / 2**20, worker.memory / 2**20),

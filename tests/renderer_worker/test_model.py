@@ -2,6 +2,8 @@
 
 import gc
 import threading
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -132,11 +134,8 @@ def test_large_archives_are_parsed_one_after_the_other_and_small_ones_beside_the
         models = cache(large_archive=64 * 2**10)
         most.clear()
         both.clear()
-        threads = [threading.Thread(target=read, args=(models, archive)) for archive in archives]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        with ThreadPoolExecutor(2) as threads:
+            list(threads.map(partial(read, models), archives))
         assert len(most) == 2
         assert max(most) == together
 

@@ -3,6 +3,7 @@
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from functools import partial
 from importlib.metadata import version
@@ -82,23 +83,19 @@ def test_many_requests_at_a_time_each_get_their_own_texture_while_a_worker_dies(
     own_worker: Worker, worker: Address, expected: Expected
 ) -> None:
     wanted = {seed: expected(seed) for seed in range(4)}
-    found: dict[int, list[bool]] = {seed: [] for seed in wanted}
     begun = threading.Event()
 
     def ask(seed: int) -> None:
         for _ in range(3):
             images = pool.render(painted(seed), VIEWS, size=SIZE, on_frame=begun.set)
-            found[seed].append(bool((images == wanted[seed]).all()))
+            assert (images == wanted[seed]).all()
 
-    with closing(Pool([own_worker.address, worker])) as pool:
-        threads = [threading.Thread(target=ask, args=(seed,)) for seed in wanted]
-        for thread in threads:
-            thread.start()
+    with closing(Pool([own_worker.address, worker])) as pool, ThreadPoolExecutor(len(wanted)) as threads:
+        asked = [threads.submit(ask, seed) for seed in wanted]
         assert begun.wait(240)
         own_worker.process.kill()
-        for thread in threads:
-            thread.join()
-    assert found == {seed: [True] * 3 for seed in wanted}
+        for each in asked:
+            each.result()
 
 
 def test_dead_addresses_are_passed_over_and_a_pool_of_these_alone_says_how_to_start_a_worker(

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -346,16 +347,13 @@ def test_large_requests_for_memory_are_not_overtaken_by_small_ones() -> None:
         with memory.reserved(count):
             order.append(count)
 
-    with memory.reserved(30):
-        threads = [threading.Thread(target=use, args=(count,)) for count in (1000, 20, 20)]
-        threads[0].start()
+    with ThreadPoolExecutor(3) as threads, memory.reserved(30):
+        threads.submit(use, 1000)
         wait_until(memory._queue.locked)  # it is the first
-        for thread in threads[1:]:
-            thread.start()
+        threads.submit(use, 20)
+        threads.submit(use, 20)
         time.sleep(0.05)
         assert order == []
-    for thread in threads:
-        thread.join()
     assert order == [1000, 20, 20]
     memory.take(100, timeout=0)
 

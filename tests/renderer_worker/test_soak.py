@@ -6,9 +6,9 @@ The slow runs last TROMPE_SOAK_SECONDS (600) with 8 agents, and 10,000 frames an
 
 import logging
 import os
-import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 import numpy as np
@@ -68,11 +68,8 @@ def test_agents_at_work_at_once_get_their_own_pictures_and_none_waits_for_long(
                 if not (images == expected[agent][turn][views]).all():
                     wrong.append((agent, turn))
 
-    threads = [threading.Thread(target=work, args=(agent,)) for agent in range(AGENTS)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(AGENTS) as threads:
+        list(threads.map(work, range(AGENTS)))
     middle, late = (float(np.percentile(np.concatenate(waits), share)) for share in (50, 99))
     counts = [len(mine) for mine in waits]
     for name, value in (("requests", sum(counts)), ("median_ms", 1000 * middle), ("p99_ms", 1000 * late)):

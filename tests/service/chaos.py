@@ -12,6 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -206,11 +207,8 @@ class Site:
 
     def close(self) -> None:
         """End all processes."""
-        threads = [threading.Thread(target=kept.close) for kept in self._kept]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        with ThreadPoolExecutor(len(self._kept)) as threads:
+            list(threads.map(Kept.close, self._kept))
         self.store.close()
         self._reserved.close()
 

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -215,11 +214,8 @@ def test_events_tell_the_whole_story_and_their_ids_grow_by_one(store: JobStore) 
     job = create(store)
     taken = claim(store)
     mine = claims_of(store)
-    threads = [threading.Thread(target=lambda: [mine.advance(taken, HALF) for _ in range(5)]) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: mine.advance(taken, HALF), range(20)))
     mine.finish(taken, DONE)
     events = store.events(job)
     assert [event.id for event in events] == list(range(1, 24))
