@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from trimesh.creation import uv_sphere
 
 from tests.documentation import blocks
 from tests.made_objects import CANDLE, FLAG, GLASS, LATTICE, lantern
@@ -87,13 +88,8 @@ def picture(target: SailenvTarget, obj: Object3D, camera: Camera, light: Light =
 
 
 def sphere(make_object: Make, radius: float) -> Object3D:
-    """A white ball of 96 x 48 quads, smooth."""
-    around, up = np.meshgrid(np.linspace(0, 2 * np.pi, 97), np.linspace(-np.pi / 2, np.pi / 2, 49))
-    points = radius * np.stack([np.cos(up) * np.sin(around), np.sin(up), np.cos(up) * np.cos(around)], axis=-1)
-    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
-    corners = np.concatenate([np.stack(each, axis=-2).reshape(-1, 3, 3) for each in ((a, b, c), (a, c, d))])
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    corners = corners[area > 1e-9 * area.max()]
+    """A white ball, smooth."""
+    corners = np.array(uv_sphere(radius=radius, count=(48, 96)).triangles)
     return make_object((corners, np.full((len(corners), 3, 2), 0.5), plain(255, 255, 255)))  # type: ignore[no-any-return]
 
 

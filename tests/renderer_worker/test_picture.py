@@ -7,6 +7,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from tests import wire
 from tests.wire import WHITE, boxes, plain
@@ -70,16 +71,7 @@ def test_from_straight_above_the_front_is_at_the_bottom(target: SailenvTarget) -
 
 def outline(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The convex polygon (N, 2) around points (K, 2), in order."""
-    ordered = sorted(map(tuple, points))
-    chains = []
-    for row in (ordered, ordered[::-1]):
-        chain: list[tuple[float, ...]] = []
-        for point in row:
-            while len(chain) > 1 and np.linalg.det(np.array([chain[-1], point]) - chain[-2]) <= 0:
-                chain.pop()
-            chain.append(point)
-        chains += chain[:-1]
-    return np.array(chains)
+    return np.asarray(points[ConvexHull(points).vertices])
 
 
 def area_and_middle(polygon: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 
 from tests.wire import Wire, boxes, on_screen, pixel_rays
 from trompe_renderer.protocol.label_views import instance_color
@@ -67,9 +68,7 @@ def depth_of(camera: Camera, box: Box) -> Array:
 
 def inside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Pixels whose neighbours are all in the mask too."""
-    padded = np.pad(mask, 1)
-    shifted = [np.roll(padded, step, axis)[1:-1, 1:-1] for axis in (0, 1) for step in (-1, 1)]
-    return np.asarray(np.logical_and.reduce([mask, *shifted]))
+    return np.asarray(binary_erosion(mask))
 
 
 TURNED = Box((0.03, -0.02, 0.05), (20.0, 35.0, -50.0), (1.2, 0.8, 1.0))

@@ -12,6 +12,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.stats import theilslopes
 
 from tests.served import Served, ancestry, process_table
 from tests.service.chaos import KINDS, kind_of
@@ -129,8 +130,7 @@ def trends(rows: Sequence[Row], *, warm: float) -> list[Trend]:
 
 def trend(name: str, times: ArrayLike, values: ArrayLike) -> Trend:
     """Trend of the quantity ``... UNIT``. Growth is the median slope (Theil-Sen) times the time, robust to peaks."""
-    run, rise = (np.subtract.outer(*[np.asarray(each, float)] * 2) for each in (times, values))
-    grew = float(np.median(rise[run > 0] / run[run > 0]) * run.max())
+    grew = float(theilslopes(values, times).slope * np.ptp(times))
     share, more = ALLOWED[name.split()[-1]]
     median = float(np.median(np.asarray(values, float)))
     return Trend(name, median, grew, share * median + more)

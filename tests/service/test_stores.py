@@ -7,7 +7,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,13 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Folder:
             return open_folder(f"memory://{secrets.token_hex(4)}/folder")
         case _:
             return open_folder(f"{request.getfixturevalue('bucket')}/{secrets.token_hex(4)}")
+
+
+def raising(error: Exception) -> Callable[..., Any]:
+    def fail(*_: Any, **__: Any) -> None:
+        raise error
+
+    return fail
 
 
 def test_a_file_is_read_as_it_was_written_last(folder: Folder, tmp_path: Path) -> None:
@@ -117,10 +124,7 @@ def test_a_store_that_nobody_knows_is_refused_with_a_remedy() -> None:
 def test_a_store_that_cannot_be_reached_is_told_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
     folder = open_folder("memory://gone")
 
-    def unreachable(*_: Any, **__: Any) -> bytes:
-        raise ConnectionError("nobody there")
-
-    monkeypatch.setattr(type(folder.system), "cat_file", unreachable)  # type: ignore[union-attr]
+    monkeypatch.setattr(type(folder.system), "cat_file", raising(ConnectionError("nobody there")))  # type: ignore[union-attr]
     with pytest.raises(ServiceError, match=r"is not available.*TROMPE_STORE"):
         folder.read("a")
 
@@ -134,11 +138,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(
 ) -> None:
     folder = LocalArtifacts(tmp_path / "full")
     folder.write("a.bin", b"old")
-
-    def fail(_: int) -> None:
-        raise fault
-
-    monkeypatch.setattr(os, "fsync", fail)
+    monkeypatch.setattr(os, "fsync", raising(fault))
     with pytest.raises(expected, match="no space left"):
         folder.write("a.bin", b"new")
     assert folder.read("a.bin") == b"old"
@@ -253,12 +253,8 @@ def test_a_job_whose_files_cannot_be_deleted_stays_until_they_can(
         delete_job(store, files, job)
     assert job_artifacts(files, job).names() == ["result.json"]
     claims_of(store).finish(claim(store), DONE)
-
-    def away(*_: Any, **__: Any) -> None:
-        raise ConnectionError("nobody there")
-
     with monkeypatch.context() as patch:
-        patch.setattr(type(files.system), "rm", away)  # type: ignore[union-attr]
+        patch.setattr(type(files.system), "rm", raising(ConnectionError("nobody there")))  # type: ignore[union-attr]
         with pytest.raises(ServiceError, match="not available"):
             delete_job(store, files, job)
         assert store.get(job).state is JobState.succeeded
@@ -271,11 +267,7 @@ def test_a_job_whose_files_cannot_be_deleted_stays_until_they_can(
 def test_a_local_folder_that_cannot_be_deleted_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = open_folder(tmp_path / "job")
     folder.write("a", b"1")
-
-    def refused(*_: Any, **__: Any) -> None:
-        raise PermissionError("read-only")
-
-    monkeypatch.setattr(shutil, "rmtree", refused)
+    monkeypatch.setattr(shutil, "rmtree", raising(PermissionError("read-only")))
     with pytest.raises(ServiceError, match="cannot be deleted"):
         folder.delete_all()
 
