@@ -1,7 +1,9 @@
-"""Code blocks of the pages in docs/."""
+"""Code blocks of the pages in docs/, and their reader."""
 
 import json
+import os
 import re
+import sysconfig
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +18,11 @@ def blocks(page: str, language: str) -> list[tuple[str, str]]:
         if match[2] == language:
             found.append((heading, match[3]))
     return found
+
+
+def readers_environment(**variables: str) -> dict[str, str]:
+    """The environment of a reader who has the commands of this installation."""
+    return os.environ | variables | {"PATH": f"{sysconfig.get_path('scripts')}:{os.environ['PATH']}"}
 
 
 def cells(notebook: str) -> list[str]:

@@ -2,12 +2,10 @@
 
 import csv
 import json
-import os
 import re
 import shlex
 import subprocess
 import sys
-import sysconfig
 from importlib.resources import files
 from pathlib import Path
 
@@ -16,7 +14,7 @@ from click.testing import CliRunner
 
 import trompe_client
 from tests.client.conftest import FakeServer, zipped
-from tests.documentation import DOCS, blocks
+from tests.documentation import DOCS, blocks, readers_environment
 from trompe_client.cli import main
 from trompe_client.cli.group import EXITS, OWN
 
@@ -25,8 +23,7 @@ QUICKSTART = {heading: code for language in ("python", "sh") for heading, code i
 
 def run(command: list[str], folder: Path, server: str) -> str:
     """What a program prints that is run in ``folder`` as a reader would, with ``server`` in the environment."""
-    scripts = sysconfig.get_path("scripts")
-    environment = os.environ | {"TROMPE_SERVER": server, "PATH": f"{scripts}:{os.environ['PATH']}"}
+    environment = readers_environment(TROMPE_SERVER=server)
     done = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=240
     )

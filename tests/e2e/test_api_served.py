@@ -3,12 +3,10 @@
 The jobs are fake.
 """
 
-import os
 import re
 import shutil
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -21,6 +19,7 @@ from typing import Any, Self
 import httpx
 import pytest
 
+from tests.documentation import blocks, readers_environment
 from tests.fake_job import PHASES, trace
 from tests.served import FAKE, Served, wait_until
 from trompe_server.api.guard import FRESH
@@ -29,7 +28,6 @@ from trompe_server.storage.tokens import Right, Tokens
 from trompe_shared.api import JobState, in_parts
 from trompe_shared.shipped import shipped_objects
 
-ROOT = Path(__file__).parents[2]
 JOB = {"object": "mug", **in_parts({"label": "mug"})}
 
 
@@ -173,11 +171,11 @@ def test_the_examples_of_the_documentation_work(serve: Serve, tmp_path: Path) ->
     for program in ("curl", "jq"):
         if shutil.which(program) is None:
             pytest.skip(f"there is no {program} here; install it: sudo apt-get install {program}")
-    blocks = re.findall(r"^```bash\n(.*?)^```", (ROOT / "docs" / "api.md").read_text(), re.DOTALL | re.MULTILINE)
-    assert len(blocks) >= 8
+    codes = [code for _, code in blocks("api.md", "bash")]
+    assert len(codes) >= 8
     (tmp_path / "vase.zip").write_bytes(shipped_objects()["bottle"].read())
     own = {"TROMPE_SERVER": serve.url, "TROMPE_TOKEN": serve.secret, "TROMPE_DATA": str(serve.settings.data)}
-    environment = {**os.environ, **own, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    script = "set -euo pipefail\n" + "\n".join(blocks)
+    environment = readers_environment(**own)
+    script = "set -euo pipefail\n" + "\n".join(codes)
     done = subprocess.run(["bash", "-xc", script], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr + done.stdout

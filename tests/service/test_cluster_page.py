@@ -1,16 +1,14 @@
 """The page about clusters is true: its programs run, as a reader would start them."""
 
-import os
 import shutil
 import subprocess
-import sysconfig
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from tests.documentation import blocks
+from tests.documentation import blocks, readers_environment
 from tests.served import free_port, wait_until
 from trompe_client import Client, ServerUnreachable
 
@@ -46,8 +44,7 @@ def test_the_page_about_clusters_runs_from_its_beginning_to_its_end(ray_access: 
     access, cluster, service, jobs = scripts.split("\0")
     server = jobs.partition("--server ")[2].split()[0]
     words = dict(word.split("=") for word in access.split() if "=" in word)
-    programs = f"{sysconfig.get_path('scripts')}:{os.environ['PATH']}"
-    environment = os.environ | words | {"PATH": programs, "TROMPE_DATA": str(tmp_path / "data")}
+    environment = readers_environment(**words, TROMPE_DATA=str(tmp_path / "data"))
     serve = service.strip() + f" --port {server.rpartition(':')[2]}"
     with running(cluster, tmp_path, environment), running(serve, tmp_path, environment):
         wait_until(lambda: answers(server), story=(tmp_path / "log").read_text)
