@@ -103,11 +103,6 @@ FIGURES: dict[str, Any] = {
 """Figures of an attack; None if nothing was recognised."""
 
 
-def example_of(content: examples.Content) -> dict[str, Any]:
-    found: dict[str, Any] = content["content"]["application/json"]["example"]
-    return found
-
-
 def result_of(spec: JobSpec, *, applicable: bool = True) -> Result:
     """The API's example of a result, with figures for all rows of a table."""
     paint, search, classifier = spec.paint, spec.search, spec.victim.classifier
@@ -125,7 +120,7 @@ def result_of(spec: JobSpec, *, applicable: bool = True) -> Result:
         "seconds": {"calibrate": 1.25, "attack": 7.5},
     }
     figures = FIGURES if applicable else dict.fromkeys(FIGURES) | {"fooled_as": [], "image_pipelines": []}
-    return Result.model_validate(example_of(examples.RESULT) | asked | found | figures)
+    return Result.model_validate(examples.RESULT | asked | found | figures)
 
 
 def trompe(*words: object) -> testing.Result:
@@ -156,7 +151,7 @@ JUDGED = [MANIFEST, MANIFEST_PAGE]
 def manifest_of(job: Job) -> Manifest:
     """The API's example of a judgement, of this job's objects."""
     assert isinstance(job.spec, JudgementSpec)
-    example = example_of(examples.MANIFEST)
+    example = examples.MANIFEST
     files = {name: example[name] | {"source": getattr(job.spec, name)} for name in ("before", "after")}
     asked = {"suite": None, "label": job.spec.label, "epsilon": job.spec.epsilon}
     return Manifest.model_validate(example | asked | files)

@@ -153,10 +153,12 @@ def test_nothing_runs_as_root_or_can_become_root_or_write_the_root_of_its_contai
     status = stack.run_in(container, "cat", "/proc/self/status")
     assert POWERLESS.items() <= dict(line.split(":\t", 1) for line in status.splitlines()).items()
     host = stack.inspect(container)["HostConfig"]
+    assert (host["Privileged"], host["CapDrop"], host["CapAdd"]) == (False, ["ALL"], None)
     assert host["Memory"] > 0
     assert host["PidsLimit"] > 0
     tried = stack.run_in(container, "sh", "-c", "for f in /x /opt/x /usr/bin/x /etc/x; do touch $f 2>&1; done; true")
     assert tried.count("Read-only file system") == 4, tried
+    assert host["ReadonlyRootfs"]
 
 
 CONNECT: Final = "import socket, sys; socket.create_connection((sys.argv[1], int(sys.argv[2])), 10)"
@@ -175,6 +177,11 @@ def address(stack: Stack, container: str, network: str) -> str:
 
 def test_only_the_api_is_reached_from_outside_and_the_renderer_reaches_nobody(stack: Stack) -> None:
     (api,), (worker,), (renderer,), (postgres,) = (stack.containers(service) for service in SERVICES)
+    published = {
+        service: stack.inspect(stack.containers(service)[0])["HostConfig"]["PortBindings"] for service in SERVICES
+    }
+    assert {service for service, ports in published.items() if ports} == {"api"}
+    assert published["api"]["8000/tcp"][0]["HostIp"] == "127.0.0.1"
     assert reaches(stack, worker, "renderer", 8085)
     assert reaches(stack, worker, "postgres", 5432)
     assert not reaches(stack, renderer, address(stack, postgres, "state"), 5432)
@@ -183,6 +190,10 @@ def test_only_the_api_is_reached_from_outside_and_the_renderer_reaches_nobody(st
         stranger = ("run", "--rm", "--entrypoint", "python", stack.image("server"), "-c", CONNECT, target, str(port))
         with pytest.raises(AssertionError, match=r"TimeoutError|timed out|unreachable|refused"):
             stack.docker(*stranger)
+    for container in (worker, renderer, postgres):
+        networks = stack.inspect(container)["NetworkSettings"]["Networks"]
+        internal = [stack.docker("network", "inspect", name, "--format", "{{.Internal}}") for name in networks]
+        assert set(internal) == {"true"}
     assert reaches(stack, api, "renderer", 8085)
 
 
