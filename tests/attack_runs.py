@@ -25,7 +25,7 @@ from trompe_shared.object3d import Object3D
 
 SIZE: Final = (32, 32)
 LABEL: Final = 6
-"""Class of the square for the fake classifier in all views of ``square_surrogate``."""
+"""Class of the square for the fake classifier in all views of ``surrogate``."""
 
 EPS: Final = 1e-6
 SMALL: Final = settings(max_examples=6)

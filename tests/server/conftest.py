@@ -32,14 +32,14 @@ def _triangle_zip(*, colour: tuple[int, int, int] = (200, 30, 30)) -> bytes:
 
 @pytest.fixture(scope="session")
 def square(make_object: Callable[..., Object3D], make_quad: Callable[..., Any]) -> Object3D:
-    """A square that the views of ``square_surrogate`` see from the front, and one behind the cameras that none sees."""
+    """A square that the views of ``surrogate`` see from the front, and one behind the cameras that none sees."""
     random = np.random.default_rng(0)
     textures = [random.integers(40, 216, (16, 16, 3), dtype=np.uint8) for _ in range(2)]
     return make_object(make_quad(textures[0]), make_quad(textures[1], z=9.0))
 
 
 @pytest.fixture(scope="session")
-def square_surrogate(square: Object3D) -> Surrogate:
+def surrogate(square: Object3D) -> Surrogate:
     """12 views of ``square``, 32 x 32, in all of which the fake classifier says class 6."""
     views = [View(Camera(0.3, azimuth, elevation)) for azimuth in (-40, -10, 20, 45) for elevation in (-20, 0, 30)]
     return diffuse_surrogate(prepare_geometry(square, views, size=(32, 32), sampling=SamplingModel()), views)

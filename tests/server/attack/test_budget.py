@@ -1,4 +1,8 @@
-"""The budget: projection, steps and 8-bit quantisation, each against its formula."""
+"""The budget: projection, steps, 8-bit quantisation, perceptual bounds and the bound on images, against formulas."""
+
+import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -7,10 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.attack_runs import EPS
+from tests.attack_runs import EPS, SMALL, random_state, run, surrogate_of
 from trompe_server.attack import Budget
 from trompe_server.attack.budget import HUE
+from trompe_server.attack.perception import perceptual_bounds
+from trompe_server.judging.visibility import perceived_change
+from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
 from trompe_shared.errors import SpecError
+from trompe_shared.geometry import Camera, View
+from trompe_shared.object3d import Object3D
 
 BUDGETS = st.floats(1 / 255, 1).flatmap(lambda e: st.builds(Budget, st.just(e), st.floats(e / 1000, e)))
 SEEDS = st.integers(0, 2**31)
@@ -27,23 +36,12 @@ def random_texture(seed: int) -> Tensor:
 
 @given(BUDGETS, SEEDS)
 @settings(max_examples=60)
-def test_a_projected_change_keeps_the_budget_and_the_colours_that_exist(budget: Budget, seed: int) -> None:
-    texture = random_texture(seed)
-    delta = budget.box(texture).project(random_tensor(seed + 1, low=-2, high=2))
-    assert delta.abs().max() <= budget.epsilon + EPS
-    assert (texture + delta).min() >= 0
-    assert (texture + delta).max() <= 1
-    torch.testing.assert_close(budget.box(texture).project(delta), delta, atol=EPS, rtol=0)
-
-
-@given(BUDGETS, SEEDS)
-@settings(max_examples=60)
 def test_the_projection_is_the_nearest_change_that_is_allowed(budget: Budget, seed: int) -> None:
     texture, wish = random_texture(seed), random_tensor(seed + 1, low=-2, high=2)
     low, high = (-texture).clamp(min=-budget.epsilon), (1 - texture).clamp(max=budget.epsilon)
-    torch.testing.assert_close(
-        budget.box(texture).project(wish), torch.maximum(low, torch.minimum(high, wish)), atol=EPS, rtol=0
-    )
+    delta = budget.box(texture).project(wish)
+    torch.testing.assert_close(delta, torch.maximum(low, torch.minimum(high, wish)), atol=EPS, rtol=0)
+    assert 0 <= (texture + delta).min() <= (texture + delta).max() <= 1
 
 
 @given(BUDGETS, SEEDS, st.integers(1, 12))
@@ -121,3 +119,142 @@ def test_an_impossible_budget_is_refused(epsilon: float, alpha: float) -> None:
 def test_an_impossible_view_budget_is_refused(epsilon_view: float) -> None:
     with pytest.raises(SpecError, match=r"epsilon_view must be in \(0, 1\]"):
         Budget(0.1, 0.1, epsilon_view)
+
+
+# Perceptual bounds, from the unpainted texture
+
+
+def bound(texture: Tensor, *, footprint: float = 1.0, epsilon: float = 0.2) -> Tensor:
+    height, width = texture.shape[:2]
+    return perceptual_bounds(texture, (height, width), footprint=footprint, epsilon=epsilon)[..., 0]
+
+
+def plain(grey: float, side: int = 16) -> Tensor:
+    return torch.full((side, side, 3), grey)
+
+
+def checked(low: float, high: float, side: int = 16) -> Tensor:
+    squares = (torch.arange(side)[:, None] + torch.arange(side)) % 2
+    return (low + (high - low) * squares)[..., None].expand(-1, -1, 3).contiguous()
+
+
+@given(
+    st.floats(0.004, 1), st.integers(0, 2**31), st.sampled_from([(1, 1), (1, 7), (5, 3), (16, 16)]), st.floats(1, 300)
+)
+@settings(max_examples=40)
+def test_a_bound_is_in_whole_levels_from_one_to_epsilon(
+    epsilon: float, seed: int, size: tuple[int, int], footprint: float
+) -> None:
+    texture = torch.rand(*size, 3, generator=torch.Generator().manual_seed(seed))
+    levels = bound(texture, footprint=footprint, epsilon=epsilon) * 255
+    assert levels.shape == size
+    assert torch.allclose(levels, levels.round(), atol=1e-3)
+    assert 1 <= round(float(levels.min())) <= round(float(levels.max())) <= max(1, math.floor(epsilon * 255 + 1e-3))
+
+
+def test_texture_hides_a_change_and_plain_areas_show_it() -> None:
+    assert (bound(checked(0.4, 0.6)) > 1.3 * bound(plain(0.5))).all()
+    assert bound(plain(0.0)).min() == bound(checked(0.0, 0.2)).max() == pytest.approx(0.2)
+
+
+def test_middle_greys_show_more_than_black_and_white() -> None:
+    black, middle, white = (float(bound(plain(grey)).mean()) for grey in (0.0, 0.47, 1.0))
+    assert middle < 0.7 * black
+    assert middle < 0.7 * white
+
+
+def test_a_texture_finer_than_the_pixels_of_the_views_counts_as_plain() -> None:
+    fine = checked(0.3, 0.7, side=64)
+    assert torch.equal(bound(fine, footprint=16), bound(plain(0.5, side=64), footprint=16))
+
+
+def test_the_same_picture_has_the_same_bounds_at_any_resolution() -> None:
+    coarse = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
+    fine = coarse.repeat_interleave(4, 0).repeat_interleave(4, 1)
+    shown = bound(fine, footprint=16).unfold(0, 4, 4).unfold(1, 4, 4).mean((2, 3))
+    assert (shown - bound(coarse)).abs().mean() <= 0.01
+
+
+def test_equal_bounds_are_about_equally_visible() -> None:
+    """The mean CIEDE2000 of greys changed by their bounds varies less than for the same change of all."""
+
+    def seen(change: list[float]) -> list[float]:
+        found = []
+        for grey, step in zip(greys, change, strict=True):
+            before = (plain(grey)[None] * 255).round()
+            clean, painted = (each.byte().numpy() for each in (before, before + round(step * 255)))
+            shown = perceived_change(clean, painted, clean[..., 0] >= 0)
+            found.append(shown["delta_e"])
+        return found
+
+    greys = [0.1, 0.2, 0.4, 0.6, 0.75]
+    own = seen([float(bound(plain(grey)).mean()) for grey in greys])
+    same = seen([0.1] * len(greys))
+    assert max(own) / min(own) < 1.4 < max(same) / min(same)
+
+
+def test_an_attack_keeps_its_bounds(square: Object3D, surrogate: Surrogate) -> None:
+    budget = Budget(0.1, 0.03, perceptual=True)
+    state = run(square, surrogate, budget=budget, steps=8)
+    clean = textures_of(square)
+    bounds = {name: bound(each, footprint=surrogate.footprint[name], epsilon=0.1) for name, each in clean.items()}
+    painted = textures_of(budget.repaint(square, state.deltas))
+    change = {name: (painted[name] - each).abs() for name, each in clean.items()}
+    assert all((change[name].amax(2) <= bounds[name] + 1e-4).all() for name in change)
+    assert change["m0.png"].max() > 0.02
+
+
+# The bound on the surrogate's images
+
+
+def images_of(surrogate: Surrogate, textures: dict[str, Tensor]) -> Tensor:
+    with torch.no_grad():
+        return surrogate.render_all(surrogate.texels(textures))
+
+
+def attacked(
+    obj: Object3D, surrogate: Surrogate, epsilon_view: float | None, **options: Any
+) -> tuple[dict[str, Tensor], float]:
+    """The deltas of an attack, and the largest change of its images, for floats and for saved textures."""
+    textures, budget = textures_of(obj), Budget(0.3, 0.1, epsilon_view)
+    state = run(obj, surrogate, budget=budget, steps=3, **options)
+    painted = {name: textures[name] + delta for name, delta in state.deltas.items()}
+    clean, saved = images_of(surrogate, textures), textures_of(budget.repaint(obj, state.deltas))
+    change = max(float((images_of(surrogate, each) - clean).abs().max()) for each in (painted, saved))
+    return dict(state.deltas), change
+
+
+@pytest.mark.parametrize("optimiser", ["pgd", "nesterov"])
+@given(epsilon_view=st.floats(0.002, 0.3), seed=st.integers(0, 9))
+@SMALL
+def test_no_pixel_changes_by_more_than_the_bound(
+    optimiser: str, square: Object3D, surrogate: Surrogate, epsilon_view: float, seed: int
+) -> None:
+    begin = random_state(square, Budget(0.3, 0.1), seed)
+    _, change = attacked(square, surrogate, epsilon_view, optimiser=optimiser, state=begin)
+    assert change <= epsilon_view + 1e-5
+
+
+def test_the_bound_is_used_up_at_no_needless_cost(square: Object3D, surrogate: Surrogate) -> None:
+    bounded, change = attacked(square, surrogate, 0.05)
+    free, largest = attacked(square, surrogate, None)
+    assert largest > 0.1
+    assert 0.045 < change <= 0.05 + 1e-5
+    assert bounded["m0.png"].abs().mean() > 0.8 * free["m0.png"].abs().mean() * 0.05 / largest
+
+
+@pytest.mark.parametrize("filtered", ["linear", "encoded"])
+def test_the_bound_holds_for_textures_seen_from_afar(
+    filtered: Any, make_object: Callable[..., Object3D], make_quad: Callable[..., Any]
+) -> None:
+    obj = make_object(make_quad(np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)))
+    views = [View(Camera(distance, azimuth, 10)) for distance in (0.3, 1.5) for azimuth in (-80, 0, 30)]
+    surrogate = surrogate_of(obj, views, sampling=SamplingModel(filtered=filtered))
+    for epsilon_view in (0.01, 0.03):
+        assert attacked(obj, surrogate, epsilon_view)[1] <= epsilon_view + 1e-5
+
+
+def test_an_unreached_bound_changes_nothing(square: Object3D, surrogate: Surrogate) -> None:
+    bounded, _ = attacked(square, surrogate, 1.0)
+    free, _ = attacked(square, surrogate, None)
+    assert all(torch.equal(bounded[name], free[name]) for name in free)

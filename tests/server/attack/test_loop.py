@@ -1,6 +1,5 @@
 """The attack loop on a small scene: ascent, budget, resumption, skipped views, safe margin, odd classifiers."""
 
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -32,7 +31,6 @@ from trompe_server.attack import (
     Step,
     ViewDistribution,
     attack,
-    grid_views,
     load_state,
     movable,
     save_state,
@@ -42,7 +40,7 @@ from trompe_server.attack.goal import SAFE_MARGIN
 from trompe_server.attack.search import RISE, SAFE_ENOUGH
 from trompe_server.classifiers import NetworkClassifier, load_classifier
 from trompe_server.judging.metrics import accuracy, texels_altered
-from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
+from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
 from trompe_shared.errors import SpecError
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, load_object
@@ -487,26 +485,3 @@ def test_the_margin_follows_the_views(
     state = run(square, surrogate, steps=steps, state=known, budget=Budget(0.01, 0.001), on_step=seen.append)
     assert float(state.memory["search.safe"]) == pytest.approx(after)
     assert [step.least_left for step in seen] == [steps - step.step - 1 for step in seen]  # so few that none is spared
-
-
-# Without any server
-
-
-def test_a_few_lines_attack_a_shipped_object_without_a_server(tmp_path: Path) -> None:
-    entry, classifier = shipped_objects()["mug"], load_classifier("tiny")
-    assert isinstance(classifier, NetworkClassifier)
-    obj, label = load_object(entry.read()), (classifier.classes or ()).index(entry.label)
-    views = grid_views(
-        distance=entry.distance, elevation=entry.elevation, azimuths=3, elevations=1, background=(255,) * 3
-    )
-    geometry = prepare_geometry(obj, views, size=classifier.image_size, sampling=SamplingModel())
-    surrogate = diffuse_surrogate(geometry, views)
-    textures, budget, seen = textures_of(obj), Budget(epsilon=0.2, alpha=0.05), list[Step]()
-    state = attack(
-        start(textures), textures, surrogate, classifier, goal=Goal(label), budget=budget, steps=4, on_step=seen.append
-    )
-    (tmp_path / "adversarial.zip").write_bytes(budget.repaint(obj, state.deltas).to_zip())
-    again = load_object(tmp_path / "adversarial.zip")
-    change = np.abs(again.textures[min(again.textures)].astype(int) - obj.textures[min(obj.textures)])
-    assert seen[-1].loss > seen[0].loss
-    assert 0 < change.max() <= 51

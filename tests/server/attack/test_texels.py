@@ -1,6 +1,7 @@
-"""Selection and ranking of texels."""
+"""Selection and ranking of texels, and the choice of few by trial attacks."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tests.attack_runs import SIZE
-from trompe_server.attack import Budget, best_texels, material_texels, movable, painted_texels, rank_texels
+from tests.attack_runs import LABEL, SIZE, mean_loss, run
+from tests.fakes import fake_classifier
+from trompe_server.attack import (
+    Budget,
+    Goal,
+    TexelMasks,
+    best_texels,
+    few_texels,
+    material_texels,
+    movable,
+    painted_texels,
+    rank_texels,
+)
 from trompe_server.surrogate import Surrogate, textures_of
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D
@@ -96,8 +108,6 @@ def test_a_texel_ranks_by_the_saliency_of_its_pixels(square: Object3D, surrogate
     for name, score in scores.items():
         assert score.shape == (16, 16)
         assert torch.equal(score > 0, read[name] > 0)
-    twice = rank_texels(surrogate, textures_of(square), 2 * maps)
-    torch.testing.assert_close(twice["m0.png"], 2 * scores["m0.png"])
 
 
 def test_the_scores_of_views_add_up(square: Object3D, surrogate: Surrogate) -> None:
@@ -150,3 +160,61 @@ def test_a_share_without_texels_is_refused() -> None:
     for scores in (torch.ones(2, 2), torch.zeros(200, 2)):
         with pytest.raises(SpecError, match="keep more"):
             best_texels({"a": scores}, 0.01)
+
+
+# Few texels
+
+
+BUDGET = Budget(0.3, 0.1)
+
+
+def gradients_of(surrogate: Surrogate) -> torch.Tensor:
+    return torch.rand(surrogate.n_views, *SIZE, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+
+
+def found(
+    obj: Object3D, surrogate: Surrogate, keep: float, *, gradients: torch.Tensor | None = None, **options: Any
+) -> TexelMasks:
+    gradients = gradients_of(surrogate) if gradients is None else gradients
+    asked: dict[str, Any] = {"goal": Goal(LABEL), "budget": BUDGET} | options
+    return few_texels(keep, textures_of(obj), surrogate, fake_classifier(), gradients, **asked).masks
+
+
+def count(masks: TexelMasks) -> int:
+    return sum(int(mask.sum()) for mask in masks.values())
+
+
+def test_the_same_texels_are_found_each_time_and_as_many_as_asked(square: Object3D, surrogate: Surrogate) -> None:
+    once, again = (found(square, surrogate, 0.1) for _ in range(2))
+    assert count(once) == round(0.1 * 2 * 16 * 16)
+    assert all(torch.equal(once[name], again[name]) for name in once)
+
+
+def test_all_texels_are_found_within_the_masks(square: Object3D, surrogate: Surrogate) -> None:
+    upper = painted_texels(square, {"m0.png": mask_image(slice(0, 8), slice(0, 16))})
+    few = found(square, surrogate, 0.1, within=[upper])
+    assert count(few) == round(0.1 * 2 * 16 * 16)
+    assert not few["m0.png"][8:].any()
+
+
+def test_trials_get_an_attack_further_than_a_plain_ranking(square: Object3D, surrogate: Surrogate) -> None:
+    textures, goal = textures_of(square), Goal(LABEL, safe=100.0)
+    blind = best_texels(rank_texels(surrogate, textures, gradients_of(surrogate)), 0.05)
+    losses = []
+    for few in (blind, found(square, surrogate, 0.05)):
+        moving = movable(surrogate, BUDGET, within=[few])
+        state = run(square, surrogate, goal=goal, budget=BUDGET, steps=5, texels=moving)
+        losses.append(mean_loss(square, surrogate, state, goal))
+    assert losses[1] > losses[0]
+
+
+def test_only_masked_pixels_count(square: Object3D, surrogate: Surrogate) -> None:
+    masks = torch.zeros(surrogate.n_views, *SIZE, dtype=torch.bool)
+    masks[:, :, :16] = True
+    loud = gradients_of(surrogate)
+    loud[:, :, 16:] *= 1000
+    one, other = (
+        found(square, surrogate, 0.05, gradients=gradients, masks=masks)
+        for gradients in (gradients_of(surrogate), loud)
+    )
+    assert all(torch.equal(one[name], other[name]) for name in one)

@@ -185,15 +185,14 @@ def test_an_onnx_file_can_be_attacked_by_its_scores(tmp_path: Path) -> None:
     assert cosine(found, torch.from_numpy(weight[:, 1])) > 0.85
 
 
-def test_an_estimate_goes_through_the_surrogate_into_the_texture(square: Object3D, square_surrogate: Surrogate) -> None:
+def test_an_estimate_goes_through_the_surrogate_into_the_texture(square: Object3D, surrogate: Surrogate) -> None:
     network, textures = fake_classifier(), textures_of(square)
 
     def into_texture(classifier: WhiteBoxClassifier) -> Tensor:
         leaves = {name: texture.clone().requires_grad_() for name, texture in textures.items()}
-        texels = square_surrogate.texels(leaves)
+        texels = surrogate.texels(leaves)
         losses = [
-            classifier.logits(square_surrogate.render(texels, batch))[:, 6].sum()
-            for batch in range(len(square_surrogate.batches))
+            classifier.logits(surrogate.render(texels, batch))[:, 6].sum() for batch in range(len(surrogate.batches))
         ]
         return torch.cat([g.flatten() for g in torch.autograd.grad(torch.stack(losses).sum(), list(leaves.values()))])
 
