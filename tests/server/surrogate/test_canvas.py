@@ -1,4 +1,4 @@
-"""The canvas: what views read while some texels move is what they read of the whole textures."""
+"""The canvas: what views read while some texels move is what they read of the whole textures; blocks move together."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,18 +6,23 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
-from trompe_server.surrogate import (
-    Canvas,
-    SamplingModel,
-    Surrogate,
-    diffuse_surrogate,
-    prepare_geometry,
-    pyramid,
-    textures_of,
-)
+from tests.attack_runs import surrogate_of
+from trompe_server.surrogate import Canvas, SamplingModel, Surrogate, joined, prepare_geometry, pyramid, textures_of
 from trompe_server.surrogate import surrogate as surrogate_module
+from trompe_server.surrogate.blocks import (
+    by_block,
+    common_change,
+    halvings,
+    means,
+    most_halvings,
+    repeated,
+    rooms,
+    whole,
+)
 from trompe_server.surrogate.surrogate import Painted
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
@@ -42,7 +47,7 @@ def obj(request: pytest.FixtureRequest, make_object: Make, make_quad: Make) -> O
 
 @pytest.fixture(params=MODELS.values(), ids=list(MODELS))
 def surrogate(request: pytest.FixtureRequest, obj: Object3D) -> Surrogate:
-    return diffuse_surrogate(prepare_geometry(obj, VIEWS, size=(48, 48), sampling=request.param), VIEWS)
+    return surrogate_of(obj, VIEWS, size=(48, 48), sampling=request.param)
 
 
 def some_texels(obj: Object3D, share: float) -> dict[str, Tensor]:
@@ -121,3 +126,134 @@ def test_stored_levels_of_other_hypotheses_are_dropped_beyond_their_bytes(
         geometry = prepare_geometry(obj, VIEWS, size=(48, 48), sampling=sampling)
         torch.testing.assert_close(painted.texels(geometry), geometry.values(textures_of(obj)), atol=1e-6, rtol=0)
         assert len(painted.stored) == 1
+
+
+# Blocks: their means, and how much they may change
+
+COUNTS = st.integers(0, 3)
+SEEDS = st.integers(0, 2**31)
+AFAR = [View(Camera(3.0, 0, 0)), View(Camera(4.0, 40, 30))]
+
+
+def textured(seed: int) -> Tensor:
+    """8-bit colours, black and white among them."""
+    random = np.random.default_rng(seed)
+    return torch.from_numpy(random.integers(-80, 336, (16, 24, 3)).clip(0, 255).astype(np.uint8))
+
+
+def by_hand(table: Tensor, count: int) -> Tensor:
+    return by_block(table.float(), count).mean((1, 3))
+
+
+@given(COUNTS, SEEDS)
+def test_means_and_rooms_are_those_of_the_texels_of_each_block(count: int, seed: int) -> None:
+    texture = textured(seed) / 255
+    bound = torch.rand(16 >> count, 24 >> count, 1, generator=torch.Generator().manual_seed(seed))
+    torch.testing.assert_close(means(texture, count), by_hand(texture, count))
+    down, up = rooms(texture, bound, count)
+    limit = repeated(bound, texture.shape)
+    torch.testing.assert_close(down, by_hand(torch.minimum(texture, limit), count))
+    torch.testing.assert_close(up, by_hand(torch.minimum(1 - texture, limit), count))
+    assert halvings(down.shape, texture.shape) == count
+
+
+@given(COUNTS, SEEDS, st.floats(0.004, 1))
+@settings(max_examples=60)
+def test_a_common_change_has_the_mean_that_was_asked_for_and_stays_within_the_bound(
+    count: int, seed: int, bound: float
+) -> None:
+    texture = textured(seed)
+    down, up = rooms(texture / 255, torch.full((16 >> count, 24 >> count, 1), bound), count)
+    share = torch.rand(down.shape, generator=torch.Generator().manual_seed(seed))
+    share = (1.5 * share - 0.25).clamp(0, 1)  # the ends of the range among them
+    mean = share * up - (1 - share) * down
+    change = common_change(mean, texture)
+    assert change.abs().max() <= bound + 1e-4
+    painted = (texture / 255 + repeated(change, texture.shape)).clamp(0, 1)
+    torch.testing.assert_close(by_hand(painted - texture / 255, count), mean, atol=2e-4, rtol=0)
+
+
+def test_no_change_of_a_mean_changes_no_texel() -> None:
+    assert not common_change(torch.zeros(4, 6, 3), textured(0)).any()
+
+
+def test_a_block_is_whole_if_all_its_texels_are() -> None:
+    mask = torch.zeros(8, 12, dtype=torch.bool)
+    mask[2:8, 3:12] = True
+    assert whole(mask, 1).nonzero().tolist() == [[row, column] for row in (1, 2, 3) for column in (2, 3, 4, 5)]
+    assert whole(mask, 2).nonzero().tolist() == [[1, 1], [1, 2]]
+    assert torch.equal(whole(mask, 0), mask)
+
+
+@pytest.mark.parametrize(
+    ("size", "wanted", "most"), [((64, 32), 9, 5), ((24, 20), 9, 2), ((15, 30), 3, 0), ((1, 1), 4, 0), ((64, 64), 2, 2)]
+)
+def test_blocks_divide_their_texture(size: tuple[int, int], wanted: int, most: int) -> None:
+    assert most_halvings(size, wanted) == most
+
+
+@pytest.fixture
+def fine(make_object: Make, make_quad: Make) -> Object3D:
+    """A square with a texture much finer than the pixels of ``AFAR``, and one with a coarse texture."""
+    image = np.random.default_rng(0).integers(60, 200, (256, 256, 3), dtype=np.uint8)
+    return make_object(make_quad(image), make_quad(image[:8, :8], z=-0.1))  # type: ignore[no-any-return]
+
+
+def of_blocks(obj: Object3D, **sampling: Any) -> Surrogate:
+    return surrogate_of(obj, AFAR, sampling=SamplingModel(cull=False, **sampling))
+
+
+def test_the_mip_levels_that_views_hardly_read_are_spare(fine: Object3D) -> None:
+    surrogate, names = of_blocks(fine), sorted(fine.textures)
+    weights = [0.0] * 9
+    for level, reads in enumerate(surrogate.geometry.reads[:9]):
+        first = sum(map(len, surrogate.geometry.reads[:level]))
+        weights[level] = float(surrogate._read_weights()[first : first + len(reads)].sum())
+    shares = np.cumsum(weights) / sum(weights)
+    spare = surrogate.spare_levels[names[0]]
+    assert spare >= 2
+    assert shares[spare - 1] < 0.05 <= shares[spare]
+    assert joined([surrogate, of_blocks(fine, bias=-2.0)]).spare_levels[names[0]] == spare - 2
+
+
+@pytest.mark.parametrize(
+    ("sampling", "error"),
+    [({}, 1e-6), ({"mips": "rounded"}, 1.01 / 255), ({"filtered": "linear"}, 0.5 / 255)],
+    ids=["encoded", "rounded", "linear"],
+)
+@pytest.mark.parametrize("share", [0.1, 1.0])
+def test_views_read_of_moved_blocks_what_they_read_of_their_moved_texels(
+    fine: Object3D, sampling: dict[str, str], error: float, share: float
+) -> None:
+    surrogate, textures = of_blocks(fine, **sampling), textures_of(fine)
+    generator = torch.Generator().manual_seed(1)
+    moving = {
+        name: torch.rand(surrogate.geometry.layout.sizes[k][min(2, 2 * (1 - k))], generator=generator) < share
+        for k, name in enumerate(surrogate.geometry.textures)
+    }
+    canvas = surrogate.canvas(textures, moving)
+    torch.testing.assert_close(canvas.read(canvas.source), surrogate.texels(textures), atol=1e-6, rtol=0)
+    change = 0.2 * torch.rand(canvas.source.shape, generator=generator) - 0.1
+    tables = dict(zip(surrogate.geometry.textures, canvas.split(change), strict=True))
+    painted = {name: texture + repeated(tables[name], texture.shape) for name, texture in textures.items()}
+    torch.testing.assert_close(canvas.read(canvas.source + change), surrogate.texels(painted), atol=error, rtol=0)
+
+
+@pytest.mark.parametrize("bound", [0.02, 0.05, 0.1])
+def test_the_light_of_blocks_is_that_of_their_texels_as_far_as_these_have_room(fine: Object3D, bound: float) -> None:
+    random = np.random.default_rng(1)
+    images = [random.integers(-200, 456, (256, 256, 3)).clip(0, 255).astype(np.uint8) for _ in range(2)]
+    images[0][:64], images[0][64:128] = 0, 255
+    obj = fine.with_textures(dict(zip(sorted(fine.textures), images, strict=True)))
+    surrogate, textures = of_blocks(obj, filtered="linear"), textures_of(obj)
+    canvas = surrogate.canvas(textures, {name: torch.ones(64, 64, dtype=torch.bool) for name in textures})
+    generator, changes, painted = torch.Generator().manual_seed(2), {}, {}
+    for name, texture in textures.items():
+        down, up = rooms(texture, torch.full((64, 64, 1), bound), 2)
+        changes[name] = torch.where(torch.rand(down.shape, generator=generator) < 0.5, -down, up)
+        common = common_change(changes[name], torch.from_numpy(obj.textures[name]))
+        painted[name] = (texture + repeated(common, texture.shape)).clamp(0, 1)
+    values = canvas.source + canvas.join([changes[name] for name in surrogate.geometry.textures])
+    seen, true = canvas.read(values), surrogate.texels(painted)
+    assert (true - surrogate.texels(textures)).abs().max() > 0.3 * bound
+    torch.testing.assert_close(seen, true, atol=0.002, rtol=0)

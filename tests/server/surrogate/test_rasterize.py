@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from random import Random
 
 import numpy as np
 import pytest
@@ -254,16 +253,6 @@ def test_of_two_sheets_in_one_plane_the_first_is_seen_however_they_are_cut_into_
     sheets = mesh_from(square[[[0, 1, 2], [0, 2, 3], [1, 2, 3], [1, 3, 0]]])
     seen = seen_faces(sheets, camera, size=(128, 128))
     assert (seen[seen >= 0] < 2).mean() > 0.95
-
-
-@given(triangle_soups(), CAMERAS, st.randoms(use_true_random=False))
-@settings(max_examples=40)
-def test_the_order_of_the_triangles_does_not_matter(soup: Floats, camera: Camera, random: Random) -> None:
-    order = list(range(len(soup)))
-    random.shuffle(order)
-    _, certain = expected_faces(soup, camera, CENTRE, cull=False)
-    straight, shuffled = seen_faces(mesh_from(soup), camera), seen_faces(mesh_from(soup[order]), camera)
-    assert (np.array([*order, -1])[shuffled] == straight)[certain].all()
 
 
 @pytest.mark.parametrize(("candidates", "faces"), [(1, 2**14), (7, 1), (100, 1000)])

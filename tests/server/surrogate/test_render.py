@@ -14,15 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from tests.attack_runs import surrogate_of
 from tests.fakes import FakeTarget
 from trompe_server.renderers import SailenvTarget, TargetRenderer
-from trompe_server.surrogate import (
-    SamplingModel,
-    Surrogate,
-    diffuse_surrogate,
-    prepare_geometry,
-    textures_of,
-)
+from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
 from trompe_server.surrogate.calibration import (
     CALIBRATED_GREYS,
     CURVE_GREYS,
@@ -55,10 +50,6 @@ def measured(
     model = "calibrated" if len(greys) == 2 else "curve"
     calibration = Calibration(model, "", SamplingModel(), tuple(greys), probes, Fidelity((), (), (), ()), 0)
     return build_surrogate(calibration, obj, views, clean), clean
-
-
-def diffuse(obj: Object3D, model: SamplingModel, views: Sequence[View] = VIEWS) -> Surrogate:
-    return diffuse_surrogate(prepare_geometry(obj, views, size=SIZE, sampling=model), views)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +104,7 @@ def check_gradient(surrogate: Surrogate, obj: Object3D, *, tolerance: float) -> 
 def test_the_gradient_of_the_diffuse_surrogate_is_that_of_finite_differences(
     mug: Object3D, model: SamplingModel
 ) -> None:
-    check_gradient(diffuse(mug, model), mug, tolerance=0.01)
+    check_gradient(surrogate_of(mug, VIEWS, sampling=model, size=SIZE), mug, tolerance=0.01)
 
 
 def test_the_gradient_of_a_measured_surrogate_is_that_of_finite_differences(mug: Object3D, curved: Surrogate) -> None:
@@ -240,7 +231,7 @@ MANY = [View(Camera(0.16 + 0.002 * k, 30.0 * k, 5.0 * k - 25), background=(20 * 
 
 
 def test_views_are_rendered_in_successive_batches(mug: Object3D) -> None:
-    surrogate = diffuse(mug, SamplingModel(), MANY)
+    surrogate = surrogate_of(mug, MANY, size=SIZE)
     assert surrogate.batches == (range(BATCH), range(BATCH, 12))
     texels = surrogate.texels(textures_of(mug))
     images = [surrogate.render(texels, k) for k in range(2)]
@@ -253,7 +244,7 @@ def test_the_order_of_the_views_changes_neither_images_nor_gradient(mug: Object3
     order = [11, 3, 0, 7, 1, 9, 2, 10, 4, 8, 5, 6]
     weights = torch.randn(len(MANY), 3, *SIZE, generator=torch.Generator().manual_seed(0))
     masks = weights[:, 0] > 0
-    one, other = diffuse(mug, SamplingModel(), MANY), diffuse(mug, SamplingModel(), [MANY[k] for k in order])
+    one, other = (surrogate_of(mug, views, size=SIZE) for views in (MANY, [MANY[k] for k in order]))
     torch.testing.assert_close(
         images_of(one, textures_of(mug))[order], images_of(other, textures_of(mug)), atol=1e-6, rtol=0
     )
@@ -285,7 +276,7 @@ def test_influence_sums_to_the_pixels_that_read(mug: Object3D, curved: Surrogate
 def test_a_texture_that_no_view_sees_has_no_influence_and_changes_no_image(make_object: Make, make_quad: Make) -> None:
     half = np.full((8, 8, 3), 128, np.uint8)
     obj, views = make_object(make_quad(half), make_quad(half, z=5.0)), [View(Camera(0.5, 0, 0))]
-    surrogate = diffuse_surrogate(prepare_geometry(obj, views, size=SIZE, sampling=SamplingModel()), views)
+    surrogate = surrogate_of(obj, views, size=SIZE)
     assert (surrogate.influence()["m1.png"] == 0).all()
     before, hidden, seen = (
         images_of(surrogate, textures_of(obj.with_textures(new)))
@@ -317,7 +308,7 @@ def test_a_prediction_that_is_rounded_to_what_the_target_shows_is_believed_as_it
 
 
 def test_the_diffuse_surrogate_shows_each_views_own_background(mug: Object3D) -> None:
-    images = images_of(diffuse(mug, SamplingModel()), textures_of(mug)) * 255
+    images = images_of(surrogate_of(mug, VIEWS, size=SIZE), textures_of(mug)) * 255
     assert images[0, :, 0, 0].tolist() == [255, 255, 255]
     torch.testing.assert_close(images[1, :, 0, 0], torch.tensor([10.0, 20, 30]))
 
@@ -326,7 +317,7 @@ def test_images_are_colours(mug: Object3D, curved: Surrogate) -> None:
     wild = {
         name: torch.rand(t.shape, generator=torch.Generator().manual_seed(0)) for name, t in textures_of(mug).items()
     }
-    for surrogate in (curved, diffuse(mug, SamplingModel())):
+    for surrogate in (curved, surrogate_of(mug, VIEWS, size=SIZE)):
         images = images_of(surrogate, wild)
         assert images.min() >= 0
         assert images.max() <= 1
