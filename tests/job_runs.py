@@ -115,6 +115,30 @@ class DarkTarget(FakeTarget):
         return images
 
 
+Asked = tuple[Object3D, tuple[View, ...]]
+
+
+class Recorder(FakeTarget):
+    """Records the views of each request, and shows noise on some views."""
+
+    def __init__(self, noisy: Sequence[View] = ()) -> None:
+        super().__init__()
+        self.asked, self.noisy = list[Asked](), set(noisy)
+
+    @property
+    def images(self) -> int:
+        """Number of images so far."""
+        return sum(len(views) for _, views in self.asked)
+
+    def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> NDArray[np.uint8]:
+        self.asked.append((obj, tuple(views)))
+        images = super().render(obj, views, **options)
+        for image, view in zip(images, views, strict=True):
+            if view in self.noisy:
+                image[:] = np.random.default_rng(0).integers(0, 256, image.shape)
+        return images
+
+
 def setup_of(library: Library, **options: Any) -> JobSetup:
     return open_setup(spec_of(**options), library=library, target=FakeTarget())
 

@@ -1,19 +1,16 @@
 """A growing pool: which views an attack adds, and that it survives interruption."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from tests.fakes import FakeTarget
-from tests.job_runs import MemoryArtifacts, Run, opened, run_job, setup_of, spec_of
+from tests.job_runs import Asked, MemoryArtifacts, Recorder, Run, opened, run_job, setup_of, spec_of
 from trompe_server.job.protocol import DamagedFileError
 from trompe_server.judging.metrics import recognised
 from trompe_server.library import Library
-from trompe_shared.geometry import View
-from trompe_shared.object3d import Object3D
 
 pytestmark = pytest.mark.usefixtures("few_first_views")
 
@@ -28,25 +25,6 @@ def few_first_views() -> Iterator[None]:
         patch.setattr("trompe_server.job.pool.LOOKS", (5, 10))
         patch.setattr("trompe_server.job.report.picture_files", lambda _: {})
         yield
-
-
-Asked = tuple[Object3D, tuple[View, ...]]
-
-
-class Recorder(FakeTarget):
-    """Records the views of each request, and shows noise on some views."""
-
-    def __init__(self, noisy: Sequence[View] = ()) -> None:
-        super().__init__()
-        self.asked, self.noisy = list[Asked](), set(noisy)
-
-    def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> NDArray[np.uint8]:
-        self.asked.append((obj, tuple(views)))
-        images = super().render(obj, views, **options)
-        for image, view in zip(images, views, strict=True):
-            if view in self.noisy:
-                image[:] = np.random.default_rng(0).integers(0, 256, image.shape)
-        return images
 
 
 @pytest.fixture(scope="module")
@@ -102,13 +80,19 @@ def test_an_attack_that_loses_few_of_the_further_views_adds_none(
 
 
 @pytest.mark.parametrize(
-    "surrogate", ["calibrated", *(pytest.param(each, marks=pytest.mark.thorough) for each in ("diffuse", "curve"))]
+    "options",
+    [
+        {},
+        pytest.param({"surrogate": "diffuse"}, marks=pytest.mark.thorough),
+        pytest.param({"surrogate": "curve", "background": ["white", "black", "#808080"]}, marks=pytest.mark.thorough),
+    ],
+    ids=str,
 )
 def test_a_pool_grows_to_the_same_bytes_after_interruption(
-    library: Library, hard: tuple[Run, dict[str, list[Asked]]], surrogate: str
+    library: Library, hard: tuple[Run, dict[str, list[Asked]]], options: dict[str, Any]
 ) -> None:
-    spec = spec_of(**HARD | {"surrogate": surrogate})
-    once = hard[0] if surrogate == "calibrated" else run_job(spec, library)
+    spec = spec_of(**HARD | options)
+    once = run_job(spec, library) if options else hard[0]
     anew = run_job(spec, library, new=True, times=2)
     assert once.result.attacked_views > 4
     assert anew.artifacts.lasting() == once.artifacts.lasting()
@@ -147,11 +131,3 @@ def test_a_damaged_look_is_taken_anew(library: Library, hard: tuple[Run, dict[st
 def test_attacks_whose_choice_rests_on_all_views_start_with_all(library: Library, options: dict[str, Any]) -> None:
     setup = setup_of(library, **HARD | options)
     assert (len(setup.views), setup.further) == (options.get("pool", 16), ())
-
-
-@pytest.mark.thorough
-def test_backgrounds_of_added_views_are_drawn_too(library: Library) -> None:
-    spec = spec_of(**HARD, background=["white", "black", "#808080"])
-    once, anew = run_job(spec, library), run_job(spec, library, new=True)
-    assert once.result.attacked_views > 4
-    assert anew.artifacts.lasting() == once.artifacts.lasting()

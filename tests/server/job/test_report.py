@@ -22,12 +22,11 @@ from trompe_server.job.files import Spent
 from trompe_server.job.report import ReportData, pictures
 from trompe_server.job.report.models import model_files
 from trompe_server.job.report.warnings import _stronger, _wider
-from trompe_server.judging.metrics import accuracy, reach_warning
 from trompe_server.library import Library
 from trompe_server.pictures import Verdict
 from trompe_server.renderers import SailenvTarget
 from trompe_server.storage.folders import checked
-from trompe_shared.api import JobSpec, in_flags
+from trompe_shared.api import JobSpec
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, load_object, pack_zip
 from trompe_shared.shipped import shipped_objects
@@ -148,7 +147,9 @@ def test_the_report_lists_what_the_object_became_and_both_drops(
 
 
 @without_pictures
-def test_a_judge_knows_the_label_by_its_name(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_judge_classifies_the_same_images_and_knows_the_label_by_its_name(
+    library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tiny = load_classifier("tiny")
     assert isinstance(tiny, NetworkClassifier)
     turned = replace(tiny, name="turned", classes=(tiny.classes or ())[::-1], network=Turned(tiny.network))
@@ -156,7 +157,9 @@ def test_a_judge_knows_the_label_by_its_name(library: Library, monkeypatch: pyte
         "trompe_server.job.setup._stored_classifier", lambda name, **_: turned if name == "turned" else tiny
     )
     result = run_job(spec_of(judges=["turned"]), library).result
-    assert result.judges[0].target.a_before == result.target.a_before > 0
+    (judge,) = result.judges
+    assert (judge.classifier, judge.target, judge.held_out) == ("turned", result.target, result.held_out)
+    assert result.target.a_before > 0
 
 
 class Turned(nn.Module):
@@ -245,16 +248,6 @@ def test_more_views_are_advised_by_options_that_fit_the_job(options: dict[str, A
 )
 def test_a_stronger_attack_is_advised_by_the_options_that_limited_it(options: dict[str, Any], advice: str) -> None:
     assert _stronger(data_of(**options)) == advice
-
-
-def test_a_grid_is_advised_random_views_in_its_place(library: Library) -> None:
-    own, held_out = (accuracy(logits([True] * 10), logits([k < kept for k in range(10)]), 0) for kept in (0, 5))
-    warned = reach_warning(own, held_out, stronger="", wider=_wider(data_of(grid=True)))
-    assert in_flags(warned or "").endswith("Attack random views instead: leave out --grid.")
-
-
-def logits(right: Sequence[bool]) -> NDArray[np.float32]:
-    return np.array([[1, 0] if each else [0, 1] for each in right], np.float32)
 
 
 def test_the_contact_sheet_shows_recognised_views_alone_and_tells_their_number(

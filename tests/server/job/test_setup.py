@@ -64,8 +64,6 @@ def test_a_background_can_be_a_colour(library: Library, background: str, colour:
         pytest.param({"classifier": "resnet"}, NotFoundError, "resnet.*tiny", id="classifier"),
         pytest.param({"judges": ["resnet"]}, NotFoundError, "resnet", id="judge"),
         pytest.param({"label": "chairs"}, LabelError, "did you mean 'chair'", id="label"),
-        pytest.param({"label": 8}, LabelError, r"0\.\.7", id="index"),
-        pytest.param({"label": ["chair", 3]}, SpecError, "'chair' and 3 are the same class, 3", id="label twice"),
         pytest.param({"keep": 9e-7}, SpecError, r"`keep: 9e-07` .* 32768 texels .* keep 3e-05 or more", id="keep"),
         pytest.param({"queries": 4}, SpecError, "'tiny' gives them: leave it out", id="queries"),
         *(

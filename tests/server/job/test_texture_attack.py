@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tests.fakes import FakeTarget
-from tests.job_runs import CHAIR, DarkTarget, MemoryArtifacts, Run, opened, run_job, setup_of, spec_of
+from tests.job_runs import CHAIR, DarkTarget, MemoryArtifacts, Recorder, Run, opened, run_job, setup_of, spec_of
 from trompe_server.attack import Budget, Goal, attack, load_state, saliency_masks, start
 from trompe_server.classifiers import NetworkClassifier
 from trompe_server.job.protocol import DamagedFileError
@@ -40,18 +40,6 @@ PICTURES = {
 MODELS = {"chair-adversarial.zip", "chair-adversarial.glb"}
 IMAGES = {"views_before.npz", "views_after.npz"}
 Image8 = NDArray[np.uint8]
-
-
-class CountingTarget(FakeTarget):
-    """Counts its images."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.images = 0
-
-    def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
-        self.images += len(views)
-        return super().render(obj, views, **options)
 
 
 @pytest.fixture(scope="module")
@@ -171,20 +159,30 @@ def test_each_phase_can_run_in_another_process_and_twice(finished: Run, library:
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_an_attack_with_all_views_safely_won_takes_no_further_steps(
+def test_an_attack_with_all_views_safely_won_takes_no_further_steps_and_goes_on_with_the_judgement(
     library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trompe_server.attack.search.SAFE_ENOUGH", 1.1)
-    easy = spec_of(epsilon=0.5, alpha=0.1, steps=30)
+    easy = spec_of(epsilon=0.5, alpha=0.1, steps=90)
     once, anew = run_job(easy, library), run_job(easy, library, new=True)
+    *_, last, judge = once.reports
+    assert (judge, once.reports[last].then) == ("judge", "judge")
+    assert len(once.reports) < len(opened(easy, library, once.artifacts).phases())
     result = once.result
-    assert result.spec.search.steps == 30
-    assert 2 < result.steps < 30
+    assert result.spec.search.steps == 90
+    assert 2 < result.steps < 90
     assert once.counts()["attack_steps"] == result.steps
     assert result.target.a_after == 0
     taken = [progress.step for progress in once.progress if progress.step is not None]
     assert taken == list(range(1, result.steps + 1))
     assert anew.artifacts.lasting() == once.artifacts.lasting()
+    end = once.artifacts.files["state-end.npz"]
+    once.artifacts.files["state-end.npz"] = end[:-40]
+    for phase in ("judge", "attack-017"):
+        with pytest.raises(DamagedFileError):
+            opened(easy, library, once.artifacts).run(phase, lambda _: None)
+    opened(easy, library, once.artifacts).run(last, lambda _: None)
+    assert once.artifacts.files["state-end.npz"] == end
 
 
 @pytest.fixture(scope="module")
@@ -203,8 +201,11 @@ def test_options_of_the_search_change_the_texture_and_survive_interruption(
     assert once.reports["judge"].state is JobState.succeeded
     assert once.result.steps == 6
     assert once.artifacts.files["chair-adversarial.zip"] != six_steps.artifacts.files["chair-adversarial.zip"]
-    assert once.result.texels_altered is not None
-    assert once.result.texels_altered <= options.get("keep", 1.0) + 1e-6
+    moved, all_moved = once.result.texels_altered, six_steps.result.texels_altered
+    assert moved is not None
+    assert all_moved is not None
+    assert 0 < moved <= options.get("keep", 1.0) + 1e-6
+    assert "keep" not in options or all_moved > 0.03
     assert once.artifacts.files["saliency.npz"] == six_steps.artifacts.files["saliency.npz"]
 
 
@@ -261,26 +262,9 @@ def test_all_images_shown_by_the_search_are_counted(
     assert run.counts()["classifier_images"] == run.counts("attack")["classifier_images"]
 
 
-@pytest.mark.usefixtures("no_pictures")
-def test_an_attack_that_has_won_all_views_goes_on_with_the_judgement(library: Library) -> None:
-    easy = spec_of(epsilon=0.5, alpha=0.1, steps=90)
-    run = run_job(easy, library)
-    *_, last, judge = run.reports
-    assert (judge, run.reports[last].then) == ("judge", "judge")
-    assert len(run.reports) < len(opened(easy, library, run.artifacts).phases())
-    assert run.result.target.a_after == 0
-    end = run.artifacts.files["state-end.npz"]
-    run.artifacts.files["state-end.npz"] = end[:-40]
-    for phase in ("judge", "attack-017"):
-        with pytest.raises(DamagedFileError):
-            opened(easy, library, run.artifacts).run(phase, lambda _: None)
-    opened(easy, library, run.artifacts).run(last, lambda _: None)
-    assert run.artifacts.files["state-end.npz"] == end
-
-
 @pytest.mark.usefixtures("no_pictures", "measured_tone")
 def test_a_second_job_on_the_same_object_and_views_renders_no_probe(library: Library) -> None:
-    one, other = CountingTarget(), CountingTarget()
+    one, other = Recorder(), Recorder()
     spec = {"surrogate": "calibrated", "steps": 1}
     first = run_job(spec_of(**spec), library, target=one)
     second = run_job(spec_of(**spec, epsilon=0.05, alpha=0.01), library, target=other, known=True)
@@ -392,15 +376,6 @@ def test_a_job_with_one_view_and_no_held_out_ones_works_too(library: Library) ->
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_a_higher_threshold_alters_fewer_texels(library: Library) -> None:
-    altered = [run_job(spec_of(tau=tau), library).result.texels_altered for tau in (None, 0.05, 0.2)]
-    shares = [share for share in altered if share is not None]
-    assert len(set(shares)) == 3
-    assert shares == sorted(shares, reverse=True)
-    assert shares[-1] > 0
-
-
-@pytest.mark.usefixtures("no_pictures")
 def test_the_threshold_stops_the_gradient_of_less_salient_pixels(library: Library) -> None:
     spec = spec_of(tau=0.2)
     artifacts, setup = run_job(spec, library, until="attack-000").artifacts, setup_of(library, tau=0.2)
@@ -422,29 +397,6 @@ def test_the_threshold_stops_the_gradient_of_less_salient_pixels(library: Librar
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_judges_classify_the_same_images(library: Library) -> None:
-    result = run_job(spec_of(judges=["tiny"]), library).result
-    (judge,) = result.judges
-    assert (judge.classifier, judge.target, judge.held_out) == ("tiny", result.target, result.held_out)
-
-
-class Liar(FakeTarget):
-    """A target that shows noise in held-out views, and in all views while ``judging``."""
-
-    def __init__(self, own: Sequence[View]) -> None:
-        super().__init__()
-        self.own, self.judging = set(own), False
-
-    def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
-        images = super().render(obj, views, **options)
-        noise = np.random.default_rng(0)
-        for image, view in zip(images, views, strict=True):
-            if self.judging or view not in self.own:
-                image[:] = noise.integers(0, 256, image.shape)
-        return images
-
-
-@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize(
     "options",
     [
@@ -461,10 +413,11 @@ def test_the_images_of_the_judgement_cannot_influence_the_texture(library: Libra
     spec = spec_of(**options)
     honest = run_job(spec, library).artifacts
     library.calibrations.delete_all()
-    target, artifacts = Liar(setup_of(library, **options).views), MemoryArtifacts()
+    setup, artifacts = setup_of(library, **options), MemoryArtifacts()
+    target = Recorder(setup.held_out)
     job = opened(spec, library, artifacts, target=target)
     for phase in job.phases():
-        target.judging = phase not in {"prepare", "calibrate"}
+        target.noisy |= set() if phase in {"prepare", "calibrate"} else {*setup.views}
         job.run(phase, lambda _: None)
     assert artifacts.files["chair-adversarial.zip"] == honest.files["chair-adversarial.zip"]
     assert artifacts.result().target.a_after != honest.result().target.a_after or honest.result().target.a_after == 0

@@ -2,15 +2,13 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from tests.fakes import FAKE, FakeTarget
+from tests.job_runs import Recorder
 from trompe_server.job.protocol import OnProgress
 from trompe_server.judgement.judge_files import judge_files
 from trompe_server.judgement.manifest import Judged
@@ -19,26 +17,14 @@ from trompe_server.renderers import TargetRenderer
 from trompe_server.storage.folders import LocalArtifacts
 from trompe_shared.api import JudgementSpec
 from trompe_shared.errors import RendererError
-from trompe_shared.object3d import Object3D, load_object
+from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
 
-@dataclass(frozen=True)
-class CountingTarget(FakeTarget):
-    """A fake renderer that counts its images."""
-
-    points: int = 20_000
-    rendered: list[int] = field(default_factory=list)
-
-    def render(self, obj: Object3D, views: Any, **options: Any) -> NDArray[np.uint8]:
-        self.rendered.append(len(views))
-        return super().render(obj, views, **options)
-
-
 @pytest.fixture
-def fake_renderer(monkeypatch: pytest.MonkeyPatch) -> CountingTarget:
+def fake_renderer(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     """The renderer of the name ``fake``; there is no other."""
-    target = CountingTarget(engine=FAKE)
+    target = Recorder()
 
     @contextmanager
     def running(_sources: LocalSources, name: str) -> Iterator[TargetRenderer]:
@@ -64,9 +50,9 @@ Judge = Callable[..., Judged]
 
 
 @pytest.fixture
-def judge(fake_renderer: CountingTarget, tmp_path: Path) -> Judge:
+def judge(fake_renderer: Recorder, tmp_path: Path) -> Judge:
     """Judges the mug against another file."""
-    assert fake_renderer.rendered == []
+    assert fake_renderer.asked == []
 
     def run(after: Path, *, on_progress: OnProgress = lambda _: None, **options: Any) -> Judged:
         kept = LocalArtifacts(tmp_path / "kept")

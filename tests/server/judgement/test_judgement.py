@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.job_runs import run_job
-from tests.server.judgement.conftest import CountingTarget, Judge, spec_of
+from tests.job_runs import Recorder, run_job
+from tests.server.judgement.conftest import Judge, spec_of
 from trompe_server.image_pipelines import SUITE
 from trompe_server.judgement.judge_files import judge_files
 from trompe_server.judgement.manifest import manifest_of
@@ -156,7 +156,7 @@ class StoppedError(Exception):
 
 
 def test_a_stopped_judgement_goes_on_to_the_same_figures(
-    judge: Judge, dark: Path, fake_renderer: CountingTarget, tmp_path: Path
+    judge: Judge, dark: Path, fake_renderer: Recorder, tmp_path: Path
 ) -> None:
     def stop(progress: Progress) -> None:
         if progress.fraction > 0.5:
@@ -164,10 +164,10 @@ def test_a_stopped_judgement_goes_on_to_the_same_figures(
 
     with pytest.raises(StoppedError):
         judge(dark, on_progress=stop)
-    rendered = len(fake_renderer.rendered)
+    rendered = len(fake_renderer.asked)
     assert rendered == 2
     resumed = manifest_of(judge(dark), seconds=1.0)
-    assert len(fake_renderer.rendered) == rendered
+    assert len(fake_renderer.asked) == rendered
     assert any((tmp_path / "kept").iterdir())
     for file in (tmp_path / "kept").iterdir():
         file.write_bytes(b"damaged")
