@@ -1,5 +1,7 @@
-"""Networks of timm, RobustBench and the Hugging Face hub by name, on random weights in caches made here."""
+"""Networks of torchvision, timm, RobustBench and the Hugging Face hub by name: their own size and normalisation, and
+never random weights but those that are put into caches here."""
 
+import importlib
 import json
 import os
 import sys
@@ -11,12 +13,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from torch import nn
+from torch import Tensor, nn
 
-from tests.torchvision_here import import_torchvision
 from trompe_server import attack_object
 from trompe_server.attack import Budget, ViewDistribution
 from trompe_server.classifiers import NetworkClassifier, classifier_file, load_classifier
+from trompe_server.classifiers.fold import Formatted
 from trompe_server.classifiers.registry import ZOOS
 from trompe_server.classifiers.timm_networks import load_timm
 from trompe_server.renderers import SailenvTarget
@@ -31,6 +33,68 @@ TAGS: Final = {
     "vit_tiny_patch16_384": "vit_tiny_patch16_384.augreg_in21k_ft_in1k",
 }
 """Networks of timm and their repositories."""
+IMAGENET: Final = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+"""Mean and standard deviation."""
+
+
+def import_torchvision() -> Any:
+    """torchvision's networks. Where torchvision was built for another torch its compiled operators are missing; no
+    classification network uses one, so names for those that it looks for while it is imported are enough."""
+    try:
+        return importlib.import_module("torchvision.models")
+    except ImportError:
+        pytest.skip("torchvision is not installed")
+    except RuntimeError:
+        for name in ("nms", "qnms"):
+            schema = "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor"
+            torch.library.define(f"torchvision::{name}", schema)
+        return importlib.import_module("torchvision.models")
+
+
+def random_images(side: int, count: int = 1) -> Tensor:
+    return torch.rand((count, 3, side, side), generator=torch.Generator().manual_seed(1))
+
+
+def of_normalised(network: Callable[[Tensor], Tensor], images: Tensor, mean: Any, std: Any) -> Tensor:
+    """What a network says of images in [0, 1] that it wants normalised."""
+    with torch.no_grad():
+        return network((images - torch.tensor(mean).reshape(3, 1, 1)) / torch.tensor(std).reshape(3, 1, 1))
+
+
+@pytest.fixture
+def models() -> Any:
+    return import_torchvision()
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder in place of torch's cache of weights."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    (tmp_path / "hub" / "checkpoints").mkdir(parents=True)
+    return tmp_path / "hub" / "checkpoints"
+
+
+def real(models: Any, name: str, **options: Any) -> nn.Module:
+    """The real architecture with random weights, its batch norms as if they had seen data."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network: nn.Module = models.get_model(name, weights=None, **options).eval()
+        for module in network.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.running_mean = 0.1 * torch.randn(module.num_features)
+                module.running_var = torch.rand(module.num_features) + 0.5
+    return network
+
+
+def saved(network: nn.Module, path: Path) -> Path:
+    torch.save(network.state_dict(), path)
+    return path
+
+
+def white_box(*arguments: Any, **options: Any) -> NetworkClassifier:
+    classifier = load_classifier(*arguments, **options)
+    assert isinstance(classifier, NetworkClassifier)
+    return classifier
 
 
 @pytest.fixture
@@ -52,8 +116,7 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path
 
 
 @pytest.fixture
-def timm() -> Any:
-    import_torchvision()
+def timm(models: Any) -> Any:
     return pytest.importorskip("timm")
 
 
@@ -71,6 +134,98 @@ def stored(timm: Any, hub: Callable[[str], Path]) -> Callable[..., nn.Module]:
         return network
 
     return store
+
+
+# torchvision
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "size"),
+    [
+        pytest.param("mobilenet_v2", {}, 224, id="mobilenet_v2"),
+        pytest.param("inception_v3", {"init_weights": False, "transform_input": True}, 299, id="inception_v3"),
+    ],
+)
+def test_a_torchvision_network_has_its_own_size_classes_and_normalisation(
+    name: str, options: dict[str, Any], size: int, models: Any, tmp_path: Path
+) -> None:
+    network = real(models, name, **options)
+    classifier = white_box(f"torchvision:{name}", weights=saved(network, tmp_path / "weights.pth"))
+    assert (classifier.name, classifier.image_size, classifier.n_classes) == (name, (size, size), 1000)
+    assert classifier.classes is not None
+    assert classifier.classes[0] == "tench"
+    image = np.random.default_rng(0).integers(0, 256, (1, size, size, 3), np.uint8)
+    its = models.get_model_weights(name).DEFAULT.transforms()
+    expected = of_normalised(network, torch.from_numpy(image).permute(0, 3, 1, 2) / 255, its.mean, its.std)
+    scale = float(expected.abs().max())
+    np.testing.assert_allclose(classifier.predict(image) / scale, expected / scale, atol=1e-4)
+    assert isinstance(classifier.network, Formatted), "it was not made faster"
+
+
+def test_weights_are_found_in_torchs_cache(models: Any, cache: Path) -> None:
+    network = real(models, "squeezenet1_1")
+    saved(network, cache / "squeezenet1_1-b8a52dc0.pth")
+    for classifier in (
+        white_box("squeezenet1_1"),
+        white_box("torchvision:squeezenet1_1", weights="IMAGENET1K_V1", name="mine"),
+    ):
+        images = random_images(224)
+        expected = of_normalised(network, images, *IMAGENET)
+        torch.testing.assert_close(classifier.logits(images), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_weights_that_are_nowhere_are_not_made_up(models: Any, cache: Path, tmp_path: Path) -> None:
+    with pytest.raises(ClassifierError, match=r"no file '.*mobilenet_v2-7ebf99e0.pth'.*nothing is downloaded"):
+        load_classifier("mobilenet_v2")
+    with pytest.raises(ClassifierError, match="one of IMAGENET1K_V1, IMAGENET1K_V2"):
+        load_classifier("mobilenet_v2", weights=tmp_path / "absent.pth")
+
+
+def test_a_network_of_other_classes_is_read_with_their_names(models: Any, tmp_path: Path) -> None:
+    file = saved(real(models, "squeezenet1_1", num_classes=3), tmp_path / "own.pth")
+    classifier = white_box("squeezenet1_1", weights=file, classes=["mug", "ball", "lamp"])
+    assert (classifier.n_classes, classifier.classes) == (3, ("mug", "ball", "lamp"))
+    with pytest.raises(ClassifierError, match=r"'own.pth' do not fit torchvision's 'squeezenet1_1' with 1000 classes"):
+        load_classifier("squeezenet1_1", weights=file)
+
+
+def test_weights_are_read_as_tensors_alone(models: Any, tmp_path: Path) -> None:
+    file = tmp_path / "whole.pth"
+    torch.save(real(models, "squeezenet1_1"), file)
+    with pytest.raises(ClassifierError, match="expected a state dict of tensors alone"):
+        load_classifier("squeezenet1_1", weights=file)
+    torch.save({"epoch": 3}, file)
+    with pytest.raises(ClassifierError, match="contains no state dict"):
+        load_classifier("squeezenet1_1", weights=file)
+
+
+def test_a_name_that_torchvision_does_not_have_is_answered_with_some_that_it_has(models: Any) -> None:
+    with pytest.raises(ClassifierError, match=r"no classification network 'mobilnet_v2'.*mobilenet_v2"):
+        load_classifier("torchvision:mobilnet_v2")
+    with pytest.raises(ClassifierError, match="no classification network 'fasterrcnn_resnet50_fpn'"):
+        load_classifier("torchvision:fasterrcnn_resnet50_fpn")
+
+
+def test_without_torchvision_a_name_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torchvision.models", None)
+    for name in ("mobilenet_v2", "torchvision:mobilenet_v2"):
+        with pytest.raises(ClassifierError, match=r"torchvision is not installed.*'vision' extra"):
+            load_classifier(name)
+    with pytest.raises(ClassifierError, match="Or give 'tiny'"):
+        load_classifier("mobilenet_v2")
+
+
+def test_a_torchvision_for_another_torch_is_told_from_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "torchvision").mkdir()
+    (tmp_path / "torchvision" / "__init__.py").write_text("raise RuntimeError('operator torchvision::nms is missing')")
+    for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ClassifierError, match=r"another build of torch than .*torchvision::nms is missing"):
+        load_classifier("mobilenet_v2")
+
+
+# Libraries with a prefix
 
 
 def test_every_prefix_has_a_loader() -> None:
@@ -96,16 +251,12 @@ def test_images_are_normalised_as_timm_does(name: str, timm: Any, stored: Callab
 def test_a_network_of_timm_has_its_own_size_and_the_classes_of_imagenet(
     name: str, side: int, timm: Any, stored: Callable[..., nn.Module]
 ) -> None:
-    network, classifier = stored(name), load_classifier(f"timm:{name}")
-    assert isinstance(classifier, NetworkClassifier)
+    network, classifier = stored(name), white_box(f"timm:{name}")
     assert (classifier.name, classifier.image_size, classifier.n_classes) == (name, (side, side), 1000)
     assert classifier.classes is not None
     assert classifier.classes[999] == "toilet tissue, toilet paper, bathroom tissue"
-    images = torch.rand((1, 3, side, side), generator=torch.Generator().manual_seed(1))
-    config = timm.data.resolve_model_data_config(network)
-    mean, std = (torch.tensor(config[key]).reshape(3, 1, 1) for key in ("mean", "std"))
-    with torch.no_grad():
-        expected = network((images - mean) / std)
+    images, config = random_images(side), timm.data.resolve_model_data_config(network)
+    expected = of_normalised(network, images, config["mean"], config["std"])
     largest = max(1.0, float(expected.abs().max()))  # 1e8 for a deep network with random weights
     torch.testing.assert_close(classifier.scores(images), expected, atol=1e-4 * largest, rtol=1e-3)
     assert classifier_file(f"timm:{name}").name == "model.safetensors"
@@ -151,8 +302,7 @@ def test_a_vision_transformer_by_name_is_attacked_end_to_end(
     stored: Callable[..., nn.Module], mug: Object3D, target: SailenvTarget
 ) -> None:
     stored("vit_tiny_patch16_224")
-    network = load_classifier("timm:vit_tiny_patch16_224")
-    assert isinstance(network, NetworkClassifier)
+    network = white_box("timm:vit_tiny_patch16_224")
     views = ViewDistribution(distance=0.3, elevation=(10, 50)).sample(3, generator=np.random.default_rng(0))
     label = int(network.predict(target.render(mug, views[:1], size=network.image_size)).argmax())
     attacked = attack_object(
@@ -183,13 +333,9 @@ def test_a_repository_of_transformers_is_a_white_box(hub: Callable[[str], Path])
     network.save_pretrained(folder)
     its = {"do_normalize": True, "image_mean": [0.5, 0.4, 0.3], "image_std": [0.5, 0.6, 0.7]}
     (folder / "preprocessor_config.json").write_text(json.dumps(its | {"size": {"height": 32, "width": 32}}))
-    classifier = load_classifier("hf:org/model")
-    assert isinstance(classifier, NetworkClassifier)
+    classifier, images = white_box("hf:org/model"), random_images(32, 2)
     assert (classifier.image_size, classifier.classes) == ((32, 32), tuple(labels.values()))
-    images = torch.rand((2, 3, 32, 32), generator=torch.Generator().manual_seed(1))
-    mean, std = (torch.tensor(its[key]).reshape(3, 1, 1) for key in ("image_mean", "image_std"))
-    with torch.no_grad():
-        expected = network((images - mean) / std).logits
+    expected = of_normalised(lambda x: network(x).logits, images, its["image_mean"], its["image_std"])
     torch.testing.assert_close(classifier.scores(images), expected, atol=1e-5, rtol=1e-4)
     assert classifier_file("hf:org/model") == folder / "model.safetensors"
 
@@ -219,23 +365,18 @@ def test_settings_of_images_that_cannot_be_read_are_refused(
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_network_of_robustbench_contains_its_normalisation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    models = import_torchvision()
+@pytest.mark.usefixtures("cache")
+def test_a_network_of_robustbench_contains_its_normalisation(models: Any) -> None:
     pytest.importorskip("pyautoattack")
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     file = classifier_file("robustbench:Salman2020Do_R18")
     os.makedirs(file.parent)
     network = models.resnet18().eval()
-    torch.save(network.state_dict(), file)
-    classifier = load_classifier("robustbench:Salman2020Do_R18")
-    assert isinstance(classifier, NetworkClassifier)
+    saved(network, file)
+    classifier, images = white_box("robustbench:Salman2020Do_R18"), random_images(224)
     assert (classifier.image_size, classifier.n_classes) == ((224, 224), 1000)
     assert classifier.classes is not None
     assert classifier.classes[999] == "toilet tissue"
-    images = torch.rand((1, 3, 224, 224), generator=torch.Generator().manual_seed(1))
-    mean, std = (torch.tensor(v).reshape(3, 1, 1) for v in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
-    with torch.no_grad():
-        expected = network((images - mean) / std)
+    expected = of_normalised(network, images, *IMAGENET)
     torch.testing.assert_close(classifier.scores(images), expected, atol=1e-3, rtol=1e-3)
     with pytest.raises(ClassifierError, match=r"no ImageNet network 'Salman'"):
         load_classifier("robustbench:Salman")
