@@ -441,23 +441,15 @@ def external(ending: str = "png") -> dict[str, bytes]:
     }
 
 
-def test_of_a_folder_only_the_picture_changes() -> None:
+@pytest.mark.parametrize("picture", ["my maps/skin.png", "My Maps/SKIN.png"])
+def test_of_a_folder_only_the_picture_changes_whatever_its_capitals(picture: str) -> None:
     files = external()
+    files[picture] = files.pop("my maps/skin.png")
     data = pack_zip(files)
-    new = painted(read_object(data, name="square.zip").obj)
-    exported = repaint_file(data, new, name="square.zip")
+    exported = repaint_file(data, painted(read_object(data, name="square.zip").obj), name="square.zip")
     after = unpack(exported.data)
     assert exported.ending == ".zip"
-    assert [name for name in files if after[name] != files[name]] == ["my maps/skin.png"]
-    assert list(after) == list(files)
-
-
-def test_a_picture_in_other_capitals_is_found_and_stays_where_it_is() -> None:
-    files = external()
-    files["My Maps/SKIN.png"] = files.pop("my maps/skin.png")
-    data = pack_zip(files)
-    after = unpack(repaint_file(data, painted(read_object(data, name="s.zip").obj), name="s.zip").data)
-    assert [name for name in files if after[name] != files[name]] == ["My Maps/SKIN.png"]
+    assert [name for name in files if after[name] != files[name]] == [picture]
     assert list(after) == list(files)
 
 
