@@ -64,9 +64,10 @@ def test_each_class_of_several_counts_as_the_object(pairs: list[tuple[int, int]]
         labels, found = order[:count], accuracy(before, after, order[:count])
         assert found.views == len(pairs)
         assert found.a_before == np.mean([b in labels for b, _ in pairs])
-        assert found.a_after == np.mean([a in labels for _, a in pairs])
+        still = np.mean([a in labels for _, a in pairs])
+        assert found.a_after == still
         if found.a_before:
-            assert found.a_drop == pytest.approx((found.a_before - found.a_after) / found.a_before)
+            assert found.a_drop == pytest.approx((found.a_before - still) / found.a_before)
         assert fooled_as(before, after, labels) == Counter(a for b, a in pairs if b in labels and a not in labels)
     assert accuracy(before, after, order[:1]) == accuracy(before, after, order[0])
 
