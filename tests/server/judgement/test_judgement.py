@@ -10,66 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.job_runs import Recorder, run_job
+from tests.job_runs import Recorder
 from tests.server.judgement.conftest import Judge, spec_of
 from trompe_server.image_pipelines import SUITE
-from trompe_server.judgement.judge_files import judge_files
 from trompe_server.judgement.manifest import manifest_of
 from trompe_server.judgement.pictures import judgement_pictures
-from trompe_server.judgement.sources import LocalSources
 from trompe_server.judgement.suites import SUITES, Suite, suite_of
 from trompe_server.judgement.verify import verify
 from trompe_server.judgement.work import Timed
-from trompe_server.library import Library
 from trompe_server.pages.judgement import judgement_page
-from trompe_server.renderers import SailenvTarget
-from trompe_server.storage.folders import LocalArtifacts
-from trompe_shared.api import AS_RENDERED, JobSpec, JudgementSpec, Manifest, Progress, Visibility
+from trompe_shared.api import AS_RENDERED, Manifest, Progress, Visibility
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
 TEXTURE = "mug_ceramic_AlbedoTransparency.png"
-
-# The figures
-
-
-@pytest.mark.thorough
-def test_an_attacked_object_gets_the_figures_of_its_job(
-    tmp_path: Path, worker: tuple[str, int], target: SailenvTarget
-) -> None:
-    options = {"epsilon": 0.15, "alpha": 0.04, "steps": 5, "pool": 12, "held_out": 20, "image_pipeline": "none"}
-    run = run_job(JobSpec.of("mug", label="mug", **options), Library(tmp_path / "library"), target=target)
-    job = run.result.held_out
-    assert job is not None
-    assert job.a_drop
-    for ending, seed in ((".zip", 0), (".glb", 0), (".glb", 7)):
-        (tmp_path / f"after{ending}").write_bytes(run.artifacts.read(f"mug-adversarial{ending}"))
-        spec = JudgementSpec.of(
-            "mug",
-            str(tmp_path / f"after{ending}"),
-            label="mug",
-            renderers=[f"{worker[0]}:{worker[1]}"],
-            views=20,
-            seed=seed,
-            epsilon=0.15,
-        )
-        kept = LocalArtifacts(tmp_path / "kept")
-        judged = judge_files(spec, LocalSources(tmp_path), kept=kept, on_progress=lambda _: None)
-        manifest = manifest_of(judged, seconds=1.0)
-        found = manifest.cell(spec.renderers[0], "tiny")
-        assert found is not None
-        assert manifest.findings == []
-        if (ending, seed) == (".zip", 0):
-            assert found == job
-        assert found.a_drop is not None
-        assert found.a_drop_interval is not None
-        assert job.a_drop_interval is not None
-        assert max(found.a_drop_interval[0], job.a_drop_interval[0]) <= min(found.a_drop, job.a_drop)
-        assert min(found.a_drop_interval[1], job.a_drop_interval[1]) >= max(found.a_drop, job.a_drop)
-        (texture,) = manifest.textures
-        assert texture.texels_altered == run.result.texels_altered
-        assert texture.max_levels <= 0.15 * 255
 
 
 def test_every_cell_has_figures_and_every_view_its_classes(judge: Judge, dark: Path) -> None:

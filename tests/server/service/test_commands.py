@@ -1,5 +1,10 @@
-"""The commands, as far as they need no service to run."""
+"""The commands: `trompe serve`, `worker`, `migrate` as far as they need no service to run, `token` and `judge`."""
 
+import json
+import re
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import click
@@ -7,8 +12,15 @@ import pytest
 from click.testing import CliRunner
 
 from trompe_client.cli import main
+from trompe_server.errors import ServiceError
+from trompe_server.queue.store import JobStore
 from trompe_server.service import commands
+from trompe_server.service import serve as serving
 from trompe_server.settings import Settings
+from trompe_server.storage.tokens import Right, Tokens, hash_secret
+from trompe_shared.api import Manifest
+from trompe_shared.object3d import load_object
+from trompe_shared.shipped import shipped_objects
 
 
 def run(command: click.Command, *arguments: str) -> tuple[int, str]:
@@ -16,36 +28,33 @@ def run(command: click.Command, *arguments: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::", "example.org"])
-def test_serve_refuses_to_be_seen_by_other_machines_where_anybody_could_come_in(tmp_path: Path, host: str) -> None:
-    status, words = run(commands.serve, "--host", host, "--port", "0", "--data", str(tmp_path))
-    assert status == 1
-    assert "trompe token create NAME" in words
-
-
-def test_attack_workers_without_a_renderer_are_refused(tmp_path: Path) -> None:
-    status, words = run(commands.serve, "--renderers", "0", "--data", str(tmp_path))
-    assert status == 1
-    assert "--workers 0" in words
-
-
-def test_a_worker_must_be_told_where_the_renderers_are(tmp_path: Path) -> None:
-    status, words = run(commands.worker, "--data", str(tmp_path))
-    assert status == 2
-    assert "--renderers-dns" in words
-
-
-def test_a_worker_without_processes_is_refused(tmp_path: Path) -> None:
-    status, words = run(commands.worker, "--data", str(tmp_path), "--renderer", "127.0.0.1:1", "--workers", "0")
-    assert status == 1
-    assert "--workers 1" in words
-
-
-@pytest.mark.parametrize("url", ["mysql://host/name", "nonsense", "sqlite://"])
-def test_a_database_that_cannot_be_used_is_refused_with_a_remedy(tmp_path: Path, url: str) -> None:
-    status, words = run(commands.migrate, "--data", str(tmp_path), "--database", url)
-    assert status == 1
-    assert "is not a supported database URL" in words
+@pytest.mark.parametrize(
+    ("command", "arguments", "status", "words"),
+    [
+        pytest.param(
+            commands.serve, ["--host", "0.0.0.0", "--port", "0"], 1, "trompe token create NAME", id="anybody could come"
+        ),
+        pytest.param(commands.serve, ["--renderers", "0"], 1, "--workers 0", id="workers without a renderer"),
+        pytest.param(commands.serve, ["--executor", "dask"], 2, "executor: String should match", id="a wrong setting"),
+        pytest.param(commands.worker, [], 2, "--renderers-dns", id="a worker that does not know the renderers"),
+        pytest.param(
+            commands.worker, ["--renderer", "127.0.0.1:1", "--workers", "0"], 1, "--workers 1", id="no processes"
+        ),
+        *(
+            pytest.param(commands.worker, ["--renderer", wrong], 2, "is not HOST:PORT", id=f"address {wrong!r}")
+            for wrong in ("8085", "host:", ":80x", "")
+        ),
+        *(
+            pytest.param(commands.migrate, ["--database", url], 1, "is not a supported database URL", id=url)
+            for url in ("mysql://host/name", "nonsense", "sqlite://")
+        ),
+    ],
+)
+def test_what_cannot_work_is_refused_with_a_remedy(
+    tmp_path: Path, command: click.Command, arguments: list[str], status: int, words: str
+) -> None:
+    found, said = run(command, "--data", str(tmp_path), *arguments)
+    assert (found, words in said) == (status, True), said
 
 
 def test_migrating_makes_the_database_once_and_again(tmp_path: Path) -> None:
@@ -62,17 +71,7 @@ def test_serve_says_what_is_wrong_with_the_data_folder(tmp_path: Path) -> None:
     assert "TROMPE_DATA" in words
 
 
-@pytest.mark.parametrize("address", ["8085", "host:", ":80x", ""])
-def test_worker_refuses_a_renderer_that_is_no_address(tmp_path: Path, address: str) -> None:
-    status, words = run(commands.worker, "--data", str(tmp_path), "--renderer", address)
-    assert status == 2
-    assert "is not HOST:PORT" in words
-
-
 def test_wrong_settings_are_named_with_their_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    status, words = run(commands.serve, "--data", str(tmp_path), "--executor", "dask")
-    assert status == 2
-    assert "executor: String should match" in words
     monkeypatch.setenv("TROMPE_WORKERS", "many")
     status, words = run(commands.migrate, "--data", str(tmp_path))
     assert status == 2
@@ -83,3 +82,140 @@ def test_wrong_settings_are_named_with_their_variable(tmp_path: Path, monkeypatc
 def test_the_data_folder_is_set_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TROMPE_DATA", str(tmp_path))
     assert Settings().data == tmp_path
+
+
+# Tokens
+
+
+def token(data: Path, *words: str) -> tuple[int, str]:
+    """Exit status and standard output of ``trompe token`` with these words."""
+    result = CliRunner().invoke(main, ["token", *words, "--data", str(data)])
+    return result.exit_code, result.stdout if result.exit_code == 0 else result.output
+
+
+def tokens(data: Path) -> Tokens:
+    return Tokens(JobStore(Settings(data=data).database_url).engine)
+
+
+def test_a_token_is_made_in_a_folder_that_has_none_yet_and_its_secret_is_all_that_is_printed(tmp_path: Path) -> None:
+    status, secret = token(tmp_path / "new", "create", "ci", "--right", "read")
+    assert status == 0
+    found = tokens(tmp_path / "new").by_hash()[hash_secret(secret.strip())]
+    assert (found.name, found.right) == ("ci", Right.read)
+
+
+def test_tokens_are_listed_with_what_became_of_them(tmp_path: Path) -> None:
+    assert token(tmp_path, "list") == (0, "")
+    made = json.loads(token(tmp_path, "create", "ann", "--json")[1])
+    assert made["right"] == "write"
+    assert hash_secret(made["secret"]) in tokens(tmp_path).by_hash()
+    token(tmp_path, "create", "bob")
+    assert token(tmp_path, "revoke", "bob")[0] == 0
+    ann, bob = json.loads(token(tmp_path, "list", "--json")[1])
+    assert (ann["name"], ann["revoked"], ann["last_used"]) == ("ann", None, None)
+    assert bob["revoked"] is not None
+    words = token(tmp_path, "list")[1]
+    assert "last used never" in words
+    assert "revoked 20" in words
+    assert made["secret"] not in words
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "reason"),
+    [
+        (["create", "ann"], 1, "name 'ann' is in use"),
+        (["create", "a b"], 2, "not a valid token name"),
+        (["create", "eve", "--right", "admin"], 2, "is not one of"),
+        (["revoke", "eve"], 1, "no token 'eve'"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_with_a_reason(
+    tmp_path: Path, words: list[str], status: int, reason: str
+) -> None:
+    token(tmp_path, "create", "ann")
+    found, said = token(tmp_path, *words)
+    assert (found, reason in said) == (status, True), said
+
+
+def test_a_server_is_seen_by_other_machines_only_while_there_is_a_token_that_is_valid(tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path)
+
+    def refused(host: str) -> bool:
+        try:
+            serving._refuse_public(host, settings)
+        except ServiceError:
+            return True
+        return False
+
+    token(tmp_path, "list")
+    assert [refused(host) for host in ("127.0.0.1", "::1", "localhost")] == [False] * 3
+    assert [refused(host) for host in ("0.0.0.0", "::", "192.168.1.5", "example.org")] == [True] * 4
+    token(tmp_path, "create", "ann", "--right", "read")
+    assert not refused("0.0.0.0")
+    token(tmp_path, "revoke", "ann")
+    assert refused("0.0.0.0")
+
+
+# Judgements, each by a process with a renderer of its own
+
+TROMPE = [sys.executable, "-m", "trompe_client.cli", "judge"]
+
+
+@pytest.fixture
+def painted(tmp_path: Path) -> Path:
+    """The mug, a little darker, as a zip."""
+    mug = load_object(shipped_objects()["mug"].read())
+    file = tmp_path / "painted.zip"
+    file.write_bytes(mug.with_textures({name: image // 8 * 7 for name, image in mug.textures.items()}).to_zip())
+    return file
+
+
+@pytest.mark.thorough
+def test_a_judgement_is_interrupted_continued_and_verified(painted: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [*TROMPE, "mug", str(painted), "--label", "mug", "--views", "11", "--epsilon", "0.05", "--out", str(out)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as stopped:
+        assert stopped.stderr is not None
+        first = stopped.stderr.readline()
+        stopped.send_signal(signal.SIGINT)
+        said = stopped.stderr.read()
+    assert re.fullmatch(r" +\d:\d\d +0%  rendering in pyrender  \d+:\d\d left\n", first)
+    assert f"Finished work is kept in {out}" in said
+    assert stopped.returncode == 130
+
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert re.search(r"tiny +│ pyrender", done.stdout)
+    assert "exceeds the stated epsilon of 0.05" in done.stdout
+    assert sorted(file.name for file in out.iterdir()) == ["judgement.html", "judgement.json"]
+    assert Manifest.model_validate_json((out / "judgement.json").read_bytes()).after.source == "../painted.zip"
+
+    verified = subprocess.run([*TROMPE, "--verify", str(out / "judgement.json")], capture_output=True, text=True)
+    assert (verified.returncode, verified.stderr) == (0, "")
+    assert "random views rendered again have the same classes" in verified.stdout
+
+
+WRONG = [
+    pytest.param(["mug"], 2, "Give two files, --label and --out", id="one file"),
+    pytest.param(["mug", "mug", "--label", "mug"], 2, "Give two files, --label and --out", id="no folder"),
+    pytest.param(["mug", "nowhere.glb", "--label", "mug", "--out", "out"], 2, "no file 'nowhere.glb'", id="no file"),
+    pytest.param(["mug", "notes.txt", "--label", "mug", "--out", "out"], 2, "is not a zip archive", id="no model"),
+    pytest.param(["mug", "mug", "--label", "mug", "--out", "o", "--suite", "s"], 2, "standard-1", id="no such suite"),
+    pytest.param(
+        ["mug", "mug", "--label", "mug", "--out", "o", "--suite", "standard-1", "--views", "9"],
+        2,
+        "the suite standard-1 fixes views and seed",
+        id="another number of views",
+    ),
+    pytest.param(["--verify", "notes.txt"], 2, "notes.txt is not a manifest", id="no manifest"),
+    pytest.param(["mug", "--verify", "notes.txt"], 2, "--verify takes a manifest alone", id="a manifest and a file"),
+]
+
+
+@pytest.mark.parametrize(("words", "code", "text"), WRONG)
+def test_a_wrong_command_is_one_clear_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], code: int, text: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notes.txt").write_text(json.dumps({"a": 1}))
+    done = CliRunner().invoke(main, ["judge", *words])
+    assert (done.exit_code, text in done.output) == (code, True), done.output

@@ -1,9 +1,14 @@
-"""Threads are prepared before torch reads how many it has and how they wait."""
+"""Threads and memory as a process prepares them, in processes of their own: the settings cannot be undone."""
 
 import json
 import os
 import subprocess
 import sys
+import textwrap
+
+import pytest
+
+from trompe_server.system.memory import GIB
 
 SAYS = """
 import json, os, sys
@@ -31,3 +36,25 @@ def test_torch_has_as_many_threads_as_it_is_given_and_they_wait_for_a_moment() -
 def test_what_the_environment_says_stays() -> None:
     said = {"OMP_NUM_THREADS": "2", "OMP_WAIT_POLICY": "active", "GOMP_SPINCOUNT": "7"}
     assert prepared(**said) == [False, 2, "active", 7]
+
+
+@pytest.mark.thorough
+def test_freed_memory_is_kept_but_no_more_than_a_gibibyte() -> None:
+    code = """
+        import os, numpy as np
+        from trompe_server.system.memory import keep_freed_memory
+        def pages():
+            return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        print(keep_freed_memory())
+        arrays = [np.ones(64 * 2**20) for _ in range(3)]
+        print(pages())
+        del arrays
+        print(pages())
+        """
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout
+    supported, before, after = output.split()
+    if supported == "False":
+        pytest.skip("this C library has no mallopt")
+    assert int(before) > 1.5 * GIB
+    assert 0.4 * GIB < int(after) < 1.25 * GIB
