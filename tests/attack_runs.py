@@ -20,12 +20,15 @@ from trompe_server.surrogate import (
     textures_of,
 )
 from trompe_server.surrogate.blocks import repeated
-from trompe_shared.geometry import View
+from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
 
 SIZE: Final = (32, 32)
 LABEL: Final = 6
 """Class of the square for the fake classifier in all views of ``surrogate``."""
+
+VIEWS: Final = [View(Camera(0.3, azimuth, elevation)) for azimuth in (-40, -10, 20, 45) for elevation in (-20, 0, 30)]
+"""The views of ``surrogate``."""
 
 EPS: Final = 1e-6
 SMALL: Final = settings(max_examples=6)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trompe_server.formats import read_object
+from trompe_server.formats import gltf_repaint, read_object
 from trompe_server.formats.fbx_tree import Node, Tree
+from trompe_server.formats.gltf_container import BIN_CHUNK
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D, encode_png
 
@@ -66,11 +67,7 @@ def gltf_files(picture: bytes = PICTURE, **changes: Any) -> dict[str, bytes]:
 def glb(document: Json | bytes, data: bytes | None = None) -> bytes:
     """A GLB of JSON and one buffer, by default ``gltf_buffer``."""
     text = document if isinstance(document, bytes) else json.dumps(document).encode()
-    body = b""
-    for kind, chunk, filler in ((b"JSON", text, b" "), (b"BIN\0", gltf_buffer() if data is None else data, b"\0")):
-        chunk += filler * (-len(chunk) % 4)
-        body += struct.pack("<I", len(chunk)) + kind + chunk
-    return b"glTF" + struct.pack("<II", 2, 12 + len(body)) + body
+    return gltf_repaint.glb(text, [(BIN_CHUNK, gltf_buffer() if data is None else data)])
 
 
 def with_picture_inside(fbx: Tree, picture: bytes) -> bytes:

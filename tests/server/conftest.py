@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry
-from trompe_shared.geometry import Camera, View
+from tests.attack_runs import VIEWS, surrogate_of
+from trompe_server.surrogate import Surrogate
 from trompe_shared.object3d import Object3D, pack_zip
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl paint\nf 1/1 2/2 3/3\n"
@@ -41,5 +41,4 @@ def square(make_object: Callable[..., Object3D], make_quad: Callable[..., Any]) 
 @pytest.fixture(scope="session")
 def surrogate(square: Object3D) -> Surrogate:
     """12 views of ``square``, 32 x 32, in all of which the fake classifier says class 6."""
-    views = [View(Camera(0.3, azimuth, elevation)) for azimuth in (-40, -10, 20, 45) for elevation in (-20, 0, 30)]
-    return diffuse_surrogate(prepare_geometry(square, views, size=(32, 32), sampling=SamplingModel()), views)
+    return surrogate_of(square, VIEWS)

@@ -47,19 +47,6 @@ from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
 
 
-def test_the_attack_raises_the_margin_within_its_budget(square: Object3D, surrogate: Surrogate) -> None:
-    seen: list[Step] = []
-    state = run(square, surrogate, on_step=seen.append)
-    assert [step.step for step in seen] == list(range(6))
-    assert seen[-1].loss > seen[0].loss + 0.01
-    assert all(0 <= step.fooled <= 1 for step in seen)
-    assert state.step == 6
-    delta, texture = state.deltas["m0.png"], textures_of(square)["m0.png"]
-    assert 0.059 < delta.abs().max() <= 0.06 + EPS
-    assert (texture + delta).min() >= 0
-    assert (texture + delta).max() <= 1
-
-
 def test_a_step_reports_the_mean_over_all_views_before_it_moves(square: Object3D, surrogate: Surrogate) -> None:
     (step,) = steps_of(square, surrogate, steps=1)
     logits = fake_classifier().logits(surrogate.render_all(surrogate.texels(textures_of(square))))

@@ -201,9 +201,7 @@ def test_options_of_the_search_change_the_texture_and_survive_interruption(
     assert once.reports["judge"].state is JobState.succeeded
     assert once.result.steps == 6
     assert once.artifacts.files["chair-adversarial.zip"] != six_steps.artifacts.files["chair-adversarial.zip"]
-    moved, all_moved = once.result.texels_altered, six_steps.result.texels_altered
-    assert moved is not None
-    assert all_moved is not None
+    moved, all_moved = (each.result.texels_altered or 0.0 for each in (once, six_steps))
     assert 0 < moved <= options.get("keep", 1.0) + 1e-6
     assert "keep" not in options or all_moved > 0.03
     assert once.artifacts.files["saliency.npz"] == six_steps.artifacts.files["saliency.npz"]

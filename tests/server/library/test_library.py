@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+import torch
 
 from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE
 from trompe_server.errors import AmbiguousError, NotFoundError
@@ -18,14 +19,12 @@ from trompe_shared.errors import ClassifierError
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
-EXPORT = """
-import sys, torch
+
 class Net(torch.nn.Module):
-    def forward(self, x):
-        return x.mean(dim=(2, 3))
-batch = torch.export.Dim("batch", min=1, max=4096)
-torch.export.save(torch.export.export(Net(), (torch.zeros(2, 3, 8, 12),), dynamic_shapes=({0: batch},)), sys.argv[1])
-"""
+    """The mean of each channel."""
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return images.mean(dim=(2, 3))
 
 
 def test_an_object_comes_back_byte_for_byte(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
@@ -71,7 +70,8 @@ def test_shipped_objects_are_there_from_the_start(tmp_path: Path) -> None:
 
 def test_a_classifier_file_is_described_by_a_process_of_its_own_once(tmp_path: Path) -> None:
     file = tmp_path / "net.pt2"
-    subprocess.run([sys.executable, "-W", "ignore", "-c", EXPORT, str(file)], check=True)
+    batch = ({0: torch.export.Dim.DYNAMIC},)
+    torch.export.save(torch.export.export(Net(), (torch.zeros(2, 3, 8, 12),), dynamic_shapes=batch), file)
     inspected: list[str] = []
 
     def inspect(path: str) -> dict[str, object]:
@@ -90,12 +90,6 @@ def test_a_classifier_file_is_described_by_a_process_of_its_own_once(tmp_path: P
     assert len(inspected) == 1
     with file.open("rb") as content, pytest.raises(ClassifierError, match="2 class names for a classifier of 3"):
         library.add_classifier(content, "net.pt2", classes=["r", "g"])
-
-
-def test_a_file_that_is_no_classifier_is_refused_and_leaves_nothing_behind(tmp_path: Path) -> None:
-    with pytest.raises(ClassifierError):
-        Library(tmp_path).add_classifier(io.BytesIO(b"no network"), "net.pt2")
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
 def test_the_shipped_classifier_is_described_as_it_is(tmp_path: Path) -> None:

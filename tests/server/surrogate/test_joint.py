@@ -7,23 +7,20 @@ import numpy as np
 import pytest
 import torch
 
-from tests.attack_runs import LABEL, objective_of, random_state, run, surrogate_of
+from tests.attack_runs import LABEL, VIEWS, objective_of, random_state, run, surrogate_of
 from trompe_server.attack import Backgrounds, Budget, Goal, movable
 from trompe_server.attack.objective import Objective
 from trompe_server.surrogate import AnySurrogate, SamplingModel, Surrogate, diffuse_surrogate, joined, textures_of
-from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
 
-VIEWS = [View(Camera(0.3, azimuth, elevation)) for azimuth in (-40, -10, 20, 45) for elevation in (-20, 0, 30)]
 LINEAR = SamplingModel(filtered="linear", samples="centre", lod="area")
 
 
 @pytest.fixture(scope="module")
-def parts(square: Object3D) -> tuple[Surrogate, Surrogate, Surrogate]:
+def parts(square: Object3D, surrogate: Surrogate) -> tuple[Surrogate, Surrogate, Surrogate]:
     """Three renderers: one, one with another sampling, and one with the sampling of the first before black."""
-    first = surrogate_of(square, VIEWS)
     black = [replace(view, background=(0, 0, 0)) for view in VIEWS]
-    return first, surrogate_of(square, VIEWS, sampling=LINEAR), diffuse_surrogate(first.geometry, black)
+    return surrogate, surrogate_of(square, VIEWS, sampling=LINEAR), diffuse_surrogate(surrogate.geometry, black)
 
 
 def objective(obj: Object3D, surrogate: AnySurrogate, masks: torch.Tensor | None = None) -> Objective:
