@@ -1,6 +1,5 @@
 """Fixtures shared by the packages: a renderer worker, a running service, and objects made from a few numbers."""
 
-import json
 import os
 import re
 import signal
@@ -8,20 +7,16 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
-from numpy.typing import ArrayLike, NDArray
 
 from tests.pretend_device import register
+from tests.surfaces import Surface, object_of, quad
 from tests.worker_process import started
 from trompe_server.renderers import SailenvTarget
-from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files
+from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
-
-Surface = tuple[ArrayLike, ArrayLike, NDArray[np.uint8]]
-"""Corners (F, 3, 3) in metres, texture coordinates (F, 3, 2), and texture (H, W, 3)."""
 
 LONGEST = ("service/test_workers.py", "pages/test_pages.py", "pages/test_orbit.py", "e2e/test_service.py")
 """Files of more than a minute and a half."""
@@ -112,40 +107,14 @@ def mug() -> Object3D:
 
 @pytest.fixture(scope="session")
 def make_object() -> Callable[..., Object3D]:
-    """Makes an object of ``Surface``s with a material each (m0, m1, ... with textures m0.png, m1.png, ...)."""
-    return _object_of
-
-
-def _object_of(*surfaces: Surface) -> Object3D:
-    lines: list[str] = []
-    corners_so_far = 0
-    files: dict[str, bytes] = {}
-    for number, (corners, uvs, texture) in enumerate(surfaces):
-        points, coordinates = np.reshape(corners, (-1, 3)), np.reshape(uvs, (-1, 2))
-        lines += ["v {!r} {!r} {!r}".format(*map(float, row)) for row in points]
-        lines += ["vt {!r} {!r}".format(*map(float, row)) for row in coordinates]
-        lines.append(f"usemtl m{number}")
-        for first in range(corners_so_far + 1, corners_so_far + len(points) + 1, 3):
-            lines.append("f " + " ".join(f"{k}/{k}" for k in range(first, first + 3)))
-        corners_so_far += len(points)
-        files[f"m{number}.png"] = encode_png(texture)
-    table = {f"m{number}": {"albedo": f"m{number}.png"} for number in range(len(surfaces))}
-    mesh = "\n".join(lines).encode()
-    return object_from_files({"made.obj": mesh, "made_mat_def.json": json.dumps(table).encode()} | files)
+    """``object_of``."""
+    return object_of
 
 
 @pytest.fixture(scope="session")
 def make_quad() -> Callable[..., Surface]:
-    """Makes a square that faces a camera at azimuth 0, with the texture upright."""
-    return _quad
-
-
-def _quad(texture: NDArray[np.uint8], *, half: float = 0.1, z: float = 0.0, repeat: float = 1.0) -> Surface:
-    """``half``: half a side in metres. The texture repeats ``repeat`` times each way."""
-    square = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
-    uvs = repeat * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    rows = [0, 1, 2, 0, 2, 3]
-    return square[rows].reshape(-1, 3, 3), uvs[rows].reshape(-1, 3, 2), texture
+    """``quad``."""
+    return quad
 
 
 @pytest.fixture

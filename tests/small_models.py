@@ -13,14 +13,21 @@ from trompe_server.formats import gltf_repaint, read_object
 from trompe_server.formats.fbx_tree import Node, Tree
 from trompe_server.formats.gltf_container import BIN_CHUNK
 from trompe_shared.errors import ObjectError
-from trompe_shared.object3d import Object3D, encode_png
+from trompe_shared.object3d import Object3D, encode_png, pack_zip
 
 Json = dict[str, Any]
 
 PICTURE = encode_png(np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3))
 OBJ = b"mtllib t.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+TRIANGLE = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl paint\nf 1/1 2/2 3/3\n"
 CORNERS = struct.pack("<15f", 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 0, 0)
 """Positions, then texture coordinates."""
+
+
+def triangle_zip(*, colour: tuple[int, int, int] = (200, 30, 30)) -> bytes:
+    """The archive of an object, one textured triangle of a colour, as SAILenv wants it."""
+    materials, picture = b'{"paint": {"albedo": "paint.png"}}', encode_png(np.full((8, 8, 3), colour, np.uint8))
+    return pack_zip({"triangle.obj": TRIANGLE, "triangle_mat_def.json": materials, "paint.png": picture})
 
 
 def gltf_json() -> Json:

@@ -3,7 +3,7 @@
 import asyncio
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import httpx
 import pytest
 
+from tests.small_models import triangle_zip
 from trompe_server.api import guard
 from trompe_server.api.services import Services
 from trompe_server.library import Library
@@ -113,7 +114,7 @@ def settings(tmp_path: Path) -> Settings:
 
 
 @pytest.fixture(scope="session")
-def template(tmp_path_factory: pytest.TempPathFactory, triangle_zip: Callable[..., bytes]) -> Path:
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A service's data with an object and a classifier with class names, for copies: to make it takes seconds."""
     settings = Settings(data=tmp_path_factory.mktemp("template"))
     JobStore(settings.database_url).migrate()

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-from collections.abc import Callable
 from typing import Any
 
 import httpx
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.server.api.conftest import CLASSES, GIF, Api
+from tests.small_models import triangle_zip
 from trompe_server.errors import ServiceError
 from trompe_server.storage.folders import JobArtifacts
 from trompe_shared.api import JobState
@@ -150,7 +150,7 @@ def test_many_at_once_with_the_same_key_make_one_job(stocked: Api) -> None:
     assert len({answer.json()["id"] for answer in answers}) == 1
 
 
-def test_jobs_are_found_by_labels_object_and_classifier(stocked: Api, triangle_zip: Callable[..., bytes]) -> None:
+def test_jobs_are_found_by_labels_object_and_classifier(stocked: Api) -> None:
     other = stocked.upload_object(triangle_zip(colour=(0, 0, 255)), "blue.zip").json()["id"]
     red = stocked.job(labels={"team": "a", "run": "1"})
     blue = stocked.job(object="blue", labels={"team": "a", "run": "x:y"})

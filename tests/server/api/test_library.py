@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import httpx
 import pytest
 
 from tests.server.api.conftest import CLASSES, GIF, Api
+from tests.small_models import triangle_zip
 from trompe_server.api.services import UPLOADS
 from trompe_server.classifiers.registry import LOADERS
 from trompe_server.library import Library
@@ -21,7 +22,7 @@ def stored_files(api: Api) -> list[Path]:
     return [file for file in (api.services.settings.data / "library").rglob("*") if file.is_file()]
 
 
-def test_an_object_is_found_by_its_id_its_beginning_and_its_name(api: Api, triangle_zip: Callable[..., bytes]) -> None:
+def test_an_object_is_found_by_its_id_its_beginning_and_its_name(api: Api) -> None:
     uploaded = api.upload_object(triangle_zip()).json()
     assert uploaded["name"] == "triangle"
     assert (uploaded["triangles"], uploaded["materials"]) == (1, ["paint"])
@@ -31,14 +32,14 @@ def test_an_object_is_found_by_its_id_its_beginning_and_its_name(api: Api, trian
     assert uploaded in api.get("/v1/objects").json()
 
 
-def test_the_same_object_is_stored_once(api: Api, triangle_zip: Callable[..., bytes]) -> None:
+def test_the_same_object_is_stored_once(api: Api) -> None:
     first = api.upload_object(triangle_zip()).json()
     again = api.upload_object(triangle_zip(), "other.zip").json()
     assert again["id"] == first["id"]
     assert [each["name"] for each in api.get("/v1/objects").json() if not each["shipped"]] == ["other"]
 
 
-def test_a_broken_archive_is_refused_and_nothing_is_kept(api: Api, triangle_zip: Callable[..., bytes]) -> None:
+def test_a_broken_archive_is_refused_and_nothing_is_kept(api: Api) -> None:
     refusal = api.problem(api.upload_object(triangle_zip()[:-40]), 422)
     assert refusal["type"] == "urn:trompe:invalid-object"
     assert stored_files(api) == []
@@ -94,22 +95,20 @@ def test_the_client_uploads_the_files_that_classifiers_are_read_from() -> None:
     assert set(CLASSIFIER_SUFFIXES) == set(LOADERS)
 
 
-def test_shipped_things_are_named_by_name(stocked: Api, triangle_zip: Callable[..., bytes]) -> None:
+def test_shipped_things_are_named_by_name(stocked: Api) -> None:
     stocked.upload_object(triangle_zip(), "mug.zip")
     spec = stocked.submit("mug", classifier="tiny").json()["spec"]
     assert (spec["object"], spec["victim"]["classifier"]) == ("mug", "tiny")
 
 
-def test_a_name_that_several_uploads_share_is_refused_with_their_ids(
-    stocked: Api, triangle_zip: Callable[..., bytes]
-) -> None:
+def test_a_name_that_several_uploads_share_is_refused_with_their_ids(stocked: Api) -> None:
     other = stocked.upload_object(triangle_zip(colour=(0, 0, 255))).json()["id"]
     assert other[:12] in stocked.problem(stocked.submit(), 422)["detail"]
     assert stocked.submit(object=other).status_code == 201
 
 
 def test_uploads_are_looked_into_a_few_at_a_time_and_nothing_else_waits_for_them(
-    api: Api, triangle_zip: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch
+    api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at_work, most, lock, gate = 0, 0, threading.Lock(), threading.Event()
     add = Library.add_object

@@ -2,7 +2,6 @@
 
 import errno
 import sqlite3
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -11,6 +10,7 @@ import pytest
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from tests.server.api.conftest import Api
+from tests.small_models import triangle_zip
 from trompe_server.errors import ServiceError
 from trompe_server.library import Library
 from trompe_server.queue.store import JobStore
@@ -93,9 +93,7 @@ def test_a_real_database_that_cannot_be_opened_is_answered_with_503_on_every_pat
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_a_full_disk_is_named(
-    api: Api, triangle_zip: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch, wrapped: bool
-) -> None:
+def test_a_full_disk_is_named(api: Api, monkeypatch: pytest.MonkeyPatch, wrapped: bool) -> None:
     def full(*_: Any, **__: Any) -> None:
         try:
             raise OSError(errno.ENOSPC, "No space left on device")

@@ -1,7 +1,6 @@
 """The budget: projection, steps, 8-bit quantisation, perceptual bounds and the bound on images, against formulas."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.attack_runs import EPS, SMALL, random_state, run, surrogate_of
+from tests.surfaces import object_of, quad
 from trompe_server.attack import Budget
 from trompe_server.attack.budget import HUE
 from trompe_server.attack.perception import perceptual_bounds
@@ -244,10 +244,8 @@ def test_the_bound_is_used_up_at_no_needless_cost(square: Object3D, surrogate: S
 
 
 @pytest.mark.parametrize("filtered", ["linear", "encoded"])
-def test_the_bound_holds_for_textures_seen_from_afar(
-    filtered: Any, make_object: Callable[..., Object3D], make_quad: Callable[..., Any]
-) -> None:
-    obj = make_object(make_quad(np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)))
+def test_the_bound_holds_for_textures_seen_from_afar(filtered: Any) -> None:
+    obj = object_of(quad(np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)))
     views = [View(Camera(distance, azimuth, 10)) for distance in (0.3, 1.5) for azimuth in (-80, 0, 30)]
     surrogate = surrogate_of(obj, views, sampling=SamplingModel(filtered=filtered))
     for epsilon_view in (0.01, 0.03):

@@ -3,7 +3,6 @@
 import base64
 import json
 import math
-from collections.abc import Callable
 from io import BytesIO
 from typing import Any
 
@@ -16,6 +15,7 @@ from PIL import Image
 
 from tests.made_objects import CORNERS, SQUARE, UVS, Scene
 from tests.small_models import corners, painted, refusal, same_paint
+from tests.surfaces import object_of
 from trompe_server.formats import read_object, repaint_file, write_glb
 from trompe_server.formats.gltf_container import split_glb
 from trompe_server.renderers import SailenvTarget
@@ -491,13 +491,13 @@ def test_any_object_becomes_a_glb_that_is_the_same_object(mug: Object3D) -> None
         assert (again.textures[again.albedo_of(one)] == mug.textures[mug.albedo_of(other)]).all()
 
 
-def test_an_object_looks_the_same_as_glb(target: SailenvTarget, make_object: Callable[..., Object3D]) -> None:
+def test_an_object_looks_the_same_as_glb(target: SailenvTarget) -> None:
     random = np.random.default_rng(3)
     side = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0.2], [0.5, 0.5, 0], [-0.5, 0.5, 0.2]])
     uvs = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.5], [0.0, 1.5]])
     rows = [0, 1, 2, 0, 2, 3]
     surface = side[rows].reshape(-1, 3, 3), uvs[rows].reshape(-1, 3, 2)
-    plain = make_object((*surface, random.integers(0, 256, (32, 32, 3), dtype=np.uint8)))
+    plain = object_of((*surface, random.integers(0, 256, (32, 32, 3), dtype=np.uint8)))
     maps = {"normal": random.integers((100, 100, 199), (156, 156, 255), (16, 16, 3), dtype=np.uint8)}
     maps["metallic"] = random.integers(0, 256, (16, 16, 4), dtype=np.uint8)
     files = dict(plain.files) | {f"{name}.png": encode_png(image) for name, image in maps.items()}

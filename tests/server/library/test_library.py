@@ -3,13 +3,13 @@
 import io
 import subprocess
 import sys
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 import torch
 
+from tests.small_models import triangle_zip
 from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE
 from trompe_server.errors import AmbiguousError, NotFoundError
 from trompe_server.library import Library
@@ -27,16 +27,14 @@ class Net(torch.nn.Module):
         return images.mean(dim=(2, 3))
 
 
-def test_an_object_comes_back_byte_for_byte(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
+def test_an_object_comes_back_byte_for_byte(tmp_path: Path) -> None:
     info = Library(tmp_path).add_object(io.BytesIO(triangle_zip()), "triangle.zip")
     again = Library(tmp_path)
     assert again.objects.find("triangle") == info
     assert again.object_bytes(info.id) == again.object_bytes(info.id[:6]) == triangle_zip()
 
 
-def test_the_same_upload_from_many_sides_at_once_is_stored_once(
-    tmp_path: Path, triangle_zip: Callable[..., bytes]
-) -> None:
+def test_the_same_upload_from_many_sides_at_once_is_stored_once(tmp_path: Path) -> None:
     library = Library(tmp_path)
     with ThreadPoolExecutor(8) as pool:
         infos = list(pool.map(lambda _: library.add_object(io.BytesIO(triangle_zip()), "triangle.zip"), range(16)))
@@ -45,13 +43,13 @@ def test_the_same_upload_from_many_sides_at_once_is_stored_once(
     assert list(tmp_path.rglob(".*")) == []
 
 
-def test_short_beginnings_of_ids_are_not_taken(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
+def test_short_beginnings_of_ids_are_not_taken(tmp_path: Path) -> None:
     info = Library(tmp_path).add_object(io.BytesIO(triangle_zip()), "triangle.zip")
     with pytest.raises(NotFoundError, match="triangle"):
         Library(tmp_path).objects.find(info.id[:5])
 
 
-def test_a_beginning_that_fits_two_ids_is_refused(tmp_path: Path, triangle_zip: Callable[..., bytes]) -> None:
+def test_a_beginning_that_fits_two_ids_is_refused(tmp_path: Path) -> None:
     library = Library(tmp_path)
     info = library.add_object(io.BytesIO(triangle_zip()), "one.zip")
     for identity in ("abcdef1", "abcdef2"):

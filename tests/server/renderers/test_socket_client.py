@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from tests.served import reserved_port, wait_until
-from tests.small_models import OBJ
+from tests.small_models import triangle_zip
 from trompe_server.renderers import SailenvTarget, local_renderer
 from trompe_shared.errors import RendererError, RendererLostError
 from trompe_shared.geometry import Camera, View
-from trompe_shared.object3d import Object3D, encode_png, object_from_files
+from trompe_shared.object3d import Object3D, encode_png, load_object
 from trompe_shared.sailenv import COMMANDS, REGISTER, decode_request, encode_frame
 from trompe_shared.sailenv_client import engine_at
 
@@ -24,10 +24,7 @@ VIEW = View(Camera(1.0, 0.0, 0.0))
 
 
 def triangle() -> Object3D:
-    table = b'{"m": {"albedo": "a.png"}}'
-    return object_from_files(
-        {"t.obj": OBJ, "t_mat_def.json": table, "a.png": encode_png(np.zeros((2, 2, 3), np.uint8))}
-    )
+    return load_object(triangle_zip())
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from tests.attack_runs import surrogate_of
+from tests.surfaces import object_of, quad
 from trompe_server.renderers import SailenvTarget
 from trompe_server.storage.arrays import pack_arrays
 from trompe_server.surrogate import SamplingModel, Surrogate, prepare_geometry, textures_of
@@ -43,7 +44,6 @@ SIZE = (64, 64)
 MUG = shipped_objects()["mug"]
 VIEWS = [View(Camera(MUG.distance, azimuth, elevation)) for azimuth in (0, 70, 200) for elevation in (5, 40)]
 Image8 = NDArray[np.uint8]
-Make = Callable[..., Any]
 Render = Callable[[Object3D, Sequence[View]], Image8]
 
 
@@ -193,10 +193,10 @@ def test_a_view_in_which_hardly_anything_changes_does_not_outweigh_all_others(mu
 BOTH_SIDES = [View(Camera(0.4, azimuth, 10)) for azimuth in (0, 40, 180, -40, 200, 160)]
 
 
-def test_a_target_that_shows_both_sides_of_a_sheet_is_understood(make_object: Make, make_quad: Make) -> None:
+def test_a_target_that_shows_both_sides_of_a_sheet_is_understood() -> None:
     texture = np.random.default_rng(0).integers(40, 216, (96, 96, 3), dtype=np.uint8)
     truth = SamplingModel(cull=False)
-    calibration = found(make_object(make_quad(texture)), KnownTarget(truth), "curve", views=BOTH_SIDES)
+    calibration = found(object_of(quad(texture)), KnownTarget(truth), "curve", views=BOTH_SIDES)
     assert calibration.sampling == truth
     assert len(calibration.fidelity.correlation) == 4
     assert min(calibration.fidelity.correlation) > 0.98
@@ -218,10 +218,8 @@ def test_what_changes_where_the_surrogate_sees_no_object_counts_against_it(mug: 
 
 
 @pytest.mark.parametrize("wanted", ["auto", "diffuse", "curve"])
-def test_of_views_that_all_see_nothing_nothing_good_is_said(
-    wanted: SurrogateModel, make_object: Make, make_quad: Make
-) -> None:
-    obj = make_object(make_quad(np.full((8, 8, 3), 128, np.uint8)))
+def test_of_views_that_all_see_nothing_nothing_good_is_said(wanted: SurrogateModel) -> None:
+    obj = object_of(quad(np.full((8, 8, 3), 128, np.uint8)))
     calibration = found(obj, USUAL, wanted, views=[View(Camera(0.5, 180, 0))] * 2)
     assert calibration.fidelity == Fidelity((0.0,), (0.0,), (0.0,), (0.0,))
     assert not calibration.fidelity.good_enough
@@ -239,9 +237,9 @@ ASLANT = [View(Camera(0.3, azimuth, elevation)) for azimuth, elevation in ((60, 
         pytest.param(SamplingModel(shift=(0.25, 0.0), anisotropy=16), id="both"),
     ],
 )
-def test_what_few_renderers_do_is_recovered(truth: SamplingModel, make_object: Make, make_quad: Make) -> None:
+def test_what_few_renderers_do_is_recovered(truth: SamplingModel) -> None:
     texture = np.random.default_rng(0).integers(40, 216, (96, 96, 3), dtype=np.uint8)
-    calibration = found(make_object(make_quad(texture)), KnownTarget(truth), "curve", views=ASLANT)
+    calibration = found(object_of(quad(texture)), KnownTarget(truth), "curve", views=ASLANT)
     sampling = calibration.sampling
     assert (sampling.elongated, sampling.filtered) == (truth.elongated, truth.filtered)
     assert (sampling.anisotropy > 1) == (truth.anisotropy > 1)
@@ -346,10 +344,10 @@ def test_what_path_tracers_and_films_do_is_recovered(
     assert calibration.fidelity.mean()["slope"] == pytest.approx(1, abs=0.1)
 
 
-def test_edges_averaged_in_light_are_predicted_better_as_such(make_object: Make, make_quad: Make) -> None:
+def test_edges_averaged_in_light_are_predicted_better_as_such() -> None:
     """On bars a few pixels wide, which are mostly edges."""
     texture = np.random.default_rng(0).integers(10, 120, (32, 32, 3), dtype=np.uint8)
-    bars = make_object(*(make_quad(texture, half=0.004, z=0.02 * k) for k in range(-4, 5)))
+    bars = object_of(*(quad(texture, half=0.004, z=0.02 * k) for k in range(-4, 5)))
     truth = SamplingModel(edges="linear", cull=False)
     target, views = KnownTarget(truth), [View(Camera(0.3, azimuth, 5.0)) for azimuth in (60, 75, 105, 120)]
     clean, noise = target(bars, views), painted_noise(bars, np.random.default_rng(0))
@@ -458,9 +456,9 @@ def test_painting_grey_or_noise_keeps_the_object(mug: Object3D) -> None:
         assert np.abs(change).max() == 26
 
 
-def test_painting_grey_or_noise_keeps_what_is_cut_out(make_object: Make, make_quad: Make) -> None:
+def test_painting_grey_or_noise_keeps_what_is_cut_out() -> None:
     opacity = (np.indices((24, 40)).sum(axis=0) % 5 * 60).astype(np.uint8)
-    obj = make_object(make_quad(np.full((24, 40, 3), 100, np.uint8)))
+    obj = object_of(quad(np.full((24, 40, 3), 100, np.uint8)))
     picture = Image.fromarray(np.dstack([obj.textures["m0.png"], opacity]))
     obj = object_from_files({**obj.files, "m0.png": encode_png(picture)})
     for painted in (painted_grey(obj, 77), painted_noise(obj, np.random.default_rng(3))):

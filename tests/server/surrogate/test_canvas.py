@@ -1,6 +1,5 @@
 """The canvas: what views read while some texels move is what they read of the whole textures; blocks move together."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.attack_runs import surrogate_of
+from tests.surfaces import object_of, quad
 from trompe_server.surrogate import Canvas, SamplingModel, Surrogate, joined, prepare_geometry, pyramid, textures_of
 from trompe_server.surrogate import surrogate as surrogate_module
 from trompe_server.surrogate.blocks import (
@@ -27,7 +27,6 @@ from trompe_server.surrogate.surrogate import Painted
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
 
-Make = Callable[..., Any]
 VIEWS = [View(Camera(0.5, 0, 0)), View(Camera(1.5, 40, 50)), View(Camera(4.0, -30, 10))]
 SIZES = [(64, 32), (24, 20), (15, 30), (1, 8), (1, 1), (34, 6)]
 MODELS = {
@@ -38,11 +37,11 @@ MODELS = {
 
 
 @pytest.fixture(params=SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
-def obj(request: pytest.FixtureRequest, make_object: Make, make_quad: Make) -> Object3D:
+def obj(request: pytest.FixtureRequest) -> Object3D:
     """Two squares, one with a texture of the size in question."""
     random = np.random.default_rng(0)
     images = [random.integers(0, 256, (*size, 3), dtype=np.uint8) for size in (request.param, (16, 16))]
-    return make_object(make_quad(images[0]), make_quad(images[1], z=-0.1))  # type: ignore[no-any-return]
+    return object_of(quad(images[0]), quad(images[1], z=-0.1))
 
 
 @pytest.fixture(params=MODELS.values(), ids=list(MODELS))
@@ -193,10 +192,10 @@ def test_blocks_divide_their_texture(size: tuple[int, int], wanted: int, most: i
 
 
 @pytest.fixture
-def fine(make_object: Make, make_quad: Make) -> Object3D:
+def fine() -> Object3D:
     """A square with a texture much finer than the pixels of ``AFAR``, and one with a coarse texture."""
     image = np.random.default_rng(0).integers(60, 200, (256, 256, 3), dtype=np.uint8)
-    return make_object(make_quad(image), make_quad(image[:8, :8], z=-0.1))  # type: ignore[no-any-return]
+    return object_of(quad(image), quad(image[:8, :8], z=-0.1))
 
 
 def of_blocks(obj: Object3D, **sampling: Any) -> Surrogate:

@@ -1,6 +1,5 @@
 """The rasteriser, judged by an independent ray caster in NumPy and by what must not matter."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tests.surfaces import object_of, quad
 from trompe_server.surrogate import rasterize as module
 from trompe_server.surrogate.rasterize import CENTRE, MSAA4, NEAR, Mesh, mesh_of, project, rasterize
 from trompe_server.surrogate.sampling import fragments_of
@@ -267,11 +267,9 @@ def test_drawing_in_small_portions_gives_the_same_picture(
     assert (whole >= 0).any()
 
 
-def test_a_mesh_keeps_the_order_of_its_parts_and_says_what_each_face_is_painted_with(
-    make_object: Callable[..., Object3D], make_quad: Callable[..., tuple[Floats, Floats, NDArray[np.uint8]]]
-) -> None:
-    quads = [make_quad(np.full((2, 2, 3), k, np.uint8), z=float(k)) for k in range(2)]
-    mesh = mesh_of(make_object(*quads))
+def test_a_mesh_keeps_the_order_of_its_parts_and_says_what_each_face_is_painted_with() -> None:
+    quads = [quad(np.full((2, 2, 3), k, np.uint8), z=float(k)) for k in range(2)]
+    mesh = mesh_of(object_of(*quads))
     assert mesh.textures == ("m0.png", "m1.png")
     assert mesh.texture.tolist() == [0, 0, 1, 1]
     assert mesh.positions[:, 0, 2].tolist() == [0, 0, 1, 1]

@@ -2,10 +2,9 @@
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from torch.nn.functional import interpolate
 
 from tests.attack_runs import surrogate_of
 from tests.fakes import FakeTarget
+from tests.surfaces import object_of, quad
 from trompe_server.renderers import SailenvTarget, TargetRenderer
 from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
 from trompe_server.surrogate.calibration import (
@@ -30,7 +30,6 @@ from trompe_server.surrogate.surrogate import BATCH
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D, load_object
 
-Make = Callable[..., Any]
 SIZE = (96, 96)
 VIEWS = [
     View(Camera(0.157, 30, 25)),
@@ -273,9 +272,9 @@ def test_influence_sums_to_the_pixels_that_read(mug: Object3D, curved: Surrogate
     assert all((weight >= 0).all() for weight in everything.values())
 
 
-def test_a_texture_that_no_view_sees_has_no_influence_and_changes_no_image(make_object: Make, make_quad: Make) -> None:
+def test_a_texture_that_no_view_sees_has_no_influence_and_changes_no_image() -> None:
     half = np.full((8, 8, 3), 128, np.uint8)
-    obj, views = make_object(make_quad(half), make_quad(half, z=5.0)), [View(Camera(0.5, 0, 0))]
+    obj, views = object_of(quad(half), quad(half, z=5.0)), [View(Camera(0.5, 0, 0))]
     surrogate = surrogate_of(obj, views, size=SIZE)
     assert (surrogate.influence()["m1.png"] == 0).all()
     before, hidden, seen = (

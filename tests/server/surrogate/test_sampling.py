@@ -1,6 +1,5 @@
 """What a pixel reads of a texture: the pyramid, the weights, the way back, and which way is up."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from tests.surfaces import object_of, quad
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate import pyramid as module
 from trompe_server.surrogate.pyramid import mip_chains, mip_layout, read_texels
@@ -19,7 +19,6 @@ from trompe_server.surrogate.sampling import Gather
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, View
 from trompe_shared.object3d import Object3D, encode_png, object_from_files
 
-Make = Callable[..., Any]
 Image8 = NDArray[np.uint8]
 MODELS = [
     SamplingModel(),
@@ -52,8 +51,6 @@ def read_values(obj: Object3D, model: SamplingModel = MODELS[0], views: list[Vie
 
 def front_view(
     texture: Image8,
-    make_object: Make,
-    make_quad: Make,
     *,
     pixels: float,
     model: SamplingModel = MODELS[0],
@@ -62,7 +59,7 @@ def front_view(
     """What the pixels read of a square, ``pixels`` wide in the image, that faces the camera: (64, 64, 3), NaN around
     it."""
     focal = SIZE[0] / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
-    obj = make_object(make_quad(texture, half=pixels / 2 * DISTANCE / focal, **options))
+    obj = object_of(quad(texture, half=pixels / 2 * DISTANCE / focal, **options))
     views = [View(Camera(DISTANCE, 0, 0))]
     geometry, _ = reading(obj, model, views)
     image = torch.full((SIZE[0] * SIZE[1], 3), torch.nan)
@@ -184,52 +181,48 @@ def test_a_texture_of_one_colour_is_read_as_that_colour(mug: Object3D, model: Sa
 
 
 @pytest.mark.parametrize(("height", "width"), [(4, 4), (1, 4), (4, 1), (1, 1)])
-def test_the_centre_of_a_magnified_texel_shows_it_with_the_files_last_row_at_v_zero(
-    height: int, width: int, make_object: Make, make_quad: Make
-) -> None:
+def test_the_centre_of_a_magnified_texel_shows_it_with_the_files_last_row_at_v_zero(height: int, width: int) -> None:
     texture = noise(height, width)
-    seen = front_view(texture, make_object, make_quad, pixels=20)
+    seen = front_view(texture, pixels=20)
     rows = [22 + (2 * i + 1) * 20 // height // 2 for i in range(height)]
     columns = [22 + (2 * j + 1) * 20 // width // 2 for j in range(width)]
     torch.testing.assert_close(seen[rows][:, columns] * 255, torch.from_numpy(texture).float(), atol=0.1, rtol=0)
     assert torch.isnan(seen[5, 5, 0])
 
 
-def test_a_magnified_texture_is_interpolated_in_between(make_object: Make, make_quad: Make) -> None:
+def test_a_magnified_texture_is_interpolated_in_between() -> None:
     texture = np.zeros((2, 2, 3), np.uint8)
     texture[:, 1] = 200
-    middle = front_view(texture, make_object, make_quad, pixels=40)[32, 22:42, 0] * 255
+    middle = front_view(texture, pixels=40)[32, 22:42, 0] * 255
     steps = middle.diff()
     torch.testing.assert_close(steps, torch.full_like(steps, 10.0), atol=0.1, rtol=0)
 
 
-def test_a_minified_texture_is_read_as_its_average(make_object: Make, make_quad: Make) -> None:
+def test_a_minified_texture_is_read_as_its_average() -> None:
     fine = np.indices((256, 256)).sum(axis=0) % 2 * 200
-    seen = front_view(np.repeat(fine[..., None], 3, 2).astype(np.uint8), make_object, make_quad, pixels=32)[
-        18:46, 18:46
-    ]
+    seen = front_view(np.repeat(fine[..., None], 3, 2).astype(np.uint8), pixels=32)[18:46, 18:46]
     torch.testing.assert_close(seen * 255, torch.full_like(seen, 100.0), atol=1.0, rtol=0)
 
 
 @pytest.mark.parametrize("shift", [1, -3, 40])
-def test_textures_repeat_outside_of_the_unit_square(shift: int, make_object: Make, make_quad: Make) -> None:
-    corners, uvs, texture = make_quad(noise(8, 8), repeat=2.5)
+def test_textures_repeat_outside_of_the_unit_square(shift: int) -> None:
+    corners, uvs, texture = quad(noise(8, 8), repeat=2.5)
     views = [View(Camera(0.3, 20, 30))]
-    here, there = (read_values(make_object((corners, uvs + k, texture)), views=views)[0] for k in (0, shift))
+    here, there = (read_values(object_of((corners, uvs + k, texture)), views=views)[0] for k in (0, shift))
     torch.testing.assert_close(here, there, atol=2e-3, rtol=0)
 
 
-def test_two_repetitions_look_like_the_texture_twice(make_object: Make, make_quad: Make) -> None:
+def test_two_repetitions_look_like_the_texture_twice() -> None:
     texture = noise(8, 8)
     views = [View(Camera(0.3, 20, 30))]
-    repeated = read_values(make_object(make_quad(texture, repeat=2)), views=views)[0]
-    twice = read_values(make_object(make_quad(np.tile(texture, (2, 2, 1)))), views=views)[0]
+    repeated = read_values(object_of(quad(texture, repeat=2)), views=views)[0]
+    twice = read_values(object_of(quad(np.tile(texture, (2, 2, 1)))), views=views)[0]
     torch.testing.assert_close(repeated, twice, atol=2e-3, rtol=0)
 
 
-def test_each_part_reads_its_own_texture(make_object: Make, make_quad: Make) -> None:
-    left, right = (make_quad(np.full((4, 4, 3), k, np.uint8), half=0.1) for k in (50, 150))
-    obj = make_object((left[0] - [0.11, 0, 0], *left[1:]), (right[0] + [0.11, 0, 0], *right[1:]))
+def test_each_part_reads_its_own_texture() -> None:
+    left, right = (quad(np.full((4, 4, 3), k, np.uint8), half=0.1) for k in (50, 150))
+    obj = object_of((left[0] - [0.11, 0, 0], *left[1:]), (right[0] + [0.11, 0, 0], *right[1:]))
     views = [View(Camera(0.5, 0, 0))]
     geometry, _ = reading(obj, views=views)
     columns = geometry.batches[0].pixel % SIZE[1]
@@ -245,28 +238,24 @@ def cut(obj: Object3D, name: str, opacity: Image8) -> Object3D:
 
 
 @pytest.mark.parametrize("model", MODELS, ids=repr)
-def test_where_alpha_is_below_one_half_what_lies_behind_is_read(
-    model: SamplingModel, make_object: Make, make_quad: Make
-) -> None:
-    front, back = make_quad(np.full((64, 64, 3), 50, np.uint8), z=0.02), make_quad(np.full((8, 8, 3), 150, np.uint8))
+def test_where_alpha_is_below_one_half_what_lies_behind_is_read(model: SamplingModel) -> None:
+    front, back = quad(np.full((64, 64, 3), 50, np.uint8), z=0.02), quad(np.full((8, 8, 3), 150, np.uint8))
     opacity = np.full((64, 64), 255, np.uint8)
     opacity[:, :32] = 0
-    obj, views = cut(make_object(front, back), "m0.png", opacity), [View(Camera(0.5, 0, 0))]
+    obj, views = cut(object_of(front, back), "m0.png", opacity), [View(Camera(0.5, 0, 0))]
     geometry, _ = reading(obj, model, views)
     values = read_values(obj, model, views)[0][:, 0]
     left, right = (
-        read_values(make_object(make_quad(np.full((2, 2, 3), k, np.uint8))), model, views)[0][0, 0] for k in (150, 50)
+        read_values(object_of(quad(np.full((2, 2, 3), k, np.uint8))), model, views)[0][0, 0] for k in (150, 50)
     )
     column = geometry.batches[0].pixel % SIZE[1]
     assert torch.allclose(values[column < 30], left, atol=1e-3)
     assert torch.allclose(values[column > 34], right, atol=1e-3)
 
 
-def test_a_sheet_that_is_all_cut_out_leaves_every_number_as_if_it_were_not_there(
-    make_object: Make, make_quad: Make
-) -> None:
-    back, sheet = make_quad(noise(16, 16)), make_quad(noise(8, 8), z=0.02)
-    with_it, alone = cut(make_object(back, sheet), "m1.png", np.zeros((8, 8), np.uint8)), make_object(back)
+def test_a_sheet_that_is_all_cut_out_leaves_every_number_as_if_it_were_not_there() -> None:
+    back, sheet = quad(noise(16, 16)), quad(noise(8, 8), z=0.02)
+    with_it, alone = cut(object_of(back, sheet), "m1.png", np.zeros((8, 8), np.uint8)), object_of(back)
     first, second = (reading(obj)[0].batches[0] for obj in (with_it, alone))
     assert torch.equal(first.pixel, second.pixel)
     assert all(
@@ -274,10 +263,10 @@ def test_a_sheet_that_is_all_cut_out_leaves_every_number_as_if_it_were_not_there
     )
 
 
-def test_alpha_is_read_at_the_level_that_the_pixel_reads(make_object: Make, make_quad: Make) -> None:
+def test_alpha_is_read_at_the_level_that_the_pixel_reads() -> None:
     """Stripes of one texel, five eighths of them opaque: from afar their mean lets the whole sheet be seen."""
     opacity = np.where(np.arange(256) % 8 < 5, 255, 0).astype(np.uint8)[None].repeat(256, 0)
-    obj = make_object(make_quad(noise(256, 256)))
+    obj = object_of(quad(noise(256, 256)))
     views = [View(Camera(2.0, 0, 0))]
     whole, striped, faint = (
         len(reading(each, views=views)[0].batches[0].pixel)
@@ -292,12 +281,10 @@ INSIDE = slice(8, 56)
 
 
 @pytest.mark.parametrize("most", [1, 2, 4, 16])
-def test_a_footprint_four_times_as_long_as_wide_is_read_no_wider_than_the_anisotropy_makes_it(
-    most: int, make_object: Make, make_quad: Make
-) -> None:
+def test_a_footprint_four_times_as_long_as_wide_is_read_no_wider_than_the_anisotropy_makes_it(most: int) -> None:
     stripes = np.broadcast_to(noise(1, 64), (256, 64, 3)).copy()
     model = SamplingModel(anisotropy=most, samples="centre")
-    seen = front_view(stripes, make_object, make_quad, pixels=64, model=model)
+    seen = front_view(stripes, pixels=64, model=model)
     wide = 4 // min(most, 4)  # texels that become one at the level of detail
     level = torch.from_numpy(stripes[0] / 255).float().view(64 // wide, wide, 3).mean(1)
     at = (torch.arange(64) + 0.5) / wide - 0.5
@@ -306,28 +293,23 @@ def test_a_footprint_four_times_as_long_as_wide_is_read_no_wider_than_the_anisot
     assert torch.allclose(seen[32, INSIDE], expected[INSIDE], atol=0.01)
 
 
-def test_probes_lie_side_by_side_along_the_longer_axis(make_object: Make, make_quad: Make) -> None:
+def test_probes_lie_side_by_side_along_the_longer_axis() -> None:
     texture, model = noise(256, 64), SamplingModel(anisotropy=4, samples="centre")
-    seen = front_view(texture, make_object, make_quad, pixels=64, model=model)
+    seen = front_view(texture, pixels=64, model=model)
     averages = torch.from_numpy(texture / 255).float().view(64, 4, 64, 3).mean(1)
     assert torch.allclose(seen[INSIDE, INSIDE], averages[INSIDE, INSIDE], atol=0.01)
 
 
-def test_a_square_footprint_is_read_by_one_probe(make_object: Make, make_quad: Make) -> None:
-    usual, probed = (
-        front_view(noise(128, 128), make_object, make_quad, pixels=50, model=SamplingModel(anisotropy=most))
-        for most in (1, 16)
-    )
+def test_a_square_footprint_is_read_by_one_probe() -> None:
+    usual, probed = (front_view(noise(128, 128), pixels=50, model=SamplingModel(anisotropy=most)) for most in (1, 16))
     assert torch.equal(usual.isnan(), probed.isnan())
     assert torch.allclose(usual.nan_to_num(), probed.nan_to_num(), atol=1e-3)
 
 
-def test_an_ellipse_is_a_gaussian_over_the_texels_of_the_footprint_and_one_around_it(
-    make_object: Make, make_quad: Make
-) -> None:
+def test_an_ellipse_is_a_gaussian_over_the_texels_of_the_footprint_and_one_around_it() -> None:
     texture, (x, y) = noise(256, 64), (30, 40)
     model = SamplingModel(anisotropy=16, elongated="ellipse", samples="centre", bias=0.01)
-    seen = front_view(texture, make_object, make_quad, pixels=64, model=model)[y, x]
+    seen = front_view(texture, pixels=64, model=model)[y, x]
     rows, columns = np.indices((256, 64))
     squared = ((columns - x) / 2**0.5) ** 2 + ((rows - (4 * y + 1.5)) / 17**0.5) ** 2
     weight = np.exp(-2 * squared) * (squared < 1)
@@ -352,11 +334,11 @@ def test_a_shift_by_a_whole_pixel_moves_the_picture_by_one(
     assert torch.allclose(moved[:, 1:-1, 1:-1], pictures[1][:, 1:-1, 1:-1], atol=2e-3)
 
 
-def test_what_a_shift_moves_into_the_image_is_seen_at_its_edge(make_object: Make, make_quad: Make) -> None:
+def test_what_a_shift_moves_into_the_image_is_seen_at_its_edge() -> None:
     texture = noise(8, 8)
-    corners, *painted = make_quad(texture, half=0.01)
+    corners, *painted = quad(texture, half=0.01)
     right = DISTANCE * np.tan(np.radians(FIELD_OF_VIEW / 2)) + 0.0105  # begins right of the image
-    obj = make_object((np.asarray(corners) + np.array([right, 0, 0]), *painted))
+    obj = object_of((np.asarray(corners) + np.array([right, 0, 0]), *painted))
     views = [View(Camera(DISTANCE, 0, 0))]
     counts = [reading(obj, SamplingModel(shift=(shift, 0.0)), views)[0].batches[0].counts for shift in (0.0, 1.0)]
     assert counts[0] == (0,)
