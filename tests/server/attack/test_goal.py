@@ -64,16 +64,6 @@ def test_each_class_of_a_set_counts_as_the_object(rows: list[list[float]], label
     torch.testing.assert_close((-Goal(labels, loss="cross_entropy").losses(logits)).exp(), shares, atol=1e-6, rtol=1e-4)
 
 
-@given(LOGITS, SETS)
-@settings(max_examples=100)
-def test_one_class_more_in_the_set_never_helps_the_attack(rows: list[list[float]], labels: tuple[int, ...]) -> None:
-    logits, fewer = torch.tensor(rows), labels[:-1] or labels
-    assert not (Goal(labels).reached(logits) & ~Goal(fewer).reached(logits)).any()
-    assert (Goal(labels).margins(logits) <= Goal(fewer).margins(logits)).all()
-    entropies = [Goal(some, loss="cross_entropy").losses(logits) for some in (labels, fewer)]
-    assert (entropies[0] <= entropies[1] + 1e-5).all()
-
-
 @given(LOGITS, st.integers(0, 4), st.sampled_from(LOSSES))
 @settings(max_examples=100)
 def test_a_set_of_one_class_gives_the_bytes_of_the_textbook_formula(

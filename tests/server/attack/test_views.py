@@ -95,12 +95,6 @@ def test_quantities_do_not_depend_on_each_other() -> None:
     assert np.abs(correlation).max() < 0.08
 
 
-def test_what_is_not_asked_for_is_the_usual_light_and_an_upright_camera() -> None:
-    for view in sample(PLAIN, 20):
-        assert view.camera.roll == 0
-        assert view.light == Light(azimuth=view.light.azimuth, elevation=view.light.elevation)
-
-
 @pytest.mark.parametrize("name", ["roll", "intensity", "ambient", "light_colours", "backgrounds", "azimuth"])
 def test_fixing_one_quantity_leaves_the_others_as_they_were(name: str) -> None:
     if name == "backgrounds":

@@ -24,9 +24,7 @@ from trompe_server.classifiers import (
     score_based,
 )
 from trompe_server.classifiers.protocol import Wrapper
-from trompe_server.surrogate import Surrogate, textures_of
 from trompe_shared.errors import ClassifierError, SpecError
-from trompe_shared.object3d import Object3D
 
 ASSETS = os.environ.get("TROMPE_ASSETS")
 SIDE = 8
@@ -183,20 +181,6 @@ def test_an_onnx_file_can_be_attacked_by_its_scores(tmp_path: Path) -> None:
     classifier = score_based(inner, queries=2000, seed=0, sigma=0.0004, cells=SIDE)
     found = gradient(classifier, greyish(1), torch.tensor([[0.0, 1.0]]))
     assert cosine(found, torch.from_numpy(weight[:, 1])) > 0.85
-
-
-def test_an_estimate_goes_through_the_surrogate_into_the_texture(square: Object3D, surrogate: Surrogate) -> None:
-    network, textures = fake_classifier(), textures_of(square)
-
-    def into_texture(classifier: WhiteBoxClassifier) -> Tensor:
-        leaves = {name: texture.clone().requires_grad_() for name, texture in textures.items()}
-        texels = surrogate.texels(leaves)
-        losses = [
-            classifier.logits(surrogate.render(texels, batch))[:, 6].sum() for batch in range(len(surrogate.batches))
-        ]
-        return torch.cat([g.flatten() for g in torch.autograd.grad(torch.stack(losses).sum(), list(leaves.values()))])
-
-    assert cosine(into_texture(score_based(network, queries=100, seed=0, cells=8)), into_texture(network)) > 0.7
 
 
 def test_an_estimate_comes_back_through_a_change_of_size() -> None:

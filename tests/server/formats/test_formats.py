@@ -461,11 +461,6 @@ def test_a_file_is_read_and_repainted_in_another_process_as_in_this_one(mug: Obj
     assert repaint_limited(data, new, name="mug.zip") == repaint_file(data, new, name="mug.zip")
 
 
-def test_what_another_process_refuses_is_refused_with_its_words() -> None:
-    with pytest.raises(ObjectError, match="is not a supported model file"):
-        import_file(b"no model", name="t.bin")
-
-
 # The real objects
 
 

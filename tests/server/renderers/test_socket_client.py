@@ -146,15 +146,6 @@ def test_a_renderer_that_fails_is_an_error_with_the_reason(answer: Callable[[soc
         assert words in render(address)
 
 
-def test_images_come_back_unmirrored() -> None:
-    sent = np.zeros((8, 8, 3), np.uint8)
-    sent[:, 0] = 200
-    with listening(pretend(frame(encode_png(sent)))) as address, closing(SailenvTarget(*address)) as target:
-        images = target.render(triangle(), [VIEW, VIEW], size=(8, 8))
-        target.close()
-    assert (images == sent[:, ::-1]).all()
-
-
 # A worker of one's own
 
 
