@@ -296,7 +296,9 @@ def test_batch_norm_is_folded_into_the_convolution_before_it(pt2: Path) -> None:
 @pytest.mark.parametrize(
     "function",
     [
-        pytest.param(lambda net, x: _normed_and_not(net, net.body[0](x)), id="the convolution has another reader"),
+        pytest.param(
+            lambda net, x: (net.body[1](y := net.body[0](x)) + y).mean((2, 3)), id="the convolution has another reader"
+        ),
         pytest.param(lambda net, x: net.body[1](net.body[0](x).relu()).mean((2, 3)), id="something is in between"),
         pytest.param(
             lambda net, x: nn.functional.batch_norm(net.body[0](x), None, None, training=True).mean((2, 3)),
@@ -314,11 +316,6 @@ def test_a_batch_norm_that_cannot_be_folded_is_left_alone(
     torch.testing.assert_close(folded(images), program.module(check_guards=False)(images))
 
 
-def _normed_and_not(net: Any, features: Tensor) -> Tensor:
-    sums: Tensor = net.body[1](features) + features
-    return sums.mean((2, 3))
-
-
 def test_a_network_that_does_not_run_channels_last_is_left_as_it_was(tmp_path: Path) -> None:
     network = Around(lambda net, x: net.body[0](x).view(x.shape[0], -1)[:, :9])
     classifier = white_box(export(network, tmp_path / "net.pt2"))
@@ -333,7 +330,7 @@ def test_a_network_that_does_not_run_channels_last_is_left_as_it_was(tmp_path: P
     [
         pytest.param(lambda net, x: nn.functional.relu6(net.body[0](x)).mean((2, 3)), id="an activation with bounds"),
         pytest.param(lambda net, x: net.body[0](x).relu().mean((2, 3)), id="an activation without"),
-        pytest.param(lambda net, x: _activated_and_not(net.body[0](x)), id="another reader"),
+        pytest.param(lambda net, x: ((y := net.body[0](x)).relu() + y).mean((2, 3)), id="another reader"),
         pytest.param(lambda net, x: net.body[0](x).sigmoid().mean((2, 3)), id="another activation"),
     ],
 )
@@ -344,11 +341,6 @@ def test_logits_without_a_gradient_are_the_same(function: Callable[[Any, Tensor]
     assert not [node for node in network.network.scoring.graph.nodes if node.target is CONVOLUTION]
     images = fit_images(noise(3), SIZE)
     torch.testing.assert_close(network.scores(images), network.logits(images.requires_grad_()).detach())
-
-
-def _activated_and_not(features: Tensor) -> Tensor:
-    sums: Tensor = features.relu() + features
-    return sums.mean((2, 3))
 
 
 @pytest.mark.parametrize(
