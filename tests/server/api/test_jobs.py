@@ -1,10 +1,8 @@
 """Jobs over HTTP: submit once, find again, cancel, repeat, delete."""
 
-import asyncio
 import json
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 
@@ -136,18 +134,6 @@ def test_the_same_request_with_the_same_key_makes_one_job(stocked: Api) -> None:
 def test_a_key_has_a_sensible_length(stocked: Api, key: str) -> None:
     refusal = stocked.problem(stocked.post("/v1/jobs", json={}, headers={"Idempotency-Key": key}), 422)
     assert "idempotency-key" in {error["field"] for error in refusal["errors"]}
-
-
-def test_many_at_once_with_the_same_key_make_one_job(stocked: Api) -> None:
-    async def at_once() -> list[httpx.Response]:
-        body = {"object": "triangle", "goal": {"label": 0}, "victim": {"classifier": "net"}}
-        async with stocked.connect() as client:
-            posts = (client.post("/v1/jobs", json=body, headers={"Idempotency-Key": "k"}) for _ in range(20))
-            return await asyncio.gather(*posts)
-
-    answers = asyncio.run(at_once())
-    assert sorted(answer.status_code for answer in answers) == [200] * 19 + [201]
-    assert len({answer.json()["id"] for answer in answers}) == 1
 
 
 def test_jobs_are_found_by_labels_object_and_classifier(stocked: Api) -> None:

@@ -131,12 +131,6 @@ def test_the_figures_of_the_change_are_those_of_the_files(finished: Run) -> None
     assert result.max_view_change == pytest.approx(seen / 255)
 
 
-def test_the_repainted_object_differs_in_its_albedo_files_alone(finished: Run) -> None:
-    after = finished.artifacts.painted()
-    assert list(after.files) == list(CHAIR.files)
-    assert {name for name in CHAIR.files if after.files[name] != CHAIR.files[name]} == set(CHAIR.textures)
-
-
 def test_the_saved_texture_is_judged(finished: Run, library: Library) -> None:
     setup = setup_of(library, **WHOLE)
     images = FakeTarget().render(finished.artifacts.painted(), setup.views, size=setup.size)

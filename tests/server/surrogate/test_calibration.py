@@ -398,12 +398,6 @@ def test_one_view_is_enough(mug: Object3D) -> None:
     assert calibration.fidelity.good_enough
 
 
-def test_the_same_generator_gives_the_same_calibration(mug: Object3D, usual: Usual) -> None:
-    first, second = usual("calibrated"), found(mug, USUAL, "calibrated")
-    assert first.fidelity == second.fidelity
-    assert (first.probes == second.probes).all()
-
-
 @pytest.mark.parametrize("wanted", ["diffuse", "auto"])
 def test_a_target_that_lies_is_found_out(mug: Object3D, wanted: SurrogateModel) -> None:
     random = np.random.default_rng(0)

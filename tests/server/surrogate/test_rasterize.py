@@ -362,8 +362,3 @@ def test_awkward_triangles_give_finite_numbers_and_hide_only_what_is_behind_them
     covered = cast(camera, rays(camera, positions(CENTRE), SIZE), awkward).barycentric[:, 0].min(axis=-1) > -0.01
     assert covered[together == 0].all()
     assert (seen_faces(mesh_from(wall), camera).ravel()[together == -1] == -1).all()
-
-
-@pytest.mark.parametrize("kind", ["a point", "a line"])
-def test_triangles_without_area_are_not_seen(kind: str) -> None:
-    assert (seen_faces(mesh_from(np.array([AWKWARD[kind]], float)), Camera(2, 17, 23), samples=MSAA4) == -1).all()

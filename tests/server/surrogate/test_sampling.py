@@ -220,16 +220,6 @@ def test_two_repetitions_look_like_the_texture_twice() -> None:
     torch.testing.assert_close(repeated, twice, atol=2e-3, rtol=0)
 
 
-def test_each_part_reads_its_own_texture() -> None:
-    left, right = (quad(np.full((4, 4, 3), k, np.uint8), half=0.1) for k in (50, 150))
-    obj = object_of((left[0] - [0.11, 0, 0], *left[1:]), (right[0] + [0.11, 0, 0], *right[1:]))
-    views = [View(Camera(0.5, 0, 0))]
-    geometry, _ = reading(obj, views=views)
-    columns = geometry.batches[0].pixel % SIZE[1]
-    values = read_values(obj, views=views)[0][:, 0] * 255
-    torch.testing.assert_close(values, torch.where(columns < 32, 50.0, 150.0), atol=0.1, rtol=0)
-
-
 def cut(obj: Object3D, name: str, opacity: Image8) -> Object3D:
     """``obj`` with an alpha channel (H, W), of the texture's size, in one of its albedo files."""
     picture = Image.fromarray(obj.textures[name])
