@@ -1,13 +1,16 @@
-"""Small attacks on the ``square`` of the fixtures, 32 x 32 pixels, with the fake classifier."""
+"""Small attacks on a square, 32 x 32 pixels, with the fake classifier."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
+import numpy as np
 import torch
 from hypothesis import settings
+from torch import Tensor
 
 from tests.fakes import fake_classifier
+from tests.surfaces import object_of, quad
 from trompe_server.attack import AttackState, Budget, Goal, Step, attack, start
 from trompe_server.attack.objective import Objective
 from trompe_server.classifiers import NetworkClassifier, WhiteBoxClassifier
@@ -25,10 +28,10 @@ from trompe_shared.object3d import Object3D
 
 SIZE: Final = (32, 32)
 LABEL: Final = 6
-"""Class of the square for the fake classifier in all views of ``surrogate``."""
+"""Class of the square for the fake classifier in all ``VIEWS``."""
 
 VIEWS: Final = [View(Camera(0.3, azimuth, elevation)) for azimuth in (-40, -10, 20, 45) for elevation in (-20, 0, 30)]
-"""The views of ``surrogate``."""
+"""All see the front of ``SQUARE``."""
 
 EPS: Final = 1e-6
 SMALL: Final = settings(max_examples=6)
@@ -46,10 +49,16 @@ def surrogate_of(
     return diffuse_surrogate(geometry, views, **options)
 
 
+_RANDOM: Final = np.random.default_rng(0)
+SQUARE: Final = object_of(*(quad(_RANDOM.integers(40, 216, (16, 16, 3), dtype=np.uint8), z=z) for z in (0.0, 9.0)))
+"""A square, and one behind the cameras that none sees."""
+SURROGATE: Final = surrogate_of(SQUARE, VIEWS)
+
+
 def run(
-    obj: Object3D,
-    surrogate: AnySurrogate,
+    surrogate: AnySurrogate = SURROGATE,
     *,
+    obj: Object3D = SQUARE,
     steps: int = 6,
     state: AttackState | None = None,
     classifier: WhiteBoxClassifier | Sequence[WhiteBoxClassifier] | None = None,
@@ -62,19 +71,19 @@ def run(
     return attack(state or start(textures), textures, surrogate, victim, steps=steps, **asked)
 
 
-def random_state(obj: Object3D, budget: Budget, seed: int) -> AttackState:
+def random_state(budget: Budget, seed: int) -> AttackState:
     """A random change within the budget, to begin at."""
-    generator, textures = torch.Generator().manual_seed(seed), textures_of(obj)
+    generator, textures = torch.Generator().manual_seed(seed), textures_of(SQUARE)
     wishes = {
         name: torch.empty_like(texture).uniform_(-1, 1, generator=generator) for name, texture in textures.items()
     }
     return AttackState(0, {name: budget.box(textures[name]).project(wish) for name, wish in wishes.items()})
 
 
-def steps_of(obj: Object3D, surrogate: Surrogate, **options: Any) -> list[Step]:
+def steps_of(surrogate: AnySurrogate = SURROGATE, **options: Any) -> list[Step]:
     """The steps that ``run`` reports."""
     seen: list[Step] = []
-    run(obj, surrogate, on_step=seen.append, **options)
+    run(surrogate, on_step=seen.append, **options)
     return seen
 
 
@@ -87,21 +96,20 @@ def same(one: AttackState, other: AttackState) -> bool:
 
 
 def objective_of(
-    obj: Object3D,
-    surrogate: AnySurrogate,
     *members: WhiteBoxClassifier,
+    surrogate: AnySurrogate = SURROGATE,
     goal: Goal | None = None,
-    masks: torch.Tensor | None = None,
+    masks: Tensor | None = None,
 ) -> Objective:
     """All texels may move."""
-    textures = textures_of(obj)
+    textures = textures_of(SQUARE)
     canvas = surrogate.canvas(textures, {name: texture[..., 0] >= 0 for name, texture in textures.items()})
     return Objective(textures, surrogate, members or (fake_classifier(),), goal or Goal(LABEL), masks, canvas)
 
 
-def mean_loss(obj: Object3D, surrogate: Surrogate, state: AttackState, goal: Goal | None = None) -> float:
+def mean_loss(state: AttackState, goal: Goal | None = None) -> float:
     """Mean loss of a state over all views."""
-    objective = objective_of(obj, surrogate, goal=goal)
+    objective = objective_of(goal=goal)
     deltas = {name: repeated(state.deltas[name], texture.shape) for name, texture in objective.textures.items()}
     return objective.score(objective.join(deltas)).loss
 

@@ -8,13 +8,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-import tests.attack_runs as attack_runs
-from tests.attack_runs import SIZE, SMALL
+from tests.attack_runs import SIZE, SMALL, SQUARE, surrogate_of
 from trompe_server.attack import Backgrounds
 from trompe_server.attack.backgrounds import MIN_WEIGHT
 from trompe_server.surrogate import Surrogate, textures_of
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import Object3D
 
 PHOTO = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
 CHOICE: list[tuple[int, int, int] | str] = [(0, 0, 0), (255, 255, 255), "photo"]
@@ -30,8 +28,8 @@ def in_front_of(choice: Sequence[int]) -> list[View]:
     ]
 
 
-def surrogate_of(obj: Object3D, own: Sequence[int]) -> Surrogate:
-    return attack_runs.surrogate_of(obj, in_front_of(own), backdrops={"photo": PHOTO})
+def before(own: Sequence[int]) -> Surrogate:
+    return surrogate_of(SQUARE, in_front_of(own), backdrops={"photo": PHOTO})
 
 
 def backgrounds(own: Sequence[int]) -> Backgrounds:
@@ -42,12 +40,12 @@ def backgrounds(own: Sequence[int]) -> Backgrounds:
 @given(seed=st.integers(0, 99), step=st.integers(0, 99), own=st.lists(st.integers(0, 2), min_size=3, max_size=13))
 @SMALL
 def test_views_look_as_if_they_had_been_measured_in_front_of_what_was_drawn(
-    square: Object3D, seed: int, step: int, own: list[int]
+    seed: int, step: int, own: list[int]
 ) -> None:
-    moved = backgrounds(own).behind(surrogate_of(square, own), seed=seed, step=step)
-    there = surrogate_of(square, backgrounds(own).drawn(seed=seed, step=step).tolist())
+    moved = backgrounds(own).behind(before(own), seed=seed, step=step)
+    there = before(backgrounds(own).drawn(seed=seed, step=step).tolist())
     for batch in range(len(there.batches)):
-        images = [each.render(each.texels(textures_of(square)), batch) for each in (moved, there)]
+        images = [each.render(each.texels(textures_of(SQUARE)), batch) for each in (moved, there)]
         torch.testing.assert_close(images[0], images[1], atol=1e-5, rtol=0)
 
 

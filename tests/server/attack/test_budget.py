@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.attack_runs import EPS, SMALL, random_state, run, surrogate_of
+from tests.attack_runs import EPS, SMALL, SQUARE, SURROGATE, random_state, run, surrogate_of
 from tests.surfaces import object_of, quad
 from trompe_server.attack import Budget
 from trompe_server.attack.budget import HUE
@@ -193,12 +193,12 @@ def test_equal_bounds_are_about_equally_visible() -> None:
     assert max(own) / min(own) < 1.4 < max(same) / min(same)
 
 
-def test_an_attack_keeps_its_bounds(square: Object3D, surrogate: Surrogate) -> None:
+def test_an_attack_keeps_its_bounds() -> None:
     budget = Budget(0.1, 0.03, perceptual=True)
-    state = run(square, surrogate, budget=budget, steps=8)
-    clean = textures_of(square)
-    bounds = {name: bound(each, footprint=surrogate.footprint[name], epsilon=0.1) for name, each in clean.items()}
-    painted = textures_of(budget.repaint(square, state.deltas))
+    state = run(budget=budget, steps=8)
+    clean = textures_of(SQUARE)
+    bounds = {name: bound(each, footprint=SURROGATE.footprint[name], epsilon=0.1) for name, each in clean.items()}
+    painted = textures_of(budget.repaint(SQUARE, state.deltas))
     change = {name: (painted[name] - each).abs() for name, each in clean.items()}
     assert all((change[name].amax(2) <= bounds[name] + 1e-4).all() for name in change)
     assert change["m0.png"].max() > 0.02
@@ -213,11 +213,11 @@ def images_of(surrogate: Surrogate, textures: dict[str, Tensor]) -> Tensor:
 
 
 def attacked(
-    obj: Object3D, surrogate: Surrogate, epsilon_view: float | None, **options: Any
+    epsilon_view: float | None, *, obj: Object3D = SQUARE, surrogate: Surrogate = SURROGATE, **options: Any
 ) -> tuple[dict[str, Tensor], float]:
     """The deltas of an attack, and the largest change of its images, for floats and for saved textures."""
     textures, budget = textures_of(obj), Budget(0.3, 0.1, epsilon_view)
-    state = run(obj, surrogate, budget=budget, steps=3, **options)
+    state = run(surrogate, obj=obj, budget=budget, steps=3, **options)
     painted = {name: textures[name] + delta for name, delta in state.deltas.items()}
     clean, saved = images_of(surrogate, textures), textures_of(budget.repaint(obj, state.deltas))
     change = max(float((images_of(surrogate, each) - clean).abs().max()) for each in (painted, saved))
@@ -227,17 +227,15 @@ def attacked(
 @pytest.mark.parametrize("optimiser", ["pgd", "nesterov"])
 @given(epsilon_view=st.floats(0.002, 0.3), seed=st.integers(0, 9))
 @SMALL
-def test_no_pixel_changes_by_more_than_the_bound(
-    optimiser: str, square: Object3D, surrogate: Surrogate, epsilon_view: float, seed: int
-) -> None:
-    begin = random_state(square, Budget(0.3, 0.1), seed)
-    _, change = attacked(square, surrogate, epsilon_view, optimiser=optimiser, state=begin)
+def test_no_pixel_changes_by_more_than_the_bound(optimiser: str, epsilon_view: float, seed: int) -> None:
+    begin = random_state(Budget(0.3, 0.1), seed)
+    _, change = attacked(epsilon_view, optimiser=optimiser, state=begin)
     assert change <= epsilon_view + 1e-5
 
 
-def test_the_bound_is_used_up_at_no_needless_cost(square: Object3D, surrogate: Surrogate) -> None:
-    bounded, change = attacked(square, surrogate, 0.05)
-    free, largest = attacked(square, surrogate, None)
+def test_the_bound_is_used_up_at_no_needless_cost() -> None:
+    bounded, change = attacked(0.05)
+    free, largest = attacked(None)
     assert largest > 0.1
     assert 0.045 < change <= 0.05 + 1e-5
     assert bounded["m0.png"].abs().mean() > 0.8 * free["m0.png"].abs().mean() * 0.05 / largest
@@ -249,10 +247,10 @@ def test_the_bound_holds_for_textures_seen_from_afar(filtered: Any) -> None:
     views = [View(Camera(distance, azimuth, 10)) for distance in (0.3, 1.5) for azimuth in (-80, 0, 30)]
     surrogate = surrogate_of(obj, views, sampling=SamplingModel(filtered=filtered))
     for epsilon_view in (0.01, 0.03):
-        assert attacked(obj, surrogate, epsilon_view)[1] <= epsilon_view + 1e-5
+        assert attacked(epsilon_view, obj=obj, surrogate=surrogate)[1] <= epsilon_view + 1e-5
 
 
-def test_an_unreached_bound_changes_nothing(square: Object3D, surrogate: Surrogate) -> None:
-    bounded, _ = attacked(square, surrogate, 1.0)
-    free, _ = attacked(square, surrogate, None)
+def test_an_unreached_bound_changes_nothing() -> None:
+    bounded, _ = attacked(1.0)
+    free, _ = attacked(None)
     assert all(torch.equal(bounded[name], free[name]) for name in free)

@@ -15,6 +15,8 @@ from tests.attack_runs import (
     LABEL,
     SIZE,
     SMALL,
+    SQUARE,
+    SURROGATE,
     fooled_classifier,
     objective_of,
     run,
@@ -47,41 +49,41 @@ from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
 
 
-def test_a_step_reports_the_mean_over_all_views_before_it_moves(square: Object3D, surrogate: Surrogate) -> None:
-    (step,) = steps_of(square, surrogate, steps=1)
-    logits = fake_classifier().logits(surrogate.render_all(surrogate.texels(textures_of(square))))
+def test_a_step_reports_the_mean_over_all_views_before_it_moves() -> None:
+    (step,) = steps_of(steps=1)
+    logits = fake_classifier().logits(SURROGATE.render_all(SURROGATE.texels(textures_of(SQUARE))))
     assert step.loss == pytest.approx(float(Goal(LABEL).losses(logits).mean()), abs=1e-4)
     assert step.fooled == float(Goal(LABEL).reached(logits).float().mean())
 
 
-def test_a_step_goes_along_the_sign_of_the_mean_gradient(square: Object3D, surrogate: Surrogate) -> None:
-    leaf = textures_of(square)["m0.png"].requires_grad_()
-    texels = surrogate.texels(textures_of(square) | {"m0.png": leaf})
-    logits = fake_classifier().logits(surrogate.render_all(texels))
+def test_a_step_goes_along_the_sign_of_the_mean_gradient() -> None:
+    leaf = textures_of(SQUARE)["m0.png"].requires_grad_()
+    texels = SURROGATE.texels(textures_of(SQUARE) | {"m0.png": leaf})
+    logits = fake_classifier().logits(SURROGATE.render_all(texels))
     (gradient,) = torch.autograd.grad(Goal(LABEL).losses(logits).mean(), leaf)
     clear = gradient.abs() > 1e-6
-    delta = run(square, surrogate, steps=1).deltas["m0.png"]
+    delta = run(steps=1).deltas["m0.png"]
     assert clear.float().mean() > 0.5
     torch.testing.assert_close(delta[clear], 0.02 * gradient.sign()[clear], atol=EPS, rtol=0)
 
 
-def test_a_search_can_begin_at_a_known_change(square: Object3D, surrogate: Surrogate) -> None:
-    known = run(square, surrogate, steps=4)
-    again = run(square, surrogate, steps=1, state=AttackState(0, known.deltas), budget=Budget(0.06, 1e-4))
+def test_a_search_can_begin_at_a_known_change() -> None:
+    known = run(steps=4)
+    again = run(steps=1, state=AttackState(0, known.deltas), budget=Budget(0.06, 1e-4))
     assert (again.deltas["m0.png"] - known.deltas["m0.png"]).abs().max() <= 1e-4 + EPS
 
 
 # Saliency masks
 
 
-def test_with_masks_only_texels_of_masked_pixels_move(square: Object3D, surrogate: Surrogate) -> None:
-    masks = torch.zeros(surrogate.n_views, *SIZE, dtype=torch.bool)
+def test_with_masks_only_texels_of_masked_pixels_move() -> None:
+    masks = torch.zeros(SURROGATE.n_views, *SIZE, dtype=torch.bool)
     masks[:4, 12:18, 12:18] = True
-    moved = (run(square, surrogate, masks=masks).deltas["m0.png"] != 0).any(dim=2)
-    read = surrogate.influence(masks)["m0.png"] > 0
+    moved = (run(masks=masks).deltas["m0.png"] != 0).any(dim=2)
+    read = SURROGATE.influence(masks)["m0.png"] > 0
     assert moved.any()
     assert not moved[~read].any()
-    assert moved.sum() < (run(square, surrogate).deltas["m0.png"] != 0).any(dim=2).sum()
+    assert moved.sum() < (run().deltas["m0.png"] != 0).any(dim=2).sum()
 
 
 class Askew(torch.nn.Module):
@@ -99,41 +101,39 @@ class Askew(torch.nn.Module):
 
 
 @pytest.mark.parametrize("gain", [0.001, 0.004], ids=["the loss falls", "the loss rises and a view is lost"])
-def test_a_masked_attack_never_ends_below_the_unpainted_object(
-    square: Object3D, surrogate: Surrogate, gain: float
-) -> None:
+def test_a_masked_attack_never_ends_below_the_unpainted_object(gain: float) -> None:
     """The unmasked pixels pull their texels up; other views of the same texels lose by it."""
     rows, columns = slice(12, 18), slice(20, 26)
-    masks = torch.zeros(surrogate.n_views, *SIZE, dtype=torch.bool)
+    masks = torch.zeros(SURROGATE.n_views, *SIZE, dtype=torch.bool)
     masks[0, rows, columns] = True
-    textures = textures_of(square)
+    textures = textures_of(SQUARE)
 
     def askew(offset: float) -> NetworkClassifier:
         return NetworkClassifier("askew", Askew(rows, columns, gain=gain, offset=offset), SIZE, 2)
 
     def logits(change: Tensor) -> Tensor:
         painted = textures | {"m0.png": textures["m0.png"] + change}
-        return askew(0.0).logits(surrogate.render_all(surrogate.texels(painted)))[:, 1]
+        return askew(0.0).logits(SURROGATE.render_all(SURROGATE.texels(painted)))[:, 1]
 
-    pulled = 0.06 * movable(surrogate, Budget(0.06, 0.02), masks)["m0.png"][..., None]
+    pulled = 0.06 * movable(SURROGATE, Budget(0.06, 0.02), masks)["m0.png"][..., None]
     before, after = logits(torch.zeros_like(textures["m0.png"])), logits(pulled)
     barely_fooled = askew(1e-4 - float(before[after < before - 1e-3].max()))
     seen: list[Step] = []
-    state = run(square, surrogate, classifier=barely_fooled, goal=Goal(0), masks=masks, on_step=seen.append)
+    state = run(classifier=barely_fooled, goal=Goal(0), masks=masks, on_step=seen.append)
 
-    objective = objective_of(square, surrogate, barely_fooled, goal=Goal(0))
+    objective = objective_of(barely_fooled, goal=Goal(0))
     unpainted = objective.score(torch.zeros_like(objective.source))
     assert min((step.fooled, step.loss) for step in seen) < (unpainted.fooled - 0.01, 0)
     assert (max(step.loss for step in seen) > unpainted.loss + 1e-3) == (gain == 0.004)
     assert objective.score(objective.join(state.deltas)) >= unpainted
-    assert seen[-1].evaluations == (6 + 2) * surrogate.n_views
+    assert seen[-1].evaluations == (6 + 2) * SURROGATE.n_views
 
 
-def test_movable_texels_change_the_views_by_four_levels(square: Object3D, surrogate: Surrogate) -> None:
-    small, large = movable(surrogate, Budget(0.004, 0.004)), movable(surrogate, Budget(1.0, 0.1))
-    influence = surrogate.influence()
-    for name in square.textures:
-        assert torch.equal(large[name], influence[name] * surrogate.footprint[name] >= 4 / 255)
+def test_movable_texels_change_the_views_by_four_levels() -> None:
+    small, large = movable(SURROGATE, Budget(0.004, 0.004)), movable(SURROGATE, Budget(1.0, 0.1))
+    influence = SURROGATE.influence()
+    for name in SQUARE.textures:
+        assert torch.equal(large[name], influence[name] * SURROGATE.footprint[name] >= 4 / 255)
         assert not (small[name] & ~large[name]).any()
     assert not large["m1.png"].any()
 
@@ -179,10 +179,10 @@ FRONT = [View(Camera(0.3, azimuth, 0)) for azimuth in (-40, 0, 40)]
 
 
 @pytest.fixture(scope="module")
-def fine_square(square: Object3D) -> Object3D:
+def fine_square() -> Object3D:
     """The square with a texture much finer than its views show, with black and white texels."""
     image = np.random.default_rng(0).integers(-60, 316, (256, 256, 3)).clip(0, 255).astype(np.uint8)
-    return square.with_textures({"m0.png": image})
+    return SQUARE.with_textures({"m0.png": image})
 
 
 @pytest.mark.parametrize("perceptual", [False, True])
@@ -192,7 +192,7 @@ def test_texels_that_views_do_not_tell_apart_move_together_within_the_budget(
 ) -> None:
     surrogate = surrogate_of(fine_square, FRONT, sampling=SamplingModel(filtered=filtered))
     budget = Budget(0.06, 0.02, perceptual=perceptual)
-    state = run(fine_square, surrogate, budget=budget)
+    state = run(surrogate, obj=fine_square, budget=budget)
     side = 256 >> surrogate.spare_levels["m0.png"]
     assert state.deltas["m0.png"].shape == (side, side, 3)
     assert side < 256
@@ -200,30 +200,29 @@ def test_texels_that_views_do_not_tell_apart_move_together_within_the_budget(
     change = painted["m0.png"] - textures_of(fine_square)["m0.png"]
     assert change.abs().max() <= 15 / 255 + EPS
     seen = [surrogate.render_all(surrogate.texels(each)) for each in (painted, textures_of(fine_square))]
-    objective = objective_of(fine_square, surrogate)
-    before, after = (float(objective.goal.losses(fake_classifier().logits(each)).mean()) for each in reversed(seen))
+    before, after = (float(Goal(LABEL).losses(fake_classifier().logits(each)).mean()) for each in reversed(seen))
     assert after > before + 0.02
-    halfway = run(fine_square, surrogate, budget=budget, steps=2, total_steps=6)
-    assert same(run(fine_square, surrogate, budget=budget, steps=4, total_steps=6, state=halfway), state)
+    halfway = run(surrogate, obj=fine_square, budget=budget, steps=2, total_steps=6)
+    assert same(run(surrogate, obj=fine_square, budget=budget, steps=4, total_steps=6, state=halfway), state)
 
 
 def test_texels_that_may_not_all_move_or_whose_images_are_bounded_move_alone(fine_square: Object3D) -> None:
     surrogate = surrogate_of(fine_square, FRONT)
-    bounded = run(fine_square, surrogate, budget=Budget(0.06, 0.02, epsilon_view=0.03), steps=1)
+    bounded = run(surrogate, obj=fine_square, budget=Budget(0.06, 0.02, epsilon_view=0.03), steps=1)
     assert bounded.deltas["m0.png"].shape == (256, 256, 3)
     left = {name: torch.zeros(image.shape[:2], dtype=torch.bool) for name, image in fine_square.textures.items()}
     left["m0.png"][:, :128] = True
-    halves = run(fine_square, surrogate, texels=left, steps=1)
+    halves = run(surrogate, obj=fine_square, texels=left, steps=1)
     assert len(halves.deltas["m0.png"]) < 256
     left["m0.png"][::2] = False
-    state = run(fine_square, surrogate, texels=left, steps=1)
+    state = run(surrogate, obj=fine_square, texels=left, steps=1)
     assert state.deltas["m0.png"].shape == (256, 256, 3)
     assert not state.deltas["m0.png"][~left["m0.png"]].any()
 
 
-def test_an_attack_without_a_visible_texel_ends_at_once(square: Object3D, surrogate: Surrogate) -> None:
+def test_an_attack_without_a_visible_texel_ends_at_once() -> None:
     with pytest.raises(SpecError, match=r"epsilon=0.0001. Come closer by `distance`, or raise `epsilon`"):
-        run(square, surrogate, budget=Budget(0.0001, 0.0001))
+        run(budget=Budget(0.0001, 0.0001))
 
 
 # The pool: each step evaluates some of the views
@@ -235,25 +234,25 @@ def pool(n: int, *, seed: int) -> list[View]:
 
 
 @pytest.fixture(scope="module")
-def many_views(square: Object3D) -> Surrogate:
-    return surrogate_of(square, pool(30, seed=5))
+def many_views() -> Surrogate:
+    return surrogate_of(SQUARE, pool(30, seed=5))
 
 
-def losses(square: Object3D, surrogate: Surrogate, **options: Any) -> list[float]:
-    return [step.loss for step in steps_of(square, surrogate, steps=4, **options)]
+def losses(surrogate: Surrogate, **options: Any) -> list[float]:
+    return [step.loss for step in steps_of(surrogate, steps=4, **options)]
 
 
-def test_each_step_draws_other_views(square: Object3D, many_views: Surrogate) -> None:
-    texels = many_views.texels(textures_of(square))
+def test_each_step_draws_other_views(many_views: Surrogate) -> None:
+    texels = many_views.texels(textures_of(SQUARE))
     with torch.no_grad():
         logits = [fake_classifier().logits(many_views.render(texels, batch)) for batch in range(3)]
-    first = losses(square, many_views, views_per_step=10)[0]
+    first = losses(many_views, views_per_step=10)[0]
     assert any(first == pytest.approx(float(Goal(LABEL).losses(some).mean()), abs=1e-4) for some in logits)
-    assert first != pytest.approx(losses(square, many_views)[0], abs=1e-6)
+    assert first != pytest.approx(losses(many_views)[0], abs=1e-6)
 
 
-def test_the_seed_decides_the_drawn_views(square: Object3D, many_views: Surrogate) -> None:
-    drawn = [losses(square, many_views, views_per_step=10, seed=seed) for seed in (1, 1, 2, 3)]
+def test_the_seed_decides_the_drawn_views(many_views: Surrogate) -> None:
+    drawn = [losses(many_views, views_per_step=10, seed=seed) for seed in (1, 1, 2, 3)]
     assert drawn[0] == drawn[1]
     assert drawn[2:] != [drawn[0], drawn[0]]
 
@@ -274,23 +273,21 @@ RUNS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("kind", RUNS)
 @given(share=st.floats(0.1, 0.9), seed=st.integers(0, 99))
 @SMALL
-def test_a_run_cut_anywhere_resumes_bit_for_bit(
-    kind: str, square: Object3D, surrogate: Surrogate, many_views: Surrogate, share: float, seed: int
-) -> None:
-    views = many_views if "views_per_step" in RUNS[kind] else surrogate
+def test_a_run_cut_anywhere_resumes_bit_for_bit(kind: str, many_views: Surrogate, share: float, seed: int) -> None:
+    views = many_views if "views_per_step" in RUNS[kind] else SURROGATE
     options: dict[str, Any] = {"seed": seed, "total_steps": 7} | RUNS[kind]
     total, seen = options["total_steps"], list[Step]()
     cut = max(1, round(share * total))
-    whole = run(square, views, steps=total, **options)
-    part = load_state(save_state(run(square, views, steps=cut, on_step=seen.append, **options)))
-    ended = run(square, views, steps=total - cut, state=part, on_step=seen.append, **options)
+    whole = run(views, steps=total, **options)
+    part = load_state(save_state(run(views, steps=cut, on_step=seen.append, **options)))
+    ended = run(views, steps=total - cut, state=part, on_step=seen.append, **options)
     assert same(ended, whole)
     assert [step.step for step in seen] == list(range(len(seen)))
     assert (len(seen) == total) == (kind != "early end")
 
 
-def test_backgrounds_change_a_run(square: Object3D, many_views: Surrogate) -> None:
-    plain, drawn = (run(square, many_views, steps=5, **RUNS[kind]) for kind in ("pool", "backgrounds"))
+def test_backgrounds_change_a_run(many_views: Surrogate) -> None:
+    plain, drawn = (run(many_views, steps=5, **RUNS[kind]) for kind in ("pool", "backgrounds"))
     assert save_state(plain) != save_state(drawn)
 
 
@@ -318,11 +315,11 @@ class Broken(torch.nn.Module):
 @pytest.mark.parametrize("where", ["gradient", "inf", "nan"])
 @pytest.mark.parametrize("optimiser", ["pgd", "nesterov"])
 def test_a_failing_classifier_never_makes_nan_and_leaves_the_object_alone_if_it_fails_on_all_images(
-    optimiser: str, where: str, every: bool, square: Object3D, surrogate: Surrogate
+    optimiser: str, where: str, every: bool
 ) -> None:
     network = Broken(fake_classifier().network, every=every, where=where)
     broken = NetworkClassifier("broken", network, SIZE, 10)
-    state = run(square, surrogate, classifier=broken, steps=3, budget=Budget(0.1, 0.03), optimiser=optimiser)
+    state = run(classifier=broken, steps=3, budget=Budget(0.1, 0.03), optimiser=optimiser)
     assert all(torch.isfinite(delta).all() for delta in state.deltas.values())
     assert any((delta != 0).any() for delta in state.deltas.values()) == (not every)
     assert every or (state.deltas["m0.png"] != 0).any()
@@ -343,24 +340,20 @@ def test_a_failing_classifier_never_makes_nan_and_leaves_the_object_alone_if_it_
         pytest.param({"masks": torch.zeros(12, *SIZE, dtype=torch.bool)}, "Lower `tau`", id="empty masks"),
     ],
 )
-def test_contradictions_are_refused_before_any_work(
-    options: dict[str, Any], message: str, square: Object3D, surrogate: Surrogate
-) -> None:
+def test_contradictions_are_refused_before_any_work(options: dict[str, Any], message: str) -> None:
     seen: list[Step] = []
     with pytest.raises(SpecError, match=message):
-        run(square, surrogate, steps=3, on_step=seen.append, **options)
+        run(steps=3, on_step=seen.append, **options)
     assert seen == []
 
 
 # Several classifiers
 
 
-def test_the_loss_of_several_classifiers_is_their_mean(square: Object3D, surrogate: Surrogate) -> None:
+def test_the_loss_of_several_classifiers_is_their_mean() -> None:
     one, other = fake_classifier(seed=0), fake_classifier(seed=1)
     found = [
-        objective_of(square, surrogate, *members).evaluate(
-            torch.zeros(512, 3), [0, 1], torch.ones(12, dtype=torch.bool)
-        )
+        objective_of(*members).evaluate(torch.zeros(512, 3), [0, 1], torch.ones(12, dtype=torch.bool))
         for members in ((one,), (other,), (one, other))
     ]
     assert found[2].loss == pytest.approx((found[0].loss + found[1].loss) / 2, abs=1e-5)
@@ -370,11 +363,11 @@ def test_the_loss_of_several_classifiers_is_their_mean(square: Object3D, surroga
     assert found[2].images == found[0].images == 12
 
 
-def test_a_view_is_fooled_when_every_classifier_is(square: Object3D, surrogate: Surrogate) -> None:
+def test_a_view_is_fooled_when_every_classifier_is() -> None:
     members = [fake_classifier(seed=0), fake_classifier(seed=1)]
-    (step,) = steps_of(square, surrogate, classifier=members, budget=Budget(0.1, 0.1), steps=1)
+    (step,) = steps_of(classifier=members, budget=Budget(0.1, 0.1), steps=1)
     with torch.no_grad():
-        images = surrogate.render_all(surrogate.texels(textures_of(square)))
+        images = SURROGATE.render_all(SURROGATE.texels(textures_of(SQUARE)))
         reached = [Goal(LABEL).reached(member.logits(images)) for member in members]
     assert reached[0].tolist() != reached[1].tolist()
     assert step.fooled == float((reached[0] & reached[1]).float().mean())
@@ -383,8 +376,8 @@ def test_a_view_is_fooled_when_every_classifier_is(square: Object3D, surrogate: 
 # Skipped views
 
 
-def test_only_active_views_are_evaluated(square: Object3D, surrogate: Surrogate) -> None:
-    objective = objective_of(square, surrogate)
+def test_only_active_views_are_evaluated() -> None:
+    objective = objective_of()
     active = torch.zeros(12, dtype=torch.bool)
     active[[1, 4, 11]] = True
     change = torch.zeros(512, 3)
@@ -402,35 +395,33 @@ def test_only_active_views_are_evaluated(square: Object3D, surrogate: Surrogate)
 # The safe margin, and the end of a search
 
 
-def fooled_run(obj: Object3D, surrogate: Surrogate, **options: Any) -> AttackState:
+def fooled_run(**options: Any) -> AttackState:
     """A search on a classifier that is fooled from the beginning."""
-    return run(obj, surrogate, classifier=fooled_classifier(), **{"budget": Budget(0.1, 0.1)} | options)
+    return run(classifier=fooled_classifier(), **{"budget": Budget(0.1, 0.1)} | options)
 
 
 @pytest.mark.parametrize("optimiser", ["pgd", "nesterov"])
-def test_safely_won_views_are_skipped_for_two_steps_and_nothing_moves(
-    optimiser: str, square: Object3D, surrogate: Surrogate
-) -> None:
+def test_safely_won_views_are_skipped_for_two_steps_and_nothing_moves(optimiser: str) -> None:
     seen: list[Step] = []
-    state = fooled_run(square, surrogate, steps=5, optimiser=optimiser, on_step=seen.append)
+    state = fooled_run(steps=5, optimiser=optimiser, on_step=seen.append)
     assert [step.evaluations for step in seen] == [12, 12, 12, 24, 24]
     assert [step.fooled for step in seen] == [1.0] * 5
     assert [step.loss for step in seen] == pytest.approx([SAFE_MARGIN * RISE**step.step for step in seen])
     assert all((delta == 0).all() for delta in state.deltas.values())
 
 
-def test_a_search_ends_once_all_views_are_safely_won(square: Object3D, surrogate: Surrogate) -> None:
+def test_a_search_ends_once_all_views_are_safely_won() -> None:
     seen: list[Step] = []
-    state = fooled_run(square, surrogate, steps=40, on_step=seen.append)
+    state = fooled_run(steps=40, on_step=seen.append)
     assert len(seen) == int(np.log(SAFE_ENOUGH / SAFE_MARGIN) / np.log(RISE)) + 1
     assert [step.least_left for step in seen] == list(range(len(seen)))[::-1]
     assert state.step == 40
     assert all((delta == 0).all() for delta in state.deltas.values())
 
 
-def test_a_goal_with_an_unreachable_margin_runs_all_steps(square: Object3D, surrogate: Surrogate) -> None:
+def test_a_goal_with_an_unreachable_margin_runs_all_steps() -> None:
     seen: list[Step] = []
-    state = fooled_run(square, surrogate, steps=40, goal=Goal(LABEL, safe=1000.0), on_step=seen.append)
+    state = fooled_run(steps=40, goal=Goal(LABEL, safe=1000.0), on_step=seen.append)
     assert [step.step for step in seen] == list(range(40))
     assert all(90 < step.loss < 110 and step.fooled == 1 for step in seen)
     assert [step.least_left for step in seen] == list(range(40))[::-1]
@@ -444,11 +435,9 @@ def test_a_goal_with_an_unreachable_margin_runs_all_steps(square: Object3D, surr
         pytest.param(3.0, 1, 3 / RISE, id="falls when views are lost again"),
     ],
 )
-def test_the_margin_follows_the_views(
-    before: float, steps: int, after: float, square: Object3D, surrogate: Surrogate
-) -> None:
-    known = AttackState(0, start(textures_of(square)).deltas, {"search.safe": torch.tensor(before)})
+def test_the_margin_follows_the_views(before: float, steps: int, after: float) -> None:
+    known = AttackState(0, start(textures_of(SQUARE)).deltas, {"search.safe": torch.tensor(before)})
     seen: list[Step] = []
-    state = run(square, surrogate, steps=steps, state=known, budget=Budget(0.01, 0.001), on_step=seen.append)
+    state = run(steps=steps, state=known, budget=Budget(0.01, 0.001), on_step=seen.append)
     assert float(state.memory["search.safe"]) == pytest.approx(after)
     assert [step.least_left for step in seen] == [steps - step.step - 1 for step in seen]  # so few that none is spared

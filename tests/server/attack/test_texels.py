@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tests.attack_runs import LABEL, SIZE, mean_loss, run
+from tests.attack_runs import LABEL, SIZE, SQUARE, SURROGATE, mean_loss, run
 from tests.fakes import fake_classifier
 from trompe_server.attack import (
     Budget,
@@ -23,9 +23,8 @@ from trompe_server.attack import (
     painted_texels,
     rank_texels,
 )
-from trompe_server.surrogate import Surrogate, textures_of
+from trompe_server.surrogate import textures_of
 from trompe_shared.errors import SpecError
-from trompe_shared.object3d import Object3D
 
 # Masks
 
@@ -36,8 +35,8 @@ def mask_image(rows: slice, columns: slice) -> NDArray[np.uint8]:
     return image
 
 
-def test_painted_texels_are_the_white_ones_of_masked_textures(square: Object3D) -> None:
-    masks = painted_texels(square, {"m0.png": mask_image(slice(3, 5), slice(0, 7))})
+def test_painted_texels_are_the_white_ones_of_masked_textures() -> None:
+    masks = painted_texels(SQUARE, {"m0.png": mask_image(slice(3, 5), slice(0, 7))})
     assert masks["m0.png"].sum() == 14
     assert masks["m0.png"][3:5, 0:7].all()
     assert not masks["m1.png"].any()
@@ -52,86 +51,86 @@ def test_painted_texels_are_the_white_ones_of_masked_textures(square: Object3D) 
         pytest.param({}, "paint white", id="no image"),
     ],
 )
-def test_an_unfit_mask_image_is_refused(images: dict[str, NDArray[np.uint8]], message: str, square: Object3D) -> None:
+def test_an_unfit_mask_image_is_refused(images: dict[str, NDArray[np.uint8]], message: str) -> None:
     with pytest.raises(SpecError, match=message):
-        painted_texels(square, images)
+        painted_texels(SQUARE, images)
 
 
-def test_the_texels_of_a_material_are_those_of_its_texture(square: Object3D) -> None:
-    masks = material_texels(square, ["m1"])
+def test_the_texels_of_a_material_are_those_of_its_texture() -> None:
+    masks = material_texels(SQUARE, ["m1"])
     assert masks["m1.png"].all()
     assert not masks["m0.png"].any()
 
 
-def test_an_unknown_material_is_refused(square: Object3D) -> None:
+def test_an_unknown_material_is_refused() -> None:
     for wrong in (["m9"], []):
         with pytest.raises(SpecError, match=r"m0.*m1"):
-            material_texels(square, wrong)
+            material_texels(SQUARE, wrong)
 
 
-def test_a_texture_shared_by_two_materials_needs_both(square: Object3D) -> None:
-    shared = {name: replace(material, albedo="m0.png") for name, material in square.materials.items()}
-    obj = replace(square, materials=shared)
+def test_a_texture_shared_by_two_materials_needs_both() -> None:
+    shared = {name: replace(material, albedo="m0.png") for name, material in SQUARE.materials.items()}
+    obj = replace(SQUARE, materials=shared)
     with pytest.raises(SpecError, match=r"\['m1'\] share a texture"):
         material_texels(obj, ["m0"])
     assert material_texels(obj, ["m0", "m1"])["m0.png"].all()
 
 
-def test_masks_combine_with_visibility(square: Object3D, surrogate: Surrogate) -> None:
+def test_masks_combine_with_visibility() -> None:
     budget = Budget(0.5, 0.1)
-    painted = painted_texels(square, {"m0.png": mask_image(slice(0, 8), slice(0, 16))})
-    other = painted_texels(square, {"m0.png": mask_image(slice(4, 16), slice(0, 16))})
-    seen, both = movable(surrogate, budget), movable(surrogate, budget, within=[painted, other])
+    painted = painted_texels(SQUARE, {"m0.png": mask_image(slice(0, 8), slice(0, 16))})
+    other = painted_texels(SQUARE, {"m0.png": mask_image(slice(4, 16), slice(0, 16))})
+    seen, both = movable(SURROGATE, budget), movable(SURROGATE, budget, within=[painted, other])
     expected = seen["m0.png"].clone()
     expected[:4], expected[8:] = False, False
     assert expected.any()
     assert torch.equal(both["m0.png"], expected)
 
 
-def test_masks_without_texels_are_refused_with_a_remedy(square: Object3D, surrogate: Surrogate) -> None:
-    behind = material_texels(square, ["m1"])
+def test_masks_without_texels_are_refused_with_a_remedy() -> None:
+    behind = material_texels(SQUARE, ["m1"])
     with pytest.raises(SpecError, match="widen the texel masks, or raise `epsilon`"):
-        movable(surrogate, Budget(0.1, 0.1), within=[behind])
-    nowhere = torch.zeros(surrogate.n_views, *SIZE, dtype=torch.bool)
+        movable(SURROGATE, Budget(0.1, 0.1), within=[behind])
+    nowhere = torch.zeros(SURROGATE.n_views, *SIZE, dtype=torch.bool)
     with pytest.raises(SpecError, match=r"epsilon=0.1.*saliency `tau`.*Lower `tau`, or raise `epsilon`"):
-        movable(surrogate, Budget(0.1, 0.1), nowhere)
+        movable(SURROGATE, Budget(0.1, 0.1), nowhere)
 
 
 # Rank
 
 
-def test_a_texel_ranks_by_the_saliency_of_its_pixels(square: Object3D, surrogate: Surrogate) -> None:
-    maps = torch.zeros(surrogate.n_views, *SIZE)
+def test_a_texel_ranks_by_the_saliency_of_its_pixels() -> None:
+    maps = torch.zeros(SURROGATE.n_views, *SIZE)
     maps[3, 14:18, 14:18] = 1.0
-    scores = rank_texels(surrogate, textures_of(square), maps)
-    read = surrogate.influence(maps > 0)
+    scores = rank_texels(SURROGATE, textures_of(SQUARE), maps)
+    read = SURROGATE.influence(maps > 0)
     for name, score in scores.items():
         assert score.shape == (16, 16)
         assert torch.equal(score > 0, read[name] > 0)
 
 
-def test_the_scores_of_views_add_up(square: Object3D, surrogate: Surrogate) -> None:
+def test_the_scores_of_views_add_up() -> None:
     generator = torch.Generator().manual_seed(0)
-    maps = [torch.rand(surrogate.n_views, *SIZE, generator=generator) for _ in range(2)]
+    maps = [torch.rand(SURROGATE.n_views, *SIZE, generator=generator) for _ in range(2)]
     one, other, both = (
-        rank_texels(surrogate, textures_of(square), some)["m0.png"] for some in (*maps, maps[0] + maps[1])
+        rank_texels(SURROGATE, textures_of(SQUARE), some)["m0.png"] for some in (*maps, maps[0] + maps[1])
     )
     torch.testing.assert_close(one + other, both, atol=1e-4, rtol=1e-4)
 
 
-def test_a_texel_pulled_in_opposite_directions_ranks_low(square: Object3D, surrogate: Surrogate) -> None:
-    gradients = torch.zeros(surrogate.n_views, *SIZE, 3)
+def test_a_texel_pulled_in_opposite_directions_ranks_low() -> None:
+    gradients = torch.zeros(SURROGATE.n_views, *SIZE, 3)
     gradients[3] = 1.0
-    agreed = rank_texels(surrogate, textures_of(square), gradients)["m0.png"]
-    saliency_alike = rank_texels(surrogate, textures_of(square), gradients[..., 0])["m0.png"]
+    agreed = rank_texels(SURROGATE, textures_of(SQUARE), gradients)["m0.png"]
+    saliency_alike = rank_texels(SURROGATE, textures_of(SQUARE), gradients[..., 0])["m0.png"]
     torch.testing.assert_close(agreed, saliency_alike)
     gradients[3, :, :, 0] = -2.0
-    assert not torch.equal(rank_texels(surrogate, textures_of(square), gradients)["m0.png"], agreed)
+    assert not torch.equal(rank_texels(SURROGATE, textures_of(SQUARE), gradients)["m0.png"], agreed)
     gradients[:] = 1.0
-    pulled = rank_texels(surrogate, textures_of(square), gradients)["m0.png"]
+    pulled = rank_texels(SURROGATE, textures_of(SQUARE), gradients)["m0.png"]
     half = gradients.clone()
-    half[surrogate.n_views // 2 :] = -1.0
-    torn = rank_texels(surrogate, textures_of(square), half)["m0.png"]
+    half[SURROGATE.n_views // 2 :] = -1.0
+    torn = rank_texels(SURROGATE, textures_of(SQUARE), half)["m0.png"]
     assert (torn <= pulled + 1e-4).all()
     assert torn.sum() < 0.5 * pulled.sum()
 
@@ -168,53 +167,48 @@ def test_a_share_without_texels_is_refused() -> None:
 BUDGET = Budget(0.3, 0.1)
 
 
-def gradients_of(surrogate: Surrogate) -> torch.Tensor:
-    return torch.rand(surrogate.n_views, *SIZE, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+def gradients_of() -> torch.Tensor:
+    return torch.rand(SURROGATE.n_views, *SIZE, 3, generator=torch.Generator().manual_seed(0)) - 0.5
 
 
-def found(
-    obj: Object3D, surrogate: Surrogate, keep: float, *, gradients: torch.Tensor | None = None, **options: Any
-) -> TexelMasks:
-    gradients = gradients_of(surrogate) if gradients is None else gradients
+def found(keep: float, *, gradients: torch.Tensor | None = None, **options: Any) -> TexelMasks:
+    gradients = gradients_of() if gradients is None else gradients
     asked: dict[str, Any] = {"goal": Goal(LABEL), "budget": BUDGET} | options
-    return few_texels(keep, textures_of(obj), surrogate, fake_classifier(), gradients, **asked).masks
+    return few_texels(keep, textures_of(SQUARE), SURROGATE, fake_classifier(), gradients, **asked).masks
 
 
 def count(masks: TexelMasks) -> int:
     return sum(int(mask.sum()) for mask in masks.values())
 
 
-def test_the_same_texels_are_found_each_time_and_as_many_as_asked(square: Object3D, surrogate: Surrogate) -> None:
-    once, again = (found(square, surrogate, 0.1) for _ in range(2))
+def test_the_same_texels_are_found_each_time_and_as_many_as_asked() -> None:
+    once, again = (found(0.1) for _ in range(2))
     assert count(once) == round(0.1 * 2 * 16 * 16)
     assert all(torch.equal(once[name], again[name]) for name in once)
 
 
-def test_all_texels_are_found_within_the_masks(square: Object3D, surrogate: Surrogate) -> None:
-    upper = painted_texels(square, {"m0.png": mask_image(slice(0, 8), slice(0, 16))})
-    few = found(square, surrogate, 0.1, within=[upper])
+def test_all_texels_are_found_within_the_masks() -> None:
+    upper = painted_texels(SQUARE, {"m0.png": mask_image(slice(0, 8), slice(0, 16))})
+    few = found(0.1, within=[upper])
     assert count(few) == round(0.1 * 2 * 16 * 16)
     assert not few["m0.png"][8:].any()
 
 
-def test_trials_get_an_attack_further_than_a_plain_ranking(square: Object3D, surrogate: Surrogate) -> None:
-    textures, goal = textures_of(square), Goal(LABEL, safe=100.0)
-    blind = best_texels(rank_texels(surrogate, textures, gradients_of(surrogate)), 0.05)
+def test_trials_get_an_attack_further_than_a_plain_ranking() -> None:
+    textures, goal = textures_of(SQUARE), Goal(LABEL, safe=100.0)
+    blind = best_texels(rank_texels(SURROGATE, textures, gradients_of()), 0.05)
     losses = []
-    for few in (blind, found(square, surrogate, 0.05)):
-        moving = movable(surrogate, BUDGET, within=[few])
-        state = run(square, surrogate, goal=goal, budget=BUDGET, steps=5, texels=moving)
-        losses.append(mean_loss(square, surrogate, state, goal))
+    for few in (blind, found(0.05)):
+        moving = movable(SURROGATE, BUDGET, within=[few])
+        state = run(goal=goal, budget=BUDGET, steps=5, texels=moving)
+        losses.append(mean_loss(state, goal))
     assert losses[1] > losses[0]
 
 
-def test_only_masked_pixels_count(square: Object3D, surrogate: Surrogate) -> None:
-    masks = torch.zeros(surrogate.n_views, *SIZE, dtype=torch.bool)
+def test_only_masked_pixels_count() -> None:
+    masks = torch.zeros(SURROGATE.n_views, *SIZE, dtype=torch.bool)
     masks[:, :, :16] = True
-    loud = gradients_of(surrogate)
+    loud = gradients_of()
     loud[:, :, 16:] *= 1000
-    one, other = (
-        found(square, surrogate, 0.05, gradients=gradients, masks=masks)
-        for gradients in (gradients_of(surrogate), loud)
-    )
+    one, other = (found(0.05, gradients=gradients, masks=masks) for gradients in (gradients_of(), loud))
     assert all(torch.equal(one[name], other[name]) for name in one)
