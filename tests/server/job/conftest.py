@@ -24,6 +24,18 @@ def photo() -> NDArray[np.uint8]:
     return np.kron(image[::15, ::15], np.ones((15, 15, 1), np.uint8))
 
 
+@pytest.fixture(autouse=True)
+def quick_reports(request: pytest.FixtureRequest) -> None:
+    """Reports without pictures, unless a test uses ``pictures`` or a job of its module."""
+    if "pictures" not in request.fixturenames:
+        request.getfixturevalue("no_pictures")
+
+
+@pytest.fixture
+def pictures() -> None:
+    """Reports with pictures after all."""
+
+
 @pytest.fixture(scope="module", autouse=True)
 def default_sampling() -> Iterator[None]:
     """Calibrations with the default sampling: its search takes four times as long as the rest of a small job."""

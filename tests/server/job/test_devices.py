@@ -42,7 +42,6 @@ def done(kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *, device: st
     return run_job(spec, Library(folder), target=FakeTarget(2000), device=device).artifacts
 
 
-@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize(
     "kind", [pytest.param(kind, marks=[] if kind == "calibrated" else pytest.mark.thorough) for kind in KINDS]
 )

@@ -15,8 +15,6 @@ from trompe_server.renderers import SailenvTarget
 from trompe_shared.api import JobSpec
 from trompe_shared.object3d import load_object
 
-pytestmark = pytest.mark.usefixtures("no_pictures")
-
 
 def test_an_attack_repaints_glass_leaves_its_transparency_and_says_that_little_is_seen(
     library: Library, target: SailenvTarget

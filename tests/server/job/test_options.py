@@ -19,7 +19,6 @@ from trompe_shared.shipped import shipped_objects
 
 WOOD, CUSHION = "chair_wood_AlbedoTransparency.png", "chair_cushion_AlbedoTransparency.png"
 CLASSES = sorted({shipped.label for shipped in shipped_objects().values()})
-without_pictures = pytest.mark.usefixtures("no_pictures")
 
 
 def attacked(library: Library, **options: Any) -> tuple[Result, dict[str, NDArray[np.bool_]]]:
@@ -32,14 +31,12 @@ def changed(artifacts: MemoryArtifacts) -> dict[str, NDArray[np.bool_]]:
     return {name: (image != CHAIR.textures[name]).any(axis=2) for name, image in artifacts.painted().textures.items()}
 
 
-@without_pictures
 def test_only_the_named_material_moves(library: Library) -> None:
     _, texels = attacked(library, materials=["chair_cushion"])
     assert texels[CUSHION].any()
     assert not texels[WOOD].any()
 
 
-@without_pictures
 @pytest.mark.parametrize("materials", [[], ["chair_wood"]], ids=str)
 def test_only_texels_under_white_of_a_mask_move(library: Library, materials: list[str]) -> None:
     picture = np.zeros(CHAIR.textures[WOOD].shape, np.uint8)
@@ -51,7 +48,6 @@ def test_only_texels_under_white_of_a_mask_move(library: Library, materials: lis
     assert not texels[CUSHION].any()
 
 
-@without_pictures
 def test_every_second_held_out_image_is_also_judged_through_each_pipeline_of_the_suite(library: Library) -> None:
     run, classifier = run_job(spec_of(steps=3, held_out=7), library), load_classifier("tiny")
     assert [each.pipeline for each in run.result.image_pipelines] == list(SUITE)
@@ -64,7 +60,6 @@ def test_every_second_held_out_image_is_also_judged_through_each_pipeline_of_the
     assert run_job(spec_of(steps=1, held_out=0), library).result.image_pipelines == []
 
 
-@without_pictures
 @pytest.mark.parametrize("target", ["table", None])
 def test_the_result_says_how_often_the_goal_is_reached(library: Library, target: str | None) -> None:
     result, _ = attacked(library, target=target, epsilon=0.3, alpha=0.1, steps=8)
@@ -75,6 +70,7 @@ def test_the_result_says_how_often_the_goal_is_reached(library: Library, target:
 @pytest.mark.parametrize(
     "options", [{}, {"top_k": 2}, {"target": "ball"}, {"loss": "cross_entropy", "tau": 0.05}], ids=str
 )
+@pytest.mark.usefixtures("pictures")
 def test_each_of_several_labels_counts_as_the_object(library: Library, options: dict[str, Any]) -> None:
     run = run_job(spec_of(label=["table", "chair"], steps=4, epsilon=0.3, alpha=0.1, **options), library)
     result = run.result
@@ -89,7 +85,6 @@ def test_each_of_several_labels_counts_as_the_object(library: Library, options: 
     assert "predictions.png" in run.artifacts.files
 
 
-@without_pictures
 @pytest.mark.parametrize(
     "options",
     [
@@ -112,7 +107,6 @@ def test_every_kind_of_attack_stays_in_its_budget_and_says_what_it_was(
     assert any(mask.any() for mask in changed(run.artifacts).values())
 
 
-@without_pictures
 def test_the_view_constraint_holds_in_the_surrogate_and_is_measured_in_the_target(library: Library) -> None:
     (plain, _), (bound, _) = attacked(library), attacked(library, epsilon_view=0.02)
     assert plain.max_view_change is not None
@@ -121,6 +115,7 @@ def test_the_view_constraint_holds_in_the_surrogate_and_is_measured_in_the_targe
     assert plain.views_beyond_epsilon is not None
 
 
+@pytest.mark.usefixtures("pictures")
 def test_scores_of_a_classifier_without_gradients_are_counted(
     library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:

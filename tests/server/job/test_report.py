@@ -31,7 +31,6 @@ from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, load_object, pack_zip
 from trompe_shared.shipped import shipped_objects
 
-without_pictures = pytest.mark.usefixtures("no_pictures")
 Image8 = NDArray[np.uint8]
 
 
@@ -69,14 +68,12 @@ class StubbornTarget(FakeTarget):
         return images
 
 
-@without_pictures
 def test_views_with_a_poor_surrogate_are_named(library: Library) -> None:
     warnings = run_job(spec_of(surrogate="curve", steps=1), library, target=PatchyTarget()).result.warnings
     (warning,) = [found for found in warnings if "off by more" in found]
     assert f"1 {where(setup_of(library).views[1].camera)}" in warning
 
 
-@without_pictures
 def test_views_with_an_unpredicted_change_are_named(library: Library) -> None:
     first = setup_of(library).views[0].camera
     spec = spec_of(surrogate="calibrated", steps=6)
@@ -85,13 +82,12 @@ def test_views_with_an_unpredicted_change_are_named(library: Library) -> None:
     assert f"on views 0 {where(first)}: " in warning
 
 
-@without_pictures
 def test_a_surrogate_without_probes_names_its_views_too(library: Library) -> None:
     warnings = run_job(spec_of(), library, target=DarkTarget()).result.warnings
     assert [found for found in warnings if "off by more than 3/255 on views" in found]
 
 
-@pytest.mark.usefixtures("no_pictures", "searched_sampling")
+@pytest.mark.usefixtures("searched_sampling")
 def test_each_attacked_view_has_the_fidelity_of_its_prediction(library: Library, target: SailenvTarget) -> None:
     spec = spec_of(surrogate="calibrated", steps=6)
     result = run_job(spec, library, target=target).result
@@ -106,7 +102,6 @@ def test_each_attacked_view_has_the_fidelity_of_its_prediction(library: Library,
     assert not [found for found in result.warnings if "on views" in found]
 
 
-@without_pictures
 @pytest.mark.parametrize(
     ("name", "near"), [pytest.param("{} lamp", True, id="all lamps"), pytest.param("{}", False, id="as they are")]
 )
@@ -146,7 +141,6 @@ def test_the_report_lists_what_the_object_became_and_both_drops(
         assert not warnings
 
 
-@without_pictures
 def test_a_judge_classifies_the_same_images_and_knows_the_label_by_its_name(
     library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -174,14 +168,12 @@ class Turned(nn.Module):
         return logits.flip(1)
 
 
-@without_pictures
 def test_an_attack_of_little_effect_says_so_with_a_remedy(library: Library) -> None:
     result = run_job(spec_of(epsilon=1 / 255, alpha=1 / 255, steps=1), library).result
     assert result.target.a_drop == 0
     assert [warning for warning in result.warnings if "A_drop 0.00" in warning and "a larger `epsilon`" in warning]
 
 
-@without_pictures
 @pytest.mark.parametrize(
     ("options", "why", "remedy"),
     [
@@ -250,6 +242,7 @@ def test_a_stronger_attack_is_advised_by_the_options_that_limited_it(options: di
     assert _stronger(data_of(**options)) == advice
 
 
+@pytest.mark.usefixtures("pictures")
 def test_the_contact_sheet_shows_recognised_views_alone_and_tells_their_number(
     library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:

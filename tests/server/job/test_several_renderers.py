@@ -71,6 +71,7 @@ def test_one_paint_works_in_both_where_a_paint_for_one_fails_in_the_other(run: R
 
 
 @pytest.mark.thorough
+@pytest.mark.usefixtures("pictures")
 def test_a_job_resumed_at_each_phase_gives_the_same_bytes(run: Run, library: Library) -> None:
     again = run_job(spec_of(**SPEC), library, new=True, times=2, **TARGETS)
     assert again.artifacts.lasting().keys() == run.artifacts.lasting().keys()
@@ -87,7 +88,6 @@ def test_a_view_counts_in_each_attacked_renderer(run: Run) -> None:
     assert first.fooled * 8 == round(first.fooled * 8)
 
 
-@pytest.mark.usefixtures("no_pictures")
 def test_no_attack_needs_one_renderer_that_recognises_the_object(library: Library) -> None:
     class Blank(FakeTarget):
         def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
@@ -130,7 +130,7 @@ class NoisyTarget(FakeTarget):
 
 
 @pytest.mark.thorough
-@pytest.mark.usefixtures("no_pictures", "measured_tone")
+@pytest.mark.usefixtures("measured_tone")
 def test_held_out_views_have_noise_that_the_attack_has_not_seen(library: Library) -> None:
     target, spec = NoisyTarget(), spec_of(surrogate="calibrated", steps=2)
     run = run_job(spec, library, target=target)
@@ -151,7 +151,6 @@ def test_held_out_views_have_noise_that_the_attack_has_not_seen(library: Library
     assert not {own, held_out} & {*other}
 
 
-@pytest.mark.usefixtures("no_pictures")
 def test_pictures_before_and_after_have_the_same_noise(library: Library) -> None:
     run = run_job(spec_of(epsilon=0.004, alpha=0.004, steps=1, loss="cross_entropy"), library, target=NoisyTarget())
     assert run.result.max_view_change is not None
@@ -162,7 +161,6 @@ def test_pictures_before_and_after_have_the_same_noise(library: Library) -> None
 
 
 @pytest.mark.thorough
-@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize(("levels", "advised"), [(3, False), (12, True)])
 def test_more_samples_are_advised_where_noise_is_strong(library: Library, levels: int, advised: bool) -> None:
     run = run_job(spec_of(surrogate="calibrated", steps=1), library, target=NoisyTarget(levels=levels))

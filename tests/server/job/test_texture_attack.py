@@ -86,11 +86,10 @@ def test_the_time_left_is_told_from_the_second_step_on_as_a_range_that_falls(fin
 
 @pytest.mark.parametrize("new", [False, True], ids=["one process", "a process for each phase"])
 def test_the_seconds_of_a_result_sum_to_the_time_that_the_job_took(
-    library: Library, timed: tuple[Run, float], monkeypatch: pytest.MonkeyPatch, new: bool
+    library: Library, timed: tuple[Run, float], new: bool
 ) -> None:
     run, took = timed
     if new:
-        monkeypatch.setattr("trompe_server.job.report.picture_files", lambda _: {})
         began = time.perf_counter()
         run = run_job(spec_of(steps=6), library, new=True)
         took = time.perf_counter() - began
@@ -147,12 +146,12 @@ def test_the_pictures_show_something(finished: Run) -> None:
             assert len(picture.convert("RGB").getcolors(2**24) or []) > 10
 
 
+@pytest.mark.usefixtures("pictures")
 def test_each_phase_can_run_in_another_process_and_twice(finished: Run, library: Library) -> None:
     again = run_job(spec_of(**WHOLE), library, new=True, times=2)
     assert again.artifacts.lasting() == finished.artifacts.lasting()
 
 
-@pytest.mark.usefixtures("no_pictures")
 def test_an_attack_with_all_views_safely_won_takes_no_further_steps_and_goes_on_with_the_judgement(
     library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,7 +183,6 @@ def six_steps(library: Library) -> Run:
     return run_job(spec_of(steps=6), library)
 
 
-@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize("options", [{"image_pipeline": "transfer"}, {"keep": 0.03}], ids=str)
 def test_options_of_the_search_change_the_texture_and_survive_interruption(
     library: Library, six_steps: Run, options: dict[str, Any]
@@ -219,7 +217,6 @@ def test_few_texels_are_chosen_once_and_again_if_their_file_is_damaged(library: 
     assert artifacts.files["few_texels.npz"] == chosen
 
 
-@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize(
     "options",
     [
@@ -254,7 +251,7 @@ def test_all_images_shown_by_the_search_are_counted(
     assert run.counts()["classifier_images"] == run.counts("attack")["classifier_images"]
 
 
-@pytest.mark.usefixtures("no_pictures", "measured_tone")
+@pytest.mark.usefixtures("measured_tone")
 def test_a_second_job_on_the_same_object_and_views_renders_no_probe(library: Library) -> None:
     one, other = Recorder(), Recorder()
     spec = {"surrogate": "calibrated", "steps": 1}
@@ -319,7 +316,6 @@ def test_a_calibration_serves_only_its_renderer_and_is_made_anew_if_damaged(
         run_job(spec, library, target=DarkTarget(), known=True, until="calibrate")
 
 
-@pytest.mark.usefixtures("no_pictures")
 def test_a_pool_of_random_views_takes_the_place_of_the_grid(library: Library) -> None:
     result = run_job(spec_of(pool=12), library).result
     assert result.target.views == len(result.views) == 12
@@ -348,6 +344,7 @@ def test_saliency_is_that_of_the_targets_images(library: Library) -> None:
     assert (bright != dark).mean() > 0.1
 
 
+@pytest.mark.usefixtures("pictures")
 def test_an_object_never_recognised_is_not_applicable(library: Library) -> None:
     ended = run_job(spec_of(label="ball"), library)
     report, result = ended.reports["prepare"], ended.result
@@ -361,13 +358,13 @@ def test_an_object_never_recognised_is_not_applicable(library: Library) -> None:
     assert report.note in result.warnings
 
 
+@pytest.mark.usefixtures("pictures")
 def test_a_job_with_one_view_and_no_held_out_ones_works_too(library: Library) -> None:
     ended = run_job(spec_of(held_out=0, azimuths=1, elevations=1), library)
     assert ended.reports["judge"].state is JobState.succeeded
     assert (ended.result.held_out, ended.result.held_out_views, ended.result.target.views) == (None, [], 1)
 
 
-@pytest.mark.usefixtures("no_pictures")
 def test_the_threshold_stops_the_gradient_of_less_salient_pixels(library: Library) -> None:
     spec = spec_of(tau=0.2)
     artifacts, setup = run_job(spec, library, until="attack-000").artifacts, setup_of(library, tau=0.2)
@@ -388,7 +385,6 @@ def test_the_threshold_stops_the_gradient_of_less_salient_pixels(library: Librar
         assert torch.equal(done.deltas[name], delta)
 
 
-@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize(
     "options",
     [
