@@ -1,8 +1,9 @@
-"""A judgement of two files: its figures, its findings, its page, and that it goes on where it stopped."""
+"""Judgements of the mug over a fake renderer: figures, findings, page, and how one goes on where it stopped."""
 
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -11,20 +12,68 @@ import numpy as np
 import pytest
 
 from tests.job_runs import Recorder
-from tests.server.judgement.conftest import Judge, spec_of
 from trompe_server.image_pipelines import SUITE
-from trompe_server.judgement.manifest import manifest_of
+from trompe_server.job.protocol import OnProgress
+from trompe_server.judgement.judge_files import judge_files
+from trompe_server.judgement.manifest import Judged, manifest_of
 from trompe_server.judgement.pictures import judgement_pictures
+from trompe_server.judgement.sources import LocalSources
 from trompe_server.judgement.suites import SUITES, Suite, suite_of
 from trompe_server.judgement.verify import verify
 from trompe_server.judgement.work import Timed
 from trompe_server.pages.judgement import judgement_page
-from trompe_shared.api import AS_RENDERED, Manifest, Progress, Visibility
-from trompe_shared.errors import SpecError
-from trompe_shared.object3d import load_object
+from trompe_server.renderers import TargetRenderer
+from trompe_server.storage.folders import LocalArtifacts
+from trompe_shared.api import AS_RENDERED, JudgementSpec, Manifest, Progress, Visibility
+from trompe_shared.errors import RendererError, SpecError
+from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
 
 TEXTURE = "mug_ceramic_AlbedoTransparency.png"
+
+
+@pytest.fixture
+def fake_renderer(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    """The renderer of the name ``fake``; there is no other."""
+    target = Recorder()
+
+    @contextmanager
+    def running(_sources: LocalSources, name: str) -> Iterator[TargetRenderer]:
+        if name != "fake":
+            raise RendererError(f"The renderer worker did not start. There is no engine {name!r}.")
+        yield target
+
+    monkeypatch.setattr(LocalSources, "running", running)
+    return target
+
+
+@pytest.fixture
+def dark(tmp_path: Path, mug: Object3D) -> Path:
+    """The mug, painted all black but for its handle's side of the texture."""
+    painted = {name: np.where(np.arange(512)[:, None, None] < 400, 0, image) for name, image in mug.textures.items()}
+    file = tmp_path / "dark.zip"
+    file.write_bytes(mug.with_textures({name: image.astype(np.uint8) for name, image in painted.items()}).to_zip())
+    return file
+
+
+Judge = Callable[..., Judged]
+
+
+@pytest.fixture
+def judge(fake_renderer: Recorder, tmp_path: Path) -> Judge:
+    """Judges the mug against another file."""
+    assert fake_renderer.asked == []
+
+    def run(after: Path, *, on_progress: OnProgress = lambda _: None, **options: Any) -> Judged:
+        kept = LocalArtifacts(tmp_path / "kept")
+        return judge_files(spec_of(after, **options), LocalSources(tmp_path), kept=kept, on_progress=on_progress)
+
+    return run
+
+
+def spec_of(after: Path, **options: Any) -> JudgementSpec:
+    asked: dict[str, Any] = {"label": "mug", "renderers": ["fake"], "views": 6, **options}
+    return JudgementSpec.of("mug", str(after), **asked)
 
 
 def test_every_cell_has_figures_and_every_view_its_classes(judge: Judge, dark: Path) -> None:
