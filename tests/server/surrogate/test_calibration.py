@@ -461,11 +461,6 @@ def test_painting_grey_or_noise_keeps_what_is_cut_out() -> None:
         assert np.array_equal(kept, opacity)
 
 
-def test_another_generator_paints_other_noise(mug: Object3D) -> None:
-    one, same, other = (painted_noise(mug, np.random.default_rng(seed)).to_zip() for seed in (0, 0, 1))
-    assert one == same != other
-
-
 def test_a_photograph_behind_the_object_is_behind_every_surrogate(mug: Object3D) -> None:
     photo = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
     outside = (USUAL(painted_grey(mug, 0), VIEWS) == 255).all(axis=-1, keepdims=True)
