@@ -72,15 +72,23 @@ def random_weights() -> Tensor:
     return torch.randn(len(VIEWS), 3, *SIZE, generator=torch.Generator().manual_seed(0))
 
 
-def check_gradient(surrogate: Surrogate, obj: Object3D, *, tolerance: float) -> None:
-    """The slope along random directions that the gradient tells is the one that small changes show.
-
-    Pixels that are black or white already are left out: they can change one way only.
-    """
-    textures, step = textures_of(obj), 2e-3
+@pytest.mark.parametrize(
+    ("model", "tolerance"),
+    [
+        pytest.param(SamplingModel(), 0.01, id="diffuse, encoded"),
+        pytest.param(SamplingModel(filtered="linear", lod="area", samples="centre", bias=0.5), 0.01, id="linear"),
+        pytest.param(None, 0.05, id="measured"),
+    ],
+)
+def test_the_gradient_is_that_of_finite_differences(
+    mug: Object3D, curved: Surrogate, model: SamplingModel | None, tolerance: float
+) -> None:
+    """Along random directions. Pixels that are black or white are left out: they can change one way only."""
+    surrogate = surrogate_of(mug, VIEWS, sampling=model, size=SIZE) if model else curved
+    textures, step = textures_of(mug), 2e-3
     shown = images_of(surrogate, textures)
     weights = random_weights() * ((shown > 0.05) & (shown < 0.95))
-    gradients = gradient_of(surrogate, obj, weights)
+    gradients = gradient_of(surrogate, mug, weights)
     for seed in range(3):
         generator = torch.Generator().manual_seed(seed)
         ways = {n: torch.randn(t.shape, generator=generator).clamp(-2, 2) * (t - t**2) * 4 for n, t in textures.items()}
@@ -93,21 +101,6 @@ def check_gradient(surrogate: Surrogate, obj: Object3D, *, tolerance: float) -> 
         slope = float(values[0] - values[1]) / (2 * step)
         told = float(sum((gradients[n].double() * way).sum() for n, way in ways.items()))
         assert told == pytest.approx(slope, rel=tolerance, abs=tolerance * 5)
-
-
-@pytest.mark.parametrize(
-    "model",
-    [SamplingModel(), SamplingModel(filtered="linear", lod="area", samples="centre", bias=0.5)],
-    ids=["encoded", "linear"],
-)
-def test_the_gradient_of_the_diffuse_surrogate_is_that_of_finite_differences(
-    mug: Object3D, model: SamplingModel
-) -> None:
-    check_gradient(surrogate_of(mug, VIEWS, sampling=model, size=SIZE), mug, tolerance=0.01)
-
-
-def test_the_gradient_of_a_measured_surrogate_is_that_of_finite_differences(mug: Object3D, curved: Surrogate) -> None:
-    check_gradient(curved, mug, tolerance=0.05)
 
 
 @dataclass(frozen=True)
