@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trompe_server.formats import gltf_repaint, read_object
+from trompe_server.formats import gltf_write, read_object
 from trompe_server.formats.fbx_tree import Node, Tree
 from trompe_server.formats.gltf_container import BIN_CHUNK
 from trompe_shared.errors import ObjectError
@@ -74,7 +74,7 @@ def gltf_files(picture: bytes = PICTURE, **changes: Any) -> dict[str, bytes]:
 def glb(document: Json | bytes, data: bytes | None = None) -> bytes:
     """A GLB of JSON and one buffer, by default ``gltf_buffer``."""
     text = document if isinstance(document, bytes) else json.dumps(document).encode()
-    return gltf_repaint.glb(text, [(BIN_CHUNK, gltf_buffer() if data is None else data)])
+    return gltf_write.glb(text, [(BIN_CHUNK, gltf_buffer() if data is None else data)])
 
 
 def with_picture_inside(fbx: Tree, picture: bytes) -> bytes:

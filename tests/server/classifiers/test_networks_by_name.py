@@ -15,12 +15,16 @@ import torch
 from PIL import Image
 from torch import Tensor, nn
 
+from trompe_server import attack_object
+from trompe_server.attack import Budget, ViewDistribution
 from trompe_server.classifiers import NetworkClassifier, classifier_file, load_classifier
 from trompe_server.classifiers.fold import Formatted
 from trompe_server.classifiers.registry import ZOOS
 from trompe_server.classifiers.timm_networks import load_timm
+from trompe_server.renderers import SailenvTarget
 from trompe_shared.errors import ClassifierError
 from trompe_shared.local_files import LOOKED_UP
+from trompe_shared.object3d import Object3D
 
 TAGS: Final = {
     "vit_tiny_patch16_224": "vit_tiny_patch16_224.augreg_in21k_ft_in1k",
@@ -291,6 +295,32 @@ def test_without_its_library_a_name_says_what_to_install(prefix: str, monkeypatc
         monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ClassifierError, match=rf"not installed or incomplete.*pip install 'trompe\[{extra}\]'"):
         load_classifier(f"{prefix}org/model")
+
+
+@pytest.mark.thorough
+def test_a_vision_transformer_by_name_is_attacked_end_to_end(
+    stored: Callable[..., nn.Module], mug: Object3D, target: SailenvTarget
+) -> None:
+    stored("vit_tiny_patch16_224")
+    network = load_classifier("timm:vit_tiny_patch16_224")
+    assert isinstance(network, NetworkClassifier)
+    views = ViewDistribution(distance=0.3, elevation=(10, 50)).sample(3, generator=np.random.default_rng(0))
+    label = int(network.predict(target.render(mug, views[:1], size=network.image_size)).argmax())
+    attacked = attack_object(
+        mug,
+        network,
+        label=label,
+        target=target,
+        views=views[:2],
+        held_out=views[2:],
+        budget=Budget(epsilon=0.5, alpha=0.1),
+        steps=4,
+        image_pipeline="none",
+    )
+    before, after = attacked.target.a_before, attacked.target.a_after
+    assert before is not None
+    assert after is not None
+    assert after < before
 
 
 def test_a_repository_of_transformers_is_a_white_box(hub: Callable[[str], Path]) -> None:
