@@ -1,8 +1,11 @@
 """A textured triangle in several formats."""
 
+import io
 import json
 import struct
+import zipfile
 import zlib
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -69,6 +72,15 @@ def gltf_files(picture: bytes = PICTURE, **changes: Any) -> dict[str, bytes]:
         **changes,
     }
     return {"t.gltf": json.dumps(document).encode(), "t.bin": CORNERS, "tex/t.png": picture}
+
+
+def zipped(files: Mapping[str, bytes], *, method: int = zipfile.ZIP_DEFLATED) -> bytes:
+    """A zip as other programs make it."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
 
 
 def glb(document: Json | bytes, data: bytes | None = None) -> bytes:

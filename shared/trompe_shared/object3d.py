@@ -125,6 +125,13 @@ class Object3D:
         """The albedo textures of blended materials."""
         return frozenset(each.albedo for each in self.materials.values() if each.opacity is not None)
 
+    @property
+    def maps(self) -> frozenset[str]:
+        """The image files of the materials: albedo, normal and metallic."""
+        return frozenset(
+            name for m in self.materials.values() for name in (m.albedo, m.normal, m.metallic) if name is not None
+        )
+
     def albedo_of(self, part: Part) -> str:
         """File name of the albedo texture of ``part``."""
         return self.materials[part.material].albedo

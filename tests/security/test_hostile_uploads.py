@@ -8,7 +8,7 @@ import shutil
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.small_models import OBJ, PICTURE, glb, gltf_buffer, gltf_files, gltf_json, large_png, refusal
+from tests.small_models import OBJ, PICTURE, glb, gltf_buffer, gltf_files, gltf_json, large_png, refusal, zipped
 from trompe_server.formats import import_file, read_object
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import pack_zip
@@ -74,15 +74,6 @@ def valid_files() -> dict[str, bytes]:
         "t.stl": stl_binary(),
         "t.obj": OBJ.replace(b"mtllib t.mtl\n", b""),
     }
-
-
-def zipped(files: Mapping[str, bytes]) -> bytes:
-    """A zip as other programs make it."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return buffer.getvalue()
 
 
 # Archives

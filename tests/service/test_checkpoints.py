@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.attack_runs import same
 from trompe_server.attack import AttackState
 from trompe_server.job.files import JobFiles
 from trompe_server.job.protocol import DamagedFileError
@@ -15,14 +16,6 @@ from trompe_server.storage.folders import LocalArtifacts
 def state(step: int) -> AttackState:
     values = torch.arange(192, dtype=torch.float32).reshape(8, 8, 3) * step
     return AttackState(step, {"paint.png": values}, {"velocity": values + 1})
-
-
-def same(one: AttackState, other: AttackState) -> bool:
-    tables = ((one.deltas, other.deltas), (one.memory, other.memory))
-    return one.step == other.step and all(
-        mine.keys() == yours.keys() and all(torch.equal(mine[name], yours[name]) for name in mine)
-        for mine, yours in tables
-    )
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from tests.small_models import large_png
+from tests.small_models import large_png, zipped
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import decode_rgb, encode_png, load_object, object_from_files, pack_zip
 from trompe_shared.wavefront import parse_mtl, parse_obj
@@ -44,15 +44,6 @@ def with_files(**changes: bytes | None) -> dict[str, bytes]:
     """The files of a good object, some replaced or taken away; ``__`` stands for a dot."""
     changed = {name.replace("__", "."): data for name, data in changes.items()}
     return {name: data for name, data in {**FILES, **changed}.items() if data is not None}
-
-
-def zipped(files: Mapping[str, bytes], *, method: int = zipfile.ZIP_DEFLATED) -> bytes:
-    """A zip as other programs make it."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", method) as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return buffer.getvalue()
 
 
 def refusal(source: bytes | Path | Mapping[str, bytes]) -> str:

@@ -47,8 +47,7 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
 def shrunk(obj: Object3D, side: int | None) -> Object3D:
     """``obj`` with maps of at most ``side`` texels a side; reduced maps become PNGs."""
     files = dict(obj.files)
-    maps = {name for m in obj.materials.values() for name in (m.albedo, m.normal, m.metallic) if name is not None}
-    for name in maps:
+    for name in obj.maps:
         rgb, alpha = decode(files[name], name)
         small = shrink(rgb, side)
         if small is not rgb:

@@ -101,13 +101,7 @@ def _models(services: Services, job: Job) -> Mapping[str, str] | None:
 
 def _reduced(obj: Object3D, side: int) -> Object3D:
     """The object with small files as textures, of at most ``side`` texels a side."""
-    maps = {
-        name
-        for each in obj.materials.values()
-        for name in (each.albedo, each.normal, each.metallic)
-        if name is not None
-    }
-    return replace(obj, files={**obj.files, **{name: _small(obj.files[name], name, side) for name in maps}})
+    return replace(obj, files={**obj.files, **{name: _small(obj.files[name], name, side) for name in obj.maps}})
 
 
 def _small(data: bytes, name: str, side: int) -> bytes:
