@@ -11,9 +11,8 @@ from torch import Tensor
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import members_of
 from trompe_server.classifiers import WhiteBoxClassifier
+from trompe_server.surrogate.surrogate import BATCH
 from trompe_shared.errors import SpecError
-
-BATCH = 10
 
 
 def saliency(

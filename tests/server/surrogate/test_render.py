@@ -224,10 +224,10 @@ MANY = [View(Camera(0.16 + 0.002 * k, 30.0 * k, 5.0 * k - 25), background=(20 * 
 
 def test_views_are_rendered_in_successive_batches(mug: Object3D) -> None:
     surrogate = surrogate_of(mug, MANY, size=SIZE)
-    assert surrogate.batches == (range(BATCH), range(BATCH, 12))
+    assert surrogate.batches == (range(BATCH), range(BATCH, 2 * BATCH), range(2 * BATCH, 12))
     texels = surrogate.texels(textures_of(mug))
-    images = [surrogate.render(texels, k) for k in range(2)]
-    assert [tuple(some.shape) for some in images] == [(BATCH, 3, *SIZE), (2, 3, *SIZE)]
+    images = [surrogate.render(texels, k) for k in range(3)]
+    assert [tuple(some.shape) for some in images] == [(BATCH, 3, *SIZE), (BATCH, 3, *SIZE), (2, 3, *SIZE)]
     assert all(some.is_contiguous(memory_format=torch.channels_last) for some in images)
     assert torch.equal(surrogate.render_all(texels), torch.cat(images))
 
