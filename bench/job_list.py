@@ -23,6 +23,7 @@ from trompe_shared.api import JobRequest, JobSpec, JobState, Needs, Progress
 BATCH = 1000
 CALLS = 50
 STATES = [JobState.succeeded] * 96 + [JobState.failed, JobState.cancelled, JobState.not_applicable, JobState.queued]
+LEAST = len(STATES) * (CALLS + 1)
 
 
 def fill(store: JobStore, count: int) -> None:
@@ -133,6 +134,8 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=100_000)
     parser.add_argument("--database", action="append", help="an empty database; repeatable")
     options = parser.parse_args()
+    if options.jobs < LEAST:
+        parser.error(f"--jobs must be at least {LEAST}: one in {len(STATES)} is queued, and {CALLS + 1} are claimed.")
     with tempfile.TemporaryDirectory() as folder:
         for url in options.database or [f"sqlite:///{Path(folder, 'trompe.sqlite')}"]:
             bench(url, options.jobs)

@@ -52,7 +52,7 @@ def in_words(seconds: float) -> str:
 
 
 def estimated_seconds(specs: Iterable[JobSpec]) -> float:
-    """Seconds of all jobs one after the other on two cores if none stops early; accurate to a factor of two."""
+    """Seconds of all jobs one after the other on two cores if no attack stops early; accurate to a factor of two."""
     return sum(_seconds(spec) for spec in specs)
 
 

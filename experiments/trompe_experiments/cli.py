@@ -72,7 +72,7 @@ def _announcement(plan: Plan, folder: Path) -> str:
     jobs = plan.jobs()
     time = in_words(estimated_seconds(row.request for row in jobs.values()))
     rows = f" ({len(plan.rows)} rows, some with the same job)" if len(plan.rows) > len(jobs) else ""
-    return f"{plan.experiment.name}: {len(jobs)} jobs{rows}, about {time} on two cores; results in {folder}"
+    return f"{plan.experiment.name}: {len(jobs)} jobs{rows}, about {time} if no attack stops early; results in {folder}"
 
 
 def _conclude(rows: Sequence["ResultRow"], folder: Path) -> None:
