@@ -162,7 +162,7 @@ def fill(document: Path, check: bool) -> None:
 
 @experiment.command()
 @out_option(required=True, help="Folder for the results.")
-@click.option("--object", "objects", multiple=True, default=("mug", "chair"), show_default=True, help="Shipped object.")
+@click.option("--object", "objects", multiple=True, default=("mug", "lamp"), show_default=True, help="Shipped object.")
 @click.option("--seeds", default=2, show_default=True, type=click.IntRange(1), help="Number of seeds.")
 @click.option("--only", default="", metavar="WORDS", help="Cases whose name contains WORDS.")
 @click.option("--retry-failed", is_flag=True, help="Run failed jobs of an earlier run again.")
