@@ -228,7 +228,7 @@ def _facts(result: Result, seconds: Mapping[str, float]) -> Iterator[tuple[str, 
     yield "max view change", _figure(result.max_view_change, LEVELS)
     if result.views_beyond_epsilon is not None and result.pixels_beyond_epsilon is not None:
         views, pixels = _figure(result.views_beyond_epsilon, PERCENT), f"{result.pixels_beyond_epsilon:.2%}"
-        yield "above epsilon", f"{views} of the target views ({pixels} of the object's pixels), where light is bright"
+        yield "above epsilon", f"{views} of the target views ({pixels} of the object's pixels); epsilon bounds texels"
     if result.ssim is not None and result.noticed is not None:
         yield "visibility", f"{result.noticed} SSIM {result.ssim:.3f}"
     for name, each in result.by_renderer:

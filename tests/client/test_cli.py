@@ -70,7 +70,7 @@ def test_attack_prints_the_table_and_names_the_files_it_wrote(attack_mug: Attack
         "42.1%",
         "0.0310 (7.9/255)",
         "0.2000 (51.0/255)",
-        "25.0% of the target views (1.23% of the object's pixels), where light is bright",
+        "25.0% of the target views (1.23% of the object's pixels); epsilon bounds texels",
         "Side by side, a viewer sees a difference for a trained eye on average (CIEDE2000 1.2)",
         "SSIM 0.987",
         "4,800 by each attacked classifier",

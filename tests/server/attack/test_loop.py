@@ -48,6 +48,8 @@ from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
 
+BATCHES = range(len(SURROGATE.batches))
+
 
 def test_a_step_reports_the_mean_over_all_views_before_it_moves() -> None:
     (step,) = steps_of(steps=1)
@@ -355,7 +357,7 @@ def test_contradictions_are_refused_before_any_work(options: dict[str, Any], mes
 def test_the_loss_of_several_classifiers_is_their_mean() -> None:
     one, other = fake_classifier(seed=0), fake_classifier(seed=1)
     found = [
-        objective_of(*members).evaluate(torch.zeros(512, 3), range(3), torch.ones(12, dtype=torch.bool))
+        objective_of(*members).evaluate(torch.zeros(512, 3), BATCHES, torch.ones(12, dtype=torch.bool))
         for members in ((one,), (other,), (one, other))
     ]
     assert found[2].loss == pytest.approx((found[0].loss + found[1].loss) / 2, abs=1e-5)
@@ -383,13 +385,13 @@ def test_only_active_views_are_evaluated() -> None:
     active = torch.zeros(12, dtype=torch.bool)
     active[[1, 4, 11]] = True
     change = torch.zeros(512, 3)
-    some, rest = (objective.evaluate(change, range(3), which) for which in (active, ~active))
-    everything = objective.evaluate(change, range(3), active | True)
+    some, rest = (objective.evaluate(change, BATCHES, which) for which in (active, ~active))
+    everything = objective.evaluate(change, BATCHES, active | True)
     assert (some.images, rest.images) == (3, 9)
     torch.testing.assert_close(some.gradient + rest.gradient, everything.gradient, atol=1e-5, rtol=1e-3)
     total = some.loss * 12 - 9 * SAFE_MARGIN + rest.loss * 12 - 3 * SAFE_MARGIN
     assert total / 12 == pytest.approx(everything.loss, abs=1e-5)
-    none = objective.evaluate(change, range(3), torch.zeros(12, dtype=torch.bool))
+    none = objective.evaluate(change, BATCHES, torch.zeros(12, dtype=torch.bool))
     assert (none.images, none.loss, none.fooled) == (0, SAFE_MARGIN, 1.0)
     assert not none.gradient.any()
 
