@@ -47,7 +47,8 @@ LITTLE: Final = 0.3
 """An ``a_drop`` below this causes a warning."""
 
 LARGE_LOSS: Final = 0.2
-"""So does a held-out ``a_drop`` that falls short of the own views' by more than this."""
+LARGE_SHARE: Final = 0.3
+"""So does a held-out ``a_drop`` that falls short of the own views' by more than this, or by more than this share."""
 
 
 def softmax(logits: Logits) -> NDArray[np.float64]:
@@ -150,7 +151,7 @@ def reach_warning(target: Accuracy, held_out: Accuracy | None, *, stronger: str,
     own, other = target.a_drop, held_out.a_drop if held_out else None
     if own is not None and own < LITTLE:
         return f"The attack had little effect: A_drop {own:.2f} on its own views. {stronger}"
-    if own is None or other is None or own - other <= LARGE_LOSS:
+    if own is None or other is None or own - other <= min(LARGE_LOSS, LARGE_SHARE * own):
         return None
     return (
         f"The effect is weaker from other views: A_drop {own:.2f} on the attack's own, {other:.2f} on held-out ones. "
