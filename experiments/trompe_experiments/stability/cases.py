@@ -16,7 +16,7 @@ from trompe_experiments.stability import AFTERWARDS, REFERENCE
 from trompe_experiments.stability.disturbed import bfloat16, quantised, saturated
 
 NAME: Final = "stability_targets"
-BASE: Final[Mapping[str, Any]] = {"classifier": "tiny", "epsilon": 0.05, "pool": 120, "steps": 20, "held_out": 100}
+BASE: Final[Mapping[str, Any]] = {"classifier": "tiny", "epsilon": 0.1, "pool": 120, "steps": 20, "held_out": 100}
 
 
 @dataclass(frozen=True)
