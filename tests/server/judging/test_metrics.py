@@ -291,7 +291,13 @@ def share(before: int, after: int) -> Accuracy:
         pytest.param((10, 8), (10, 10), "little effect: A_drop 0.20 on its own views. stronger", id="little"),
         pytest.param((10, 0), (10, 3), "A_drop 1.00 on the attack's own, 0.70 on held-out ones. wider", id="own alone"),
         pytest.param((10, 6), (10, 8), "A_drop 0.40 on the attack's own, 0.20 on held-out ones. wider", id="by share"),
-        *[((10, 6), (10, 7), None), ((10, 0), (10, 2), None), ((10, 7), (10, 6), None), ((0, 0), (10, 10), None), ((9, 0), None, None)],
+        *[
+            ((10, 6), (10, 7), None),
+            ((10, 0), (10, 2), None),
+            ((10, 7), (10, 6), None),
+            ((0, 0), (10, 10), None),
+            ((9, 0), None, None),
+        ],
     ],
 )
 def test_an_attack_that_reaches_few_views_or_only_its_own_is_warned_of(
