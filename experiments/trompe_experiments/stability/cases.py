@@ -9,14 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from trompe_experiments.design import Experiment
+from trompe_experiments.design import Experiment, load_experiment
 from trompe_experiments.in_process import Change
 from trompe_experiments.plan import Plan, plan_experiment
 from trompe_experiments.stability import AFTERWARDS, REFERENCE
 from trompe_experiments.stability.disturbed import bfloat16, quantised, saturated
 
 NAME: Final = "stability_targets"
-BASE: Final[Mapping[str, Any]] = {"classifier": "tiny", "epsilon": 0.1, "pool": 120, "steps": 20, "held_out": 100}
 
 
 @dataclass(frozen=True)
@@ -80,10 +79,11 @@ CASES: Final[Mapping[str, Case]] = {
 def stability_plan(
     *, objects: Sequence[str], seeds: int, only: str = "", options: Mapping[str, Any] | None = None
 ) -> Plan:
-    """Jobs of the cases whose name contains ``only``, on shipped objects. ``options`` override those of all jobs."""
+    """Jobs of the cases whose name contains ``only``, on shipped objects, with the options of the experiment
+    ``stability``, which ``options`` override."""
     file = {
         "name": NAME,
-        "base": {**BASE, **(options or {})},
+        "base": {**load_experiment("stability").base, **(options or {})},
         "objects": {name: {} for name in objects},
         "cases": {words: dict(case.options) for words, case in CASES.items() if only in words},
         "seeds": seeds,

@@ -47,8 +47,10 @@ LITTLE: Final = 0.3
 """An ``a_drop`` below this causes a warning."""
 
 LARGE_LOSS: Final = 0.2
+"""So does a held-out ``a_drop`` that falls short of the own views' by more than this."""
+
 LARGE_SHARE: Final = 0.3
-"""So does a held-out ``a_drop`` that falls short of the own views' by more than this, or by more than this share."""
+"""Or by more than this share of the own views'."""
 
 
 def softmax(logits: Logits) -> NDArray[np.float64]:
