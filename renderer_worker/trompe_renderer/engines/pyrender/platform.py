@@ -40,11 +40,14 @@ try:
     from OpenGL import GL
     from OpenGL.GL.EXT.texture_filter_anisotropic import GL_MAX_TEXTURE_MAX_ANISOTROPY_EXT as MAX_ANISOTROPY
     from OpenGL.GL.EXT.texture_filter_anisotropic import GL_TEXTURE_MAX_ANISOTROPY_EXT as ANISOTROPY
+    from OpenGL.plugins import FormatHandler
     from pyrender.platforms import egl as _egl
     from pyrender.shader_program import ShaderProgram
 except (ImportError, AttributeError, OSError) as error:
     raise RendererError(f"OpenGL cannot be loaded ({error}). {_EGL_REMEDY}") from error
 
+# The PyOpenGL that pyrender asks for knows what ``byref`` returns by its name before Python 3.12.
+FormatHandler("byref", "OpenGL.arrays.ctypesparameters.CtypesParameterHandler", ["_ctypes.CArgObject"])
 
 _SHADER: Final = "mesh.frag"
 _READ: Final = "base_color = base_color * srgb_to_linear(texture(material.base_color_texture, uv_0));"
