@@ -31,11 +31,11 @@ PYTORCH3DS = np.diag([-1.0, 1.0, -1.0])
 class PyTorch3DPeer:
     """Renders ``obj`` in ``views``, differentiably in its textures, in images of ``size`` (H, W)."""
 
-    def __init__(self, obj: Object3D, views: Sequence[View], size: tuple[int, int]) -> None:
+    def __init__(self, obj: Object3D, views: Sequence[View], size: tuple[int, int], device: str = "cpu") -> None:
         self.obj, self.n_views = obj, len(views)
-        lights = DirectionalLights(direction=[spherical(views[0].light.azimuth, views[0].light.elevation).tolist()])
-        self.renderer = _renderer(views, size, lights)
-        self.textures = textures_of(obj)
+        light = spherical(views[0].light.azimuth, views[0].light.elevation).tolist()
+        self.renderer = _renderer(views, size, DirectionalLights(direction=[light], device=device)).to(device)
+        self.textures = textures_of(obj, device=device)
 
     def forward_backward(self) -> Float[Tensor, "views H W 4"]:
         """One pass over all views and back to the textures; the images it made."""
@@ -63,16 +63,11 @@ def _cameras(views: Sequence[View]) -> FoVPerspectiveCameras:
 
 
 def _meshes(obj: Object3D, textures: Mapping[str, Tensor]) -> Meshes:
-    parts = [
-        Meshes(
-            verts=[torch.from_numpy(part.vertices)],
-            faces=[torch.from_numpy(part.faces).long()],
-            textures=TexturesUV(
-                textures[obj.albedo_of(part)][None],
-                [torch.from_numpy(part.faces).long()],
-                [torch.from_numpy(part.uvs)],
-            ),
-        )
-        for part in obj.parts
-    ]
+    parts = []
+    for part in obj.parts:
+        texture = textures[obj.albedo_of(part)]
+        arrays = (torch.from_numpy(each).to(texture.device) for each in (part.vertices, part.faces, part.uvs))
+        vertices, faces, uvs = arrays
+        maps = TexturesUV(texture[None], [faces.long()], [uvs])
+        parts.append(Meshes(verts=[vertices], faces=[faces.long()], textures=maps))
     return join_meshes_as_scene(parts) if len(parts) > 1 else parts[0]

@@ -126,10 +126,11 @@ def classifier_alone(classifier: WhiteBoxClassifier) -> Callable[[], None]:
     return step
 
 
-def fastest_classifier() -> WhiteBoxClassifier:
+def fastest_classifier(device: str = "cpu") -> WhiteBoxClassifier:
     """MobileNetV2 where the real classifiers are, else the shipped one."""
     folder = assets()
-    classifier = load_classifier(folder / "classifiers" / "mobilenet_v2.pt2" if folder is not None else "tiny")
+    file = folder / "classifiers" / "mobilenet_v2.pt2" if folder is not None else "tiny"
+    classifier = load_classifier(file, device=device)
     assert isinstance(classifier, WhiteBoxClassifier)
     return classifier
 
