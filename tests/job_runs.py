@@ -70,8 +70,9 @@ class MemoryArtifacts:
         return load_object(self.read(f"{self.result().object}-adversarial.zip"))
 
     def lasting(self) -> dict[str, bytes]:
-        """All files without durations."""
-        untimed = {name: data for name, data in self.files.items() if not name.startswith("seconds-")}
+        """All files but those that depend on the time: durations, and the preview, taken when it is time."""
+        timed = ("seconds-", "preview.png")
+        untimed = {name: data for name, data in self.files.items() if not name.startswith(timed)}
         result = json.loads(untimed.pop("result.json", b"{}"))
         result.pop("seconds", None)
         return untimed | {"result.json": json.dumps(result).encode()}

@@ -77,7 +77,7 @@ class Budget:
         """``obj`` with textures changed by ``deltas``, as for ``quantise``."""
         return obj.with_textures(
             {
-                name: self.quantise(delta.cpu(), torch.from_numpy(obj.textures[name])).numpy()
+                name: self.quantise(delta, torch.from_numpy(obj.textures[name]).to(delta.device)).cpu().numpy()
                 for name, delta in deltas.items()
             }
         )

@@ -4,7 +4,7 @@ All textures are one flat tensor (texels, 3) here: the texels, or blocks of them
 surrogate's canvas.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,8 +14,10 @@ from torch import Tensor
 
 from trompe_server.attack.goal import Goal
 from trompe_server.classifiers import WhiteBoxClassifier
+from trompe_server.classifiers.protocol import AT_ONCE
 from trompe_server.image_pipelines import Drawn
 from trompe_server.surrogate import AnyCanvas, AnySurrogate
+from trompe_server.surrogate.surrogate import BATCH
 from trompe_shared.errors import SpecError
 
 Textures = Mapping[str, Float[Tensor, "H W 3"]]
@@ -111,15 +113,16 @@ class Objective:
         texels = self.canvas.read(leaf)
         read = texels.detach().requires_grad_()
         losses, won, settled, images = 0.0, 0, [], 0
-        for batch in batches:
-            views = self.surrogate.batches[batch]
-            chosen = active[views.start : views.stop].nonzero()[:, 0]
-            skipped = len(views) - len(chosen)
+        for group in self._groups(batches):
+            found = {batch: active[views.start : views.stop].nonzero()[:, 0] for batch, views in group.items()}
+            chosen = {batch: some for batch, some in found.items() if len(some)}
+            skipped = sum(map(len, group.values())) - sum(map(len, chosen.values()))
             losses, won = losses + skipped * self.goal.safe, won + skipped
-            if len(chosen):
-                loss, reached, safe = self._add_gradient(read, batch, chosen)
-                losses, won, images = losses + loss, won + reached, images + len(chosen)
-                settled.append(chosen[safe] + views.start)
+            if chosen:
+                numbers = torch.cat([some + group[batch].start for batch, some in chosen.items()])
+                loss, reached, safe = self._add_gradient(read, chosen, numbers)
+                losses, won, images = losses + loss, won + reached, images + len(numbers)
+                settled.append(numbers[safe])
         count = sum(len(self.surrogate.batches[batch]) for batch in batches)
         gradient = torch.zeros_like(leaf)
         if read.grad is not None:
@@ -132,22 +135,29 @@ class Objective:
             images,
         )
 
+    def _groups(self, batches: Sequence[int]) -> Iterator[dict[int, range]]:
+        """The views of ``batches`` by batch, together as many as one pass of a network takes."""
+        count = 1 if self.source.device.type == "cpu" else AT_ONCE // BATCH
+        for first in range(0, len(batches), count):
+            yield {batch: self.surrogate.batches[batch] for batch in batches[first : first + count]}
+
     def _add_gradient(
-        self, read: Float[Tensor, "reads 3"], batch: int, chosen: Int[Tensor, " chosen"]
+        self, read: Float[Tensor, "reads 3"], chosen: Mapping[int, Int[Tensor, " _"]], numbers: Int[Tensor, " chosen"]
     ) -> tuple[float, int, Bool[Tensor, " chosen"]]:
-        """Add the gradient of the ``chosen`` views of a batch to ``read.grad``.
+        """Add the gradient of the ``chosen`` views of some batches, the views ``numbers`` of all, to ``read.grad``.
 
         Returns their summed loss, the number of fooled ones, and a mask of the settled ones.
         """
-        shown = self.surrogate.render(read, batch, masks=self.masks)
-        everything = len(chosen) == len(shown)
-        seen = (shown.detach() if everything else _rows(shown.detach(), chosen)).requires_grad_()
-        passed = self._through(seen, batch, chosen)
+        shown = [self.surrogate.render(read, batch, masks=self.masks) for batch in chosen]
+        pairs = list(zip(shown, chosen.values(), strict=True))
+        seen = torch.cat([_rows(images.detach(), rows) for images, rows in pairs]).requires_grad_()
+        passed = seen if self.pipeline is None else self.pipeline.apply(seen, numbers.tolist())
         by_member = (self._of_member(member, passed.detach()) for member in self.members)
         gradients, losses, reached, settled = zip(*by_member, strict=True)
         (gradient,) = torch.autograd.grad(passed, seen, torch.stack(gradients).mean(0))
-        by_image = gradient if everything else torch.zeros_like(shown).index_copy_(0, chosen, gradient)
-        shown.backward(by_image)  # type: ignore[no-untyped-call]
+        parts = torch.split(gradient, [len(rows) for rows in chosen.values()])
+        by_image = [_placed(part, *pair) for part, pair in zip(parts, pairs, strict=True)]
+        torch.autograd.backward(shown, by_image)
         return sum(losses) / len(losses), int(torch.stack(reached).all(0).sum()), torch.stack(settled).all(0)
 
     def _of_member(self, member: WhiteBoxClassifier, images: Tensor) -> tuple[Tensor, float, Tensor, Tensor]:
@@ -160,13 +170,6 @@ class Objective:
         loss = self.goal.losses(logits).sum()
         (gradient,) = torch.autograd.grad(loss, images)
         return gradient, float(loss.detach()), self.goal.reached(logits), self.goal.settled(logits)
-
-    def _through(self, images: Tensor, batch: int, chosen: Int[Tensor, " chosen"]) -> Tensor:
-        """Images of the ``chosen`` views of a batch through the pipeline."""
-        if self.pipeline is None:
-            return images
-        first = self.surrogate.batches[batch].start
-        return self.pipeline.apply(images, [first + number for number in chosen.tolist()])
 
     @torch.no_grad()
     def score(self, change: Flat) -> Score:
@@ -182,4 +185,13 @@ class Objective:
 
 def _rows(images: Float[Tensor, "n 3 H W"], chosen: Int[Tensor, " chosen"]) -> Float[Tensor, "chosen 3 H W"]:
     """The ``chosen`` images, in the same memory order (channels last)."""
+    if len(chosen) == len(images):
+        return images
     return images.permute(0, 2, 3, 1).index_select(0, chosen).permute(0, 3, 1, 2)
+
+
+def _placed(
+    gradient: Float[Tensor, "chosen 3 H W"], images: Float[Tensor, "n 3 H W"], chosen: Int[Tensor, " chosen"]
+) -> Float[Tensor, "n 3 H W"]:
+    """The gradient of all ``images`` from that of the ``chosen`` ones."""
+    return gradient if len(chosen) == len(images) else torch.zeros_like(images).index_copy_(0, chosen, gradient)

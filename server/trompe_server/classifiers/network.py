@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from trompe_server.classifiers.protocol import Images, Logits, predicted
+from trompe_server.classifiers.protocol import AT_ONCE, BATCH, Images, Logits, predicted
 
 
 class NamedNetwork(NamedTuple):
@@ -34,8 +34,15 @@ class NetworkClassifier:
         self.network.requires_grad_(False)
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
-        """Logits of sRGB images in [0, 1] of size ``image_size``, differentiable in the images and on their device."""
-        logits: Tensor = self.network(images.to(self.device))
+        """Logits of sRGB images in [0, 1] of size ``image_size``, differentiable in the images and on their device.
+
+        A graphics card plans a network anew for each number of images, which takes longer than 40 of them: fewer are
+        filled up.
+        """
+        given = images.to(self.device)
+        if given.is_cuda and 0 < len(given) < AT_ONCE:
+            given = torch.cat([given, given.new_zeros(AT_ONCE - len(given), *given.shape[1:])])
+        logits: Tensor = self.network(given)[: len(images)]
         return logits.to(images.device)
 
     @torch.no_grad()
@@ -45,4 +52,5 @@ class NetworkClassifier:
 
     def predict(self, images: Images) -> Logits:
         """Logits (N, n_classes), all finite, of uint8 images (N, H, W, 3) of any size."""
-        return predicted(self.scores, images, self.image_size, self.n_classes)
+        batch = BATCH if torch.device(self.device).type == "cpu" else AT_ONCE
+        return predicted(self.scores, images, self.image_size, self.n_classes, batch=batch, device=self.device)

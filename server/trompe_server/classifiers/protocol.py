@@ -14,7 +14,9 @@ from trompe_server.spec.checks import Classes
 from trompe_shared.errors import ClassifierError
 
 BATCH: Final = 10
-"""Images of one call of a network."""
+"""Images of one call of a network on a CPU, without a gradient."""
+AT_ONCE: Final = 40
+"""Images of one call of a network on a graphics card, with or without a gradient: a step of the attack."""
 HUGE: Final = 1e30
 """Replacement for an infinite logit."""
 
@@ -66,16 +68,22 @@ def resize(images: Float[Tensor, "n 3 h w"], size: tuple[int, int]) -> Float[Ten
     return F.interpolate(images, size, mode="bilinear", antialias=True)
 
 
-def fit_images(images: Images, size: tuple[int, int]) -> Float[Tensor, "n 3 H W"]:
+def fit_images(images: Images, size: tuple[int, int], device: str = "cpu") -> Float[Tensor, "n 3 H W"]:
     """Images (N, h, w, 3) as a classifier's input in [0, 1] of ``size`` (H, W), resized if necessary."""
-    batch = torch.from_numpy(np.ascontiguousarray(images)).permute(0, 3, 1, 2).float() / 255
+    batch = torch.from_numpy(np.ascontiguousarray(images)).to(device).permute(0, 3, 1, 2).float() / 255
     return resize(batch, size)
 
 
 def predicted(
-    logits: Callable[[Tensor], Tensor], images: Images, size: tuple[int, int], n_classes: int, *, batch: int = BATCH
+    logits: Callable[[Tensor], Tensor],
+    images: Images,
+    size: tuple[int, int],
+    n_classes: int,
+    *,
+    batch: int = BATCH,
+    device: str = "cpu",
 ) -> Logits:
-    """Logits (N, n_classes), all finite, of images of any size, by a network of images of ``size`` (H, W).
+    """Logits (N, n_classes), all finite, of images of any size, by a network of ``size`` (H, W) on ``device``.
 
     Raises ``ClassifierError`` unless the images are (N, H, W, 3) uint8.
     """
@@ -86,7 +94,7 @@ def predicted(
         )
     chunks = [np.zeros((0, n_classes), np.float32)]
     for start in range(0, len(images), batch):
-        chunks.append(finite(logits(fit_images(images[start : start + batch], size))).numpy())
+        chunks.append(finite(logits(fit_images(images[start : start + batch], size, device))).cpu().numpy())
     return np.concatenate(chunks)
 
 

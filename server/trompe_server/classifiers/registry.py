@@ -86,7 +86,7 @@ def load_classifier(
 
     Raises ``ClassifierError`` for an unknown reference and for a network that breaks the contract.
     """
-    _check_device(device)
+    _prepare_device(device)
     reference = str(path_or_name)
     if reference.startswith(LOOKED_UP):
         return _by_name(reference, name, classes, weights, device)
@@ -148,8 +148,12 @@ def _from_file(path: Path, name: str | None, classes: Sequence[str] | None, devi
     return replace(loaded, name=name or path.stem, classes=names)
 
 
-def _check_device(device: str) -> None:
-    """Raise ``ClassifierError`` if torch cannot put a tensor on ``device``."""
+def _prepare_device(device: str) -> None:
+    """Raise ``ClassifierError`` if torch cannot put a tensor on ``device``.
+
+    Convolutions are computed in full precision from then on: judgements must not depend on the device.
+    """
+    torch.backends.cudnn.allow_tf32 = False
     try:
         torch.zeros((), device=device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:

@@ -21,11 +21,14 @@ from torch import Tensor
 from trompe_server.classifiers.drawing import seeded_generator
 from trompe_server.classifiers.protocol import fit_images
 from trompe_server.image_pipelines.resampling import Axis, blurred, placed, resampled, resized
+from trompe_server.system.threads import in_threads
 
 Range = tuple[float, float]
 Images = Float[Tensor, "n 3 H W"]
-Image = Float[Tensor, "3 H W"]
 Image8 = NDArray[np.uint8]
+
+SHOWN_AT_ONCE: Final = 20
+"""Images of one call of ``apply`` in ``shown``."""
 
 DARKEST: Final = 1e-4
 """Level from which a tone curve has a finite slope."""
@@ -58,16 +61,23 @@ class ImagePipeline:
 
     def apply(self, images: Images, generators: Sequence[torch.Generator]) -> Images:
         """sRGB images in [0, 1], each through its own draws from its generator. Differentiable in the images."""
-        drawn = [self._strengths(each) for each in generators]
-        if not any(drawn):
-            return images
-        return torch.stack([_through(*each) for each in zip(images, drawn, generators, strict=True)])
+        rows, drawn = list(images), [_Draw(self._strengths(each), each) for each in generators]
+        for names, change in _STAGES:
+            numbers = [number for number, draw in enumerate(drawn) if draw.strengths.keys() & names]
+            if numbers:
+                changed = change(torch.stack([rows[k] for k in numbers]), [drawn[k] for k in numbers])
+                for number, image in zip(numbers, changed, strict=True):
+                    rows[number] = image
+        return torch.stack(rows) if any(draw.strengths for draw in drawn) else images
 
     def shown(self, images: Image8) -> Image8:
         """8-bit images (N, H, W, 3) through the pipeline; an image's draws depend on its number only."""
-        batch = fit_images(images, images.shape[1:3])
-        changed = (self.apply(image[None], [_generator(number)]) for number, image in enumerate(batch))
-        return np.stack([_levels(image) for (image,) in changed]) if len(images) else images
+        parts = [images[:0]]
+        for first in range(0, len(images), SHOWN_AT_ONCE):
+            some = images[first : first + SHOWN_AT_ONCE]
+            generators = [_generator(first + number) for number in range(len(some))]
+            parts.append(_levels(self.apply(fit_images(some, some.shape[1:3]), generators)))
+        return np.concatenate(parts)
 
     def _strengths(self, generator: torch.Generator) -> Mapping[str, float]:
         """Operations of one image with their strengths. Each takes its numbers whether it is used or not."""
@@ -116,58 +126,94 @@ def _generator(*numbers: int) -> torch.Generator:
     return seeded_generator(",".join(map(str, numbers)).encode())
 
 
-def _through(image: Image, strengths: Mapping[str, float], generator: torch.Generator) -> Image:
-    image = _toned(_resampled(image, strengths), strengths)
-    if "noise" in strengths:
-        image = image + strengths["noise"] * (2 * torch.rand(image.shape, generator=generator) - 1).to(image)
-    return image + _change_by_jpeg(image.detach(), strengths["jpeg"]) if "jpeg" in strengths else image
+@dataclass(frozen=True)
+class _Draw:
+    """The operations of one image with their strengths, and the generator of its noise."""
+
+    strengths: Mapping[str, float]
+    generator: torch.Generator
 
 
-def _resampled(image: Image, strengths: Mapping[str, float]) -> Image:
-    """The image placed, reduced and enlarged, and blurred."""
-    height, width = sides = image.shape[1:]
-    stages: list[tuple[Axis, ...]] = []
-    if strengths.keys() & {"zoom", "shift of rows", "shift of columns", "mirrored"}:
+def _resampled(images: Images, drawn: Sequence[_Draw]) -> Images:
+    """Images placed, reduced and enlarged, and blurred."""
+    axes = [_axes(draw.strengths, *images.shape[2:]) for draw in drawn]
+    rows, columns = (torch.stack(each)[:, None] for each in zip(*axes, strict=True))
+    return resampled(images, rows, columns)
+
+
+def _axes(strengths: Mapping[str, float], height: int, width: int) -> tuple[Axis, Axis]:
+    """The matrices of one image's rows and columns."""
+    stages: list[tuple[Axis, Axis]] = []
+    if strengths.keys() & _PLACED:
         zoom, mirrored = strengths.get("zoom", 1.0), "mirrored" in strengths
         down, right = (strengths.get(f"shift of {axis}", 0.0) for axis in ("rows", "columns"))
         stages.append((placed(height, zoom=zoom, shift=down), placed(width, zoom=zoom, shift=right, mirrored=mirrored)))
-    if strengths.get("resize", 1) < 1:
-        factor = strengths["resize"]
-        stages.append(tuple(resized(side, max(1, round(factor * side))) for side in sides))
+    if "resize" in strengths:
+        small, narrow = (max(1, round(strengths["resize"] * side)) for side in (height, width))
+        stages.append((resized(height, small), resized(width, narrow)))
     if "blur" in strengths:
-        stages.append(tuple(blurred(side, strengths["blur"]) for side in sides))
-    if not stages:
-        return image
+        stages.append((blurred(height, strengths["blur"]), blurred(width, strengths["blur"])))
     rows, columns = (reduce(lambda done, then: then @ done, axis) for axis in zip(*stages, strict=True))
-    return resampled(image, rows, columns)
+    return rows, columns
 
 
-def _toned(image: Image, strengths: Mapping[str, float]) -> Image:
-    if "gamma" in strengths:
-        image = image.clamp(DARKEST, 1) ** strengths["gamma"]
-    if "gain" in strengths:
-        image = (image * strengths["gain"]).clamp(0, 1)
-    if "filmic" in strengths:
-        image = torch.lerp(image, _filmic(image), strengths["filmic"])
-    return image
+def _strength(drawn: Sequence[_Draw], name: str, images: Images) -> Float[Tensor, "n 1 1 1"]:
+    return torch.tensor([draw.strengths[name] for draw in drawn]).to(images)[:, None, None, None]
 
 
-def _change_by_jpeg(image: Image, quality: float) -> Image:
-    packed = io.BytesIO()
-    PIL.Image.fromarray(_levels(image)).save(packed, "JPEG", quality=round(quality))
-    read = torch.from_numpy(np.array(PIL.Image.open(packed)))
-    return read.permute(2, 0, 1).to(image) / 255 - image
+def _power(levels: Images, exponent: Tensor | float) -> Images:
+    """Powers of levels, at least ``DARKEST``; ``torch.pow`` with its gradient takes twice as long."""
+    return (levels.clamp(DARKEST, 1).log() * exponent).exp()
 
 
-def _filmic(image: Tensor) -> Tensor:
-    light = image.clamp(DARKEST, 1) ** 2.2
+def _with_gamma(images: Images, drawn: Sequence[_Draw]) -> Images:
+    return _power(images, _strength(drawn, "gamma", images))
+
+
+def _with_gain(images: Images, drawn: Sequence[_Draw]) -> Images:
+    return (images * _strength(drawn, "gain", images)).clamp(0, 1)
+
+
+def _filmic(images: Images, drawn: Sequence[_Draw]) -> Images:
+    light = _power(images, 2.2)
     curve = light * (2.51 * light + 0.03) / (light * (2.43 * light + 0.59) + 0.14)
-    return curve.clamp(DARKEST, 1) ** (1 / 2.2)
+    return torch.lerp(images, _power(curve, 1 / 2.2), _strength(drawn, "filmic", images))
 
 
-def _levels(image: Image) -> Image8:
-    found: Image8 = (255 * image.detach().cpu().clamp(0, 1)).round().byte().permute(1, 2, 0).contiguous().numpy()
+def _noisy(images: Images, drawn: Sequence[_Draw]) -> Images:
+    noise = in_threads(lambda draw: torch.rand(images.shape[1:], generator=draw.generator), drawn)
+    return images + _strength(drawn, "noise", images) * (2 * torch.stack(noise) - 1).to(images)
+
+
+def _packed(images: Images, drawn: Sequence[_Draw]) -> Images:
+    """Images through JPEG; the gradient is that of the unchanged images."""
+
+    def through_jpeg(image: Image8, draw: _Draw) -> Image8:
+        packed = io.BytesIO()
+        PIL.Image.fromarray(image).save(packed, "JPEG", quality=round(draw.strengths["jpeg"]))
+        return np.array(PIL.Image.open(packed))
+
+    plain = images.detach()
+    read = torch.from_numpy(np.stack(in_threads(through_jpeg, _levels(plain), drawn))).permute(0, 3, 1, 2)
+    return images + (read.to(images.device).to(images) / 255 - plain)
+
+
+def _levels(images: Images) -> Image8:
+    found: Image8 = (255 * images.detach().clamp(0, 1)).round().byte().permute(0, 2, 3, 1).contiguous().cpu().numpy()
     return found
+
+
+_PLACED: Final = {"zoom", "shift of rows", "shift of columns", "mirrored"}
+
+_STAGES: Final = (
+    ({*_PLACED, "resize", "blur"}, _resampled),
+    ({"gamma"}, _with_gamma),
+    ({"gain"}, _with_gain),
+    ({"filmic"}, _filmic),
+    ({"noise"}, _noisy),
+    ({"jpeg"}, _packed),
+)
+"""Names of operations and what they do to the images that take any of them, in their order."""
 
 
 PIPELINES: Final[Mapping[str, ImagePipeline]] = {

@@ -111,6 +111,7 @@ class JobCalibrations:
             on_sampling=self._prepare_geometry,
             deterministic=setup.attacked[number].engine.deterministic,
             tone_map=partial(self._tone_map, setup.attacked[number].engine),
+            device=setup.device,
         )
 
     def _tone_map(self, engine: EngineInfo, ask: Ask, size: tuple[int, int]) -> ToneMap:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Final
 
 import numpy as np
@@ -50,6 +50,9 @@ PROBE_STREAM, HELD_OUT_STREAM, POOL_STREAM, GRID_STREAM, NOISE_STREAM = range(5)
 
 FEWEST, PARTS = 60, 4
 """An attack starts with this part of its pool, and at least with so many views."""
+
+KEPT_NETWORKS: Final = 2
+"""Classifiers that stay loaded for the next job: loading one takes seconds."""
 
 SAILENV: Final = "sailenv"
 Image8 = NDArray[np.uint8]
@@ -264,7 +267,13 @@ def _picture(reference: str, library: Library) -> Image8:
 
 def _stored_classifier(reference: str, *, library: Library, device: str) -> Classifier:
     info = library.classifier(reference)
-    return load_classifier(library.classifier_path(reference), name=info.name, classes=info.classes, device=device)
+    classes = None if info.classes is None else tuple(info.classes)
+    return _loaded(library.classifier_path(reference), info.name, classes, device)
+
+
+@lru_cache(maxsize=KEPT_NETWORKS)
+def _loaded(path: str, name: str, classes: tuple[str, ...] | None, device: str) -> Classifier:
+    return load_classifier(path, name=name, classes=classes, device=device)
 
 
 def drawn_views(

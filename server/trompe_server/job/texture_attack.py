@@ -62,8 +62,8 @@ SHARES: Final = {"prepare": 0.15, "calibrate": 0.25, "attack": 0.45, "judge": 0.
 
 DONE: Final = Progress(phase="judge", fraction=1.0)
 
-PREVIEWED: Final = 2**22
-"""Texels of an object with a preview after each phase of the attack. Twice as many have one after every second."""
+PREVIEWING: Final = 0.03
+"""Largest share of an attack's time that its previews take: on a large texture one takes as long as a step."""
 
 RECENT: Final = 10
 """Number of the latest steps that tell how long one takes."""
@@ -120,6 +120,7 @@ class TextureAttack:
         self._counts: Counter[str] = Counter()
         self._between = time.perf_counter() if began is None else began
         self._stepped: deque[float] = deque(maxlen=RECENT)
+        self._next_preview = 0.0
         self._scenes: dict[tuple[View, ...], _Scene] = {}
 
     def phases(self) -> list[str]:
@@ -217,8 +218,7 @@ class TextureAttack:
         else:
             self.files.save_state(chunk + 1, after)
         if taken:
-            if chunk % -(-self.setup.obj.n_texels // PREVIEWED) == 0:
-                self._preview(after)
+            self._preview(after)
             queries = (self.setup.queries or 0) - asked
             self._counts["attack_steps"] += len(taken)
             self._counts["classifier_images"] += taken[-1].evaluations - int(before.memory.get(SHOWN, 0))
@@ -257,7 +257,10 @@ class TextureAttack:
         return {"eta_seconds": eta, "eta_least_seconds": least_eta}
 
     def _preview(self, state: AttackState) -> None:
-        """Save a picture for spectators: the first view of the current texture, in surrogate and target."""
+        """Save a picture for spectators, if it is time: the first view of the texture, in surrogate and target."""
+        began = time.perf_counter()
+        if began < self._next_preview:
+            return
         setup, painted = self.setup, self.budget.repaint(self.setup.obj, state.deltas)
         first, surrogate = setup.renderers[0], self._surrogates[0]
         texels = Painted(painted, surrogate.device).texels(surrogate.geometry)
@@ -266,6 +269,7 @@ class TextureAttack:
         self._counts["target_renders"] += 1
         picture = np.concatenate([(255 * expected).round().astype(np.uint8), shown], 1)
         self.artifacts.write("preview.png", encode_png(picture))
+        self._next_preview = began + (time.perf_counter() - began) / PREVIEWING
 
     def _ascend(self, state: AttackState, steps: int, on_step: Callable[[Step], None]) -> AttackState:
         setup, search, scene = self.setup, self.spec.search, self._scene()

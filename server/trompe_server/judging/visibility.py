@@ -13,6 +13,7 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 from skimage.metrics import structural_similarity
 
 from trompe_server.judging.metrics import max_view_change, mean_texel_change, share_beyond, texels_altered
+from trompe_server.system.threads import in_threads
 from trompe_shared.api import Visibility
 from trompe_shared.object3d import Object3D
 from trompe_shared.opacity import strongest
@@ -76,8 +77,8 @@ def perceived_change(before: Images, after: Images, pixels: Pixels) -> dict[str,
     shown = [view for view in zip(before, after, pixels, strict=True) if view[2].any()]
     if not shown:
         return {}
-    similarity = [_similarity(*view) for view in shown]
-    difference = np.concatenate([_colour_difference(old[mask], new[mask]) for old, new, mask in shown])
+    similarity = in_threads(_similarity, *zip(*shown, strict=True))
+    difference = np.concatenate(in_threads(_colour_difference, *zip(*shown, strict=True)))
     return {
         "ssim": float(np.concatenate(similarity).mean(dtype=np.float64)),
         "ssim_worst": min(float(view.mean(dtype=np.float64)) for view in similarity),
@@ -110,11 +111,14 @@ def _similarity(
     return inside
 
 
-def _colour_difference(before: UInt8[np.ndarray, "n 3"], after: UInt8[np.ndarray, "n 3"]) -> NDArray[np.float64]:
-    """CIEDE2000 (n,) of sRGB colours; equal colours are skipped."""
-    difference = np.zeros(len(before))
-    changed = (before != after).any(axis=1)
-    difference[changed] = deltaE_ciede2000(rgb2lab(before[changed]), rgb2lab(after[changed]))
+def _colour_difference(
+    before: UInt8[np.ndarray, "H W 3"], after: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]
+) -> NDArray[np.float64]:
+    """CIEDE2000 (pixels,) of sRGB colours over ``mask``; equal colours are skipped."""
+    old, new = before[mask], after[mask]
+    difference = np.zeros(len(old))
+    changed = (old != new).any(axis=1)
+    difference[changed] = deltaE_ciede2000(rgb2lab(old[changed]), rgb2lab(new[changed]))
     return difference
 
 

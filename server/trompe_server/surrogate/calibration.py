@@ -48,9 +48,6 @@ KEPT_BYTES: Final = 2**29
 KEPT_RASTERS: Final = 2
 """The best hypothesis and the one that is tried."""
 
-CPU: Final = torch.device("cpu")
-"""Device of the search."""
-
 Image8 = NDArray[np.uint8]
 MeasureToneMap = Callable[[Ask, tuple[int, int]], ToneMap]
 
@@ -314,6 +311,7 @@ def calibrate(
     on_sampling: Callable[[SamplingModel], None] = lambda _: None,
     deterministic: bool = True,
     tone_map: MeasureToneMap = measure_tone_map,
+    device: torch.device | str = "cpu",
 ) -> Calibration:
     """Probe the target as far as the ``wanted`` colour model needs; ``auto`` takes the cheapest within tolerance.
 
@@ -325,7 +323,12 @@ def calibrate(
     tone_map: gives the target's tone curve, if it is needed. A few trial views decide; the other views are probed
     afterwards.
     """
-    trial = _Trial(obj, views, clean, ask, generator, backdrops, deterministic=deterministic, tone_map=tone_map)
+    trial = _Trial(
+        *(obj, views, clean, ask, generator, backdrops),
+        deterministic=deterministic,
+        tone_map=tone_map,
+        device=torch.device(device),
+    )
     if wanted in {"auto", "diffuse"}:
         fidelity = trial.fidelity("diffuse", SamplingModel(), ())
         if wanted == "diffuse" or fidelity.good_enough:
@@ -362,14 +365,15 @@ class _Trial:
         *,
         deterministic: bool,
         tone_map: MeasureToneMap,
+        device: torch.device,
     ) -> None:
-        self.obj, self.ask, self.backdrops, self.tone_map = obj, ask, backdrops, tone_map
+        self.obj, self.ask, self.backdrops, self.tone_map, self.device = obj, ask, backdrops, tone_map, device
         self.index = sorted({round(k) for k in np.linspace(0, len(views) - 1, TRIAL_VIEWS + 2)[1:-1]})
         self.views, self.clean = tuple(views[k] for k in self.index), clean[self.index]
         repainted = painted_noise(obj, generator)
         self.images = ask(repainted, self.views)
         self.again = None if deterministic else ask(obj, [replace(view, noise=view.noise + 1) for view in self.views])
-        self.painted = Painted(obj, CPU), Painted(repainted, CPU)
+        self.painted = Painted(obj, device), Painted(repainted, device)
         self.charts: list[int] = []
         self.probes: dict[int, Image8] = {}
         self.geometries: dict[SamplingModel, Geometry] = {}
@@ -433,7 +437,7 @@ class _Trial:
         known = self.geometries.pop(key, None)
         made = key.but(kernel=sampling.kernel)
         self.geometries[key] = known or prepare_geometry(
-            self.obj, self.views, size=size, sampling=made, known=self._visible(sampling)
+            self.obj, self.views, size=size, sampling=made, device=self.device, known=self._visible(sampling)
         )
         while len(self.geometries) > 1 and sum(each.nbytes for each in self.geometries.values()) > KEPT_BYTES:
             del self.geometries[next(iter(self.geometries))]

@@ -32,7 +32,7 @@ from trompe_server.classifiers import (
 from trompe_server.classifiers.archive import read_program
 from trompe_server.classifiers.fold import BATCH_NORM, CONVOLUTION, Formatted, fold_batch_norm
 from trompe_server.classifiers.onnx import OnnxClassifier, load_onnx
-from trompe_server.classifiers.protocol import fit_images
+from trompe_server.classifiers.protocol import AT_ONCE, fit_images
 from trompe_shared.errors import ClassifierError
 
 SIZE = (20, 24)
@@ -264,21 +264,35 @@ def test_an_exported_network_is_the_network_it_was(pt2: Path) -> None:
     torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
 
 
+def logits_and_gradients(path: str | Path, device: str, count: int) -> list[torch.Tensor]:
+    network = load_classifier(path, device=device)
+    assert isinstance(network, NetworkClassifier)
+    images = torch.rand(count, 3, *network.image_size, generator=torch.Generator().manual_seed(0))
+    images = images.to(device).requires_grad_()
+    logits = network.logits(images)
+    assert logits.shape == (count, network.n_classes)
+    assert logits.device.type == device
+    return [logits.detach().cpu(), *(each.cpu() for each in torch.autograd.grad(logits[:, 0].sum(), images))]
+
+
 @pytest.mark.parametrize("kind", ["pt2", "tiny"])
 def test_a_network_on_another_device_gives_the_same_logits_and_gradients_there(
     kind: str, pt2: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device, path = pretend_device(monkeypatch), pt2 if kind == "pt2" else kind
-    found = []
-    for name in ("cpu", device):
-        network = load_classifier(path, device=name)
-        assert isinstance(network, NetworkClassifier)
-        images = torch.linspace(0, 1, 6 * network.image_size[0] * network.image_size[1]).to(name)
-        images = images.view(2, 3, *network.image_size).requires_grad_()
-        logits = network.logits(images)
-        assert logits.device.type == name
-        found.append([logits.detach().cpu(), *(each.cpu() for each in torch.autograd.grad(logits.sum(), images))])
+    found = [logits_and_gradients(path, name, 2) for name in ("cpu", device)]
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize("kind", ["pt2", "tiny"])
+@pytest.mark.parametrize("count", [1, 7, AT_ONCE, AT_ONCE + 1])
+def test_a_network_on_a_graphics_card_gives_the_logits_and_gradients_of_the_cpu(
+    count: int, kind: str, pt2: Path
+) -> None:
+    found = [logits_and_gradients(pt2 if kind == "pt2" else kind, name, count) for name in ("cpu", "cuda")]
+    for one, other in zip(*found, strict=True):
+        assert (other - one).norm() <= 1e-3 * one.norm()
 
 
 def batch_norms(graph: Any) -> int:

@@ -15,8 +15,10 @@ from PIL import Image
 from tests.fakes import FakeTarget
 from tests.job_runs import CHAIR, DarkTarget, MemoryArtifacts, Recorder, Run, opened, run_job, setup_of, spec_of
 from trompe_server.attack import Budget, Goal, attack, load_state, saliency_masks, start
-from trompe_server.classifiers import NetworkClassifier
+from trompe_server.classifiers import NetworkClassifier, load_classifier
+from trompe_server.job import setup, texture_attack
 from trompe_server.job.protocol import DamagedFileError
+from trompe_server.job.texture_attack import CHUNK
 from trompe_server.library import Library
 from trompe_server.renderers import TargetRenderer
 from trompe_server.surrogate import Geometry, SamplingModel, diffuse_surrogate, prepare_geometry, textures_of
@@ -345,6 +347,42 @@ def test_saliency_is_that_of_the_targets_images(library: Library) -> None:
 
 
 @pytest.mark.usefixtures("pictures")
+class Previewed(MemoryArtifacts):
+    """Counts the previews."""
+
+    previews = 0
+
+    def write(self, name: str, data: bytes) -> None:
+        self.previews += name == "preview.png"
+        super().write(name, data)
+
+
+@pytest.mark.parametrize(("share", "expected"), [(1e-9, 1), (1e9, 3)])
+def test_previews_take_a_limited_share_of_the_time(
+    share: float, expected: int, library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(texture_attack, "PREVIEWING", share)
+    artifacts = Previewed()
+    job = opened(spec_of(steps=2 * CHUNK + 1, loss="cross_entropy"), library, artifacts)
+    for phase in job.phases():
+        job.run(phase, lambda _: None)
+    assert artifacts.previews == expected
+
+
+def test_a_classifier_is_loaded_once_for_several_jobs(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
+    setup._loaded.cache_clear()
+    loaded: list[str] = []
+
+    def load(path: str, **options: Any) -> Any:
+        loaded.append(path)
+        return load_classifier(path, **options)
+
+    monkeypatch.setattr(setup, "load_classifier", load)
+    for steps in (1, 2):
+        run_job(spec_of(steps=steps, held_out=0), library)
+    assert loaded == ["tiny"]
+
+
 def test_an_object_never_recognised_is_not_applicable(library: Library) -> None:
     ended = run_job(spec_of(label="ball"), library)
     report, result = ended.reports["prepare"], ended.result

@@ -23,6 +23,7 @@ from trompe_server.pictures import (
     saliency_texture_sheet,
     texture_sheet,
 )
+from trompe_server.system.threads import in_threads
 from trompe_shared.engine import DEFAULT_ENGINE
 from trompe_shared.object3d import encode_png
 
@@ -43,7 +44,7 @@ def picture_files(data: ReportData) -> dict[str, bytes]:
     sheets = _saliency(data, f"Saliency of {title}")
     if data.after is not None:
         sheets |= _before_and_after(data, data.after, title)
-    return {name: encode_png(picture) for name, picture in sheets.items()}
+    return dict(zip(sheets, in_threads(encode_png, sheets.values()), strict=True))
 
 
 def saliency_views(setup: JobSetup) -> NDArray[np.int64]:
