@@ -110,6 +110,17 @@ def test_what_all_configurations_of_a_series_share_is_left_out_of_their_names() 
     ]
 
 
+def test_series_that_would_have_one_title_keep_what_tells_them_apart() -> None:
+    rows = [
+        row(series="epsilon", configuration="epsilon 0.02"),
+        row(series="epsilon", configuration="epsilon 0.05"),
+        row(series="perceptual x epsilon", configuration="perceptual True, epsilon 0.03"),
+        row(series="perceptual x epsilon", configuration="perceptual True, epsilon 0.05"),
+    ]
+    named = [each.configuration for each in configurations(rows)]
+    assert named == [(each.series, each.configuration) for each in rows]
+
+
 def test_the_table_has_both_costs_and_says_on_which_front_a_configuration_is() -> None:
     rows = [
         row(series="steps", configuration="steps 5", seconds=10, evaluations=500, held_out_a_drop=0.4),
