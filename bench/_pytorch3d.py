@@ -66,8 +66,7 @@ def _meshes(obj: Object3D, textures: Mapping[str, Tensor]) -> Meshes:
     parts = []
     for part in obj.parts:
         texture = textures[obj.albedo_of(part)]
-        arrays = (torch.from_numpy(each).to(texture.device) for each in (part.vertices, part.faces, part.uvs))
-        vertices, faces, uvs = arrays
-        maps = TexturesUV(texture[None], [faces.long()], [uvs])
-        parts.append(Meshes(verts=[vertices], faces=[faces.long()], textures=maps))
+        vertices, uvs = (torch.from_numpy(each).to(texture.device) for each in (part.vertices, part.uvs))
+        faces = torch.from_numpy(part.faces).long().to(texture.device)
+        parts.append(Meshes([vertices], [faces], TexturesUV(texture[None], [faces], [uvs])))
     return join_meshes_as_scene(parts) if len(parts) > 1 else parts[0]

@@ -15,7 +15,7 @@ from functools import partial
 import torch
 
 from bench._common import BenchObject, bench_objects, forward_backward, in_rounds, machine, measured_at_random
-from bench.surrogate_speed import fastest_classifier
+from bench.surrogate_speed import classifier_alone, fastest_classifier, same_silhouette
 from trompe_experiments.markdown import markdown_table
 from trompe_server.attack import Budget, Goal, attack, movable, start
 from trompe_server.classifiers import WhiteBoxClassifier
@@ -42,41 +42,21 @@ def contenders_of(entry: BenchObject, size: tuple[int, int]) -> tuple[dict[str, 
     found: dict[str, Contender] = {
         "surrogate": partial(forward_backward, surrogate, textures, lambda images: gradient[: len(images)])
     }
-    own, agreement = silhouettes(surrogate), list[str]()
+    agreement: list[str] = []
     if importlib.util.find_spec("nvdiffrast") is not None:
         from bench._nvdiffrast import NvdiffrastPeer
 
         for name, cached in (("nvdiffrast", False), ("nvdiffrast, rasterised once", True)):
             peer = NvdiffrastPeer(entry.obj, views, size, cached=cached)
             found[name] = peer.forward_backward
-        agreement.append(f"nvdiffrast {overlap(own, peer.forward_backward()[..., 0]):.1%}")
+        agreement.append(f"nvdiffrast {same_silhouette(surrogate, peer.forward_backward()[..., 0]):.1%}")
     if importlib.util.find_spec("pytorch3d") is not None:
         from bench._pytorch3d import PyTorch3DPeer
 
         other = PyTorch3DPeer(entry.obj, views, size, device="cuda")
         found["PyTorch3D"] = other.forward_backward
-        agreement.append(f"PyTorch3D {overlap(own, other.forward_backward()[..., 3]):.1%}")
+        agreement.append(f"PyTorch3D {same_silhouette(surrogate, other.forward_backward()[..., 3]):.1%}")
     return found, agreement
-
-
-def silhouettes(surrogate: Surrogate) -> torch.Tensor:
-    """The object's pixels (views, H, W)."""
-    found = torch.zeros(surrogate.base.shape[:3], dtype=torch.bool, device=surrogate.device)
-    for batch in surrogate.geometry.batches:
-        found[batch.views.start : batch.views.stop].view(-1)[batch.pixel] = True
-    return found
-
-
-def overlap(own: torch.Tensor, alpha: torch.Tensor) -> float:
-    """Intersection over union of the object's pixels, so that the work is known to be the same."""
-    theirs = alpha > 0
-    return float((own & theirs).sum() / (own | theirs).sum())
-
-
-def classifier_pass(classifier: WhiteBoxClassifier) -> Contender:
-    """Forward and gradient of as many images."""
-    images = torch.rand(VIEWS, 3, *classifier.image_size, device="cuda").requires_grad_()
-    return lambda: torch.autograd.grad(Goal(0).losses(classifier.logits(images)).sum(), images)
 
 
 def steps_of(entry: BenchObject, classifier: WhiteBoxClassifier) -> Contender:
@@ -120,7 +100,7 @@ def main() -> None:
             ]
     header = ["object, side", "renderer", "ms per view (median / least)", "ratio", "silhouettes agree"]
     print(markdown_table(header, rows) + "\n", flush=True)
-    network = {f"{classifier.name}, forward and gradient": classifier_pass(classifier)}
+    network = {f"{classifier.name}, forward and gradient": classifier_alone(classifier, VIEWS, "cuda")}
     steps = {f"attack steps, {entry.name}": steps_of(entry, classifier) for entry in bench_objects(options.objects)}
     times = in_rounds({name: synchronised(each) for name, each in (network | steps).items()}, options.rounds)
     print(

@@ -115,10 +115,10 @@ def outside_share(work: Work, classifier: WhiteBoxClassifier, shares: list[float
     return step
 
 
-def classifier_alone(classifier: WhiteBoxClassifier) -> Callable[[], None]:
+def classifier_alone(classifier: WhiteBoxClassifier, count: int = BATCH, device: str = "cpu") -> Callable[[], None]:
     """A contender: forward and gradient of one batch of images."""
-    generator = torch.Generator().manual_seed(0)
-    images = torch.rand(BATCH, *classifier.image_size, 3, generator=generator).permute(0, 3, 1, 2).requires_grad_()
+    images = torch.rand(count, *classifier.image_size, 3, generator=torch.Generator().manual_seed(0))
+    images = images.to(device).permute(0, 3, 1, 2).requires_grad_()
 
     def step() -> None:
         torch.autograd.grad(Goal(0).losses(classifier.logits(images)).sum(), images)
@@ -230,19 +230,19 @@ def peers(works: Sequence[Work], size: tuple[int, int]) -> dict[str, Callable[[]
         if str(SMALL) in work.name and work.surrogate.model == "calibrated":
             chosen = [int(k) for k in np.linspace(0, len(work.views) - 1, PEER_VIEWS + 2)[1:-1]]
             peer = PyTorch3DPeer(work.obj, [work.views[k] for k in chosen], size)
-            overlap = same_silhouette(work.surrogate, chosen, peer.forward_backward()[..., 3])
+            overlap = same_silhouette(work.surrogate, peer.forward_backward()[..., 3], chosen)
             print(f"{work.name}: the silhouettes of both overlap to {overlap:.1%}.\n")
             found[peer_name(work)] = peer.forward_backward
     return found
 
 
-def same_silhouette(surrogate: Surrogate, views: Sequence[int], alpha: Float[Tensor, "views H W"]) -> float:
-    """Intersection over union of the object's pixels, so that the work is known to be the same."""
-    silhouettes = torch.zeros(surrogate.base.shape[:3], dtype=torch.bool)
+def same_silhouette(surrogate: Surrogate, alpha: Float[Tensor, "views H W"], views: Sequence[int] = ()) -> float:
+    """Intersection over union of the object's pixels in some ``views`` (default: all), so that the work is known to be
+    the same."""
+    own = torch.zeros(surrogate.base.shape[:3], dtype=torch.bool, device=surrogate.device)
     for batch in surrogate.geometry.batches:
-        silhouettes[batch.views.start : batch.views.stop].view(-1)[batch.pixel] = True
-    own = silhouettes[list(views)].flatten(1)
-    theirs = alpha.flatten(1) > 0
+        own[batch.views.start : batch.views.stop].view(-1)[batch.pixel] = True
+    own, theirs = own[list(views)] if views else own, alpha > 0
     return float((own & theirs).sum() / (own | theirs).sum())
 
 
@@ -250,7 +250,7 @@ def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--objects", nargs="+", default=[], metavar="NAME", help="default: candle toilet")
-    parser.add_argument("--size", type=int, default=224, help="side of the images, pixels")
+    parser.add_argument("--size", type=int, default=224 if assets() else 128, help="side of the images, pixels")
     parser.add_argument("--views", type=int, default=60, help="how many of the 60 views")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--pytorch3d", action="store_true", help="compare with PyTorch3D (slow), where installed")

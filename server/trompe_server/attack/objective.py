@@ -175,8 +175,8 @@ class Objective:
     def score(self, change: Flat) -> Score:
         """Score of a ``change`` on all views, without masks."""
         texels, won, total = self.texels(change), 0, 0.0
-        for batch in range(len(self.surrogate.batches)):
-            images = self.surrogate.render(texels, batch)
+        for group in self._groups(range(len(self.surrogate.batches))):
+            images = torch.cat([self.surrogate.render(texels, batch) for batch in group])
             logits = [member.logits(images) for member in self.members]
             won += int(torch.stack([self.goal.reached(each) for each in logits]).all(0).sum())
             total += float(torch.stack([self.goal.losses(each).sum() for each in logits]).mean())

@@ -151,11 +151,12 @@ def _from_file(path: Path, name: str | None, classes: Sequence[str] | None, devi
 def _prepare_device(device: str) -> None:
     """Raise ``ClassifierError`` if torch cannot put a tensor on ``device``.
 
-    Convolutions are computed in full precision from then on: judgements must not depend on the device.
+    On a graphics card convolutions are computed in full precision from then on: judgements must not depend on the
+    device.
     """
-    torch.backends.cudnn.allow_tf32 = False
     try:
-        torch.zeros((), device=device)
+        if torch.zeros((), device=device).is_cuda:
+            torch.backends.cudnn.allow_tf32 = False
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         raise ClassifierError(
             f"The device {device!r} cannot be used here ({str(error).splitlines()[0][:200]}); give 'cpu', or install a "
