@@ -346,7 +346,6 @@ def test_saliency_is_that_of_the_targets_images(library: Library) -> None:
     assert (bright != dark).mean() > 0.1
 
 
-@pytest.mark.usefixtures("pictures")
 class Previewed(MemoryArtifacts):
     """Counts the previews."""
 
@@ -383,6 +382,7 @@ def test_a_classifier_is_loaded_once_for_several_jobs(library: Library, monkeypa
     assert loaded == ["tiny"]
 
 
+@pytest.mark.usefixtures("pictures")
 def test_an_object_never_recognised_is_not_applicable(library: Library) -> None:
     ended = run_job(spec_of(label="ball"), library)
     report, result = ended.reports["prepare"], ended.result
