@@ -18,7 +18,13 @@ from trompe_server.renderers import SailenvTarget
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
 
-LONGEST = ("service/test_workers.py", "pages/test_pages.py", "pages/test_orbit.py", "e2e/test_service.py")
+LONGEST = (
+    "service/test_workers.py",
+    "pages/test_pages.py",
+    "pages/test_orbit.py",
+    "e2e/test_paper_objects.py",
+    "e2e/test_service.py",
+)
 """Files of more than a minute and a half."""
 
 INSTALLABLE = re.compile("install|NOT TESTED")
