@@ -17,7 +17,6 @@ from trompe_server.classifiers import WhiteBoxClassifier
 from trompe_server.classifiers.protocol import AT_ONCE
 from trompe_server.image_pipelines import Drawn
 from trompe_server.surrogate import AnyCanvas, AnySurrogate
-from trompe_server.surrogate.surrogate import BATCH
 from trompe_shared.errors import SpecError
 
 Textures = Mapping[str, Float[Tensor, "H W 3"]]
@@ -136,10 +135,19 @@ class Objective:
         )
 
     def _groups(self, batches: Sequence[int]) -> Iterator[dict[int, range]]:
-        """The views of ``batches`` by batch, together as many as one pass of a network takes."""
-        count = 1 if self.source.device.type == "cpu" else AT_ONCE // BATCH
-        for first in range(0, len(batches), count):
-            yield {batch: self.surrogate.batches[batch] for batch in batches[first : first + count]}
+        """The views of ``batches`` by batch: on a CPU each batch alone, elsewhere as many as one pass of a network
+        takes."""
+        room, group = 0, dict[int, range]()
+        for batch in batches:
+            views = self.surrogate.batches[batch]
+            if group and len(views) > room:
+                yield group
+                group = {}
+            if not group:
+                room = 0 if self.source.device.type == "cpu" else AT_ONCE
+            group[batch], room = views, room - len(views)
+        if group:
+            yield group
 
     def _add_gradient(
         self, read: Float[Tensor, "reads 3"], chosen: Mapping[int, Int[Tensor, " _"]], numbers: Int[Tensor, " chosen"]
