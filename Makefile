@@ -64,6 +64,7 @@ docs: $(VENV)/.installed-docs
 
 # What users install, in environments of its own: first without an extra, which names the missing one in one line.
 RELEASE := out/release
+NEWER ?= $(wildcard /usr/bin/python3.1[2-9] $(HOME)/.pyenv/versions/3.1[2-9].*/bin/python3)
 release-check:
 	rm -rf dist $(RELEASE)
 	$(PYTHON) -m venv $(RELEASE)/tools
@@ -77,6 +78,10 @@ release-check:
 	$(RELEASE)/bare/bin/pip install --quiet -c constraints.txt "$$(echo dist/*.whl)[server]"
 	cd $(RELEASE) && bare/bin/trompe demo --out demo && test -s demo/result.json
 	cd $(RELEASE) && bare/bin/trompe attack mug --label mug --epsilon 0.1 --steps 10 --grid --azimuths 3 --elevations 2 --out mug
+# The renderer also on newer Pythons, where there are any: pyrender's OpenGL is older than they are.
+	for python in $(NEWER); do rm -rf $(RELEASE)/newer && $$python -m venv $(RELEASE)/newer \
+	  && $(RELEASE)/newer/bin/pip install --quiet -c constraints.txt "$$(echo dist/*.whl)[renderer]" \
+	  && $(RELEASE)/newer/bin/trompe render --check || exit 1; done
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .
