@@ -10,10 +10,11 @@ from trompe_client._plan import Upload, plan_attack
 from trompe_client.cli.connection import out_option, server_option, service, token_option
 from trompe_client.cli.following import deliver, follow, follow_our_own
 from trompe_client.cli.options import Sectioned, flag_of, needs_option, tag_option
-from trompe_client.cli.output import json_option, say
+from trompe_client.cli.output import say
 from trompe_client.tracking import TRACKERS, tracked
 from trompe_shared.api import OPTIONS, JobRequest, in_flags
 from trompe_shared.errors import SpecError
+from trompe_shared.json_option import json_option
 
 
 def _priority() -> click.Option:

@@ -11,7 +11,8 @@ import click
 from trompe_client._client import Client
 from trompe_client._embedded import embedded_server
 from trompe_client._settings import DEFAULT_SERVER
-from trompe_client.cli.output import console, json_option
+from trompe_client.cli.output import console
+from trompe_shared.json_option import json_option
 
 F = TypeVar("F", bound=Callable[..., Any])
 

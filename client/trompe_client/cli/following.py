@@ -13,9 +13,10 @@ import click
 from trompe_client._errors import ContractError
 from trompe_client._job import JobHandle
 from trompe_client._progress import Progress, Show, shown
-from trompe_client.cli.output import as_json, console, print_json, say
+from trompe_client.cli.output import console, print_json, say
 from trompe_shared.api import ADVERSARIAL, Event, JobState, JudgementSpec, in_flags
 from trompe_shared.errors import TrompeError
+from trompe_shared.json_option import as_json
 from trompe_shared.local_files import SPLIT_SUFFIXES
 
 

@@ -11,8 +11,9 @@ from trompe_client._report import job_table, jobs_table
 from trompe_client.cli.connection import out_option, with_client
 from trompe_client.cli.following import deliver, follow
 from trompe_client.cli.options import ListedByDefault, tag_option
-from trompe_client.cli.output import as_json, print_json, say
+from trompe_client.cli.output import print_json, say
 from trompe_shared.api import Job, JobState
+from trompe_shared.json_option import as_json
 
 _job = click.argument("job")
 _jobs = click.argument("names", metavar="JOB...", nargs=-1, required=True)

@@ -15,7 +15,7 @@ from trompe_client._progress import shown
 from trompe_client.cli.connection import out_option, token_option
 from trompe_client.cli.following import deliver, follow
 from trompe_client.cli.options import flag_of
-from trompe_client.cli.output import json_option, say
+from trompe_client.cli.output import say
 from trompe_shared.api import (
     JUDGEMENT_OPTIONS,
     MANIFEST,
@@ -28,6 +28,7 @@ from trompe_shared.api import (
     Progress,
 )
 from trompe_shared.errors import SpecError
+from trompe_shared.json_option import json_option
 
 HERE: Final = "trompe.here"
 """Entry points of the server package with the functions that judge without a service."""

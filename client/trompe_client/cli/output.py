@@ -1,33 +1,15 @@
 """Output of commands: tables for people, JSON for programs."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from trompe_shared.api import in_flags
+from trompe_shared.json_option import AS_JSON, as_json
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
-
-F = TypeVar("F", bound=Callable[..., Any])
-AS_JSON: Final = "trompe.json"
-"""Key of --json in click's context."""
-
-
-def json_option(command: F) -> F:
-    """Add --json: one JSON document on standard output, errors as JSON on standard error."""
-
-    def remember(ctx: click.Context, _option: click.Parameter, given: bool) -> None:
-        ctx.meta[AS_JSON] = given
-
-    option = click.option("--json", is_flag=True, expose_value=False, callback=remember, help="Print JSON.")
-    return option(command)
-
-
-def as_json() -> bool:
-    """Whether the current command has --json."""
-    return bool(click.get_current_context().meta.get(AS_JSON))
 
 
 def say(value: Any, words: Callable[[], "RenderableType"]) -> None:

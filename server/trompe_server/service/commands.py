@@ -14,6 +14,7 @@ from trompe_server.system.log import log_to_stderr
 from trompe_shared.addresses import host_and_port
 from trompe_shared.errors import SpecError
 from trompe_shared.faults import faults_of
+from trompe_shared.json_option import as_json, json_option
 
 if TYPE_CHECKING:
     from trompe_server.renderers.discovery import RendererAddresses
@@ -177,14 +178,14 @@ def demo(out: Path) -> None:
 @database_option
 @_store
 @_device
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def doctor(data: Path | None, as_json: bool, **options: str | None) -> None:
+@json_option
+def doctor(data: Path | None, **options: str | None) -> None:
     """Check this machine and print remedies."""
     findings = []
     for finding in check_all(settings_of(data, **options)):
         findings.append(finding)
-        if not as_json:
+        if not as_json():
             click.echo(in_words(finding))
-    if as_json:
+    if as_json():
         click.echo(in_json(findings))
     sys.exit(0 if all(finding.ok for finding in findings) else 1)

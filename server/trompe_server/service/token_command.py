@@ -11,8 +11,7 @@ import click
 from trompe_server.service.commands import data_option, database_option, settings_of
 from trompe_server.settings import Settings
 from trompe_server.storage.tokens import Right, Token, Tokens
-
-_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+from trompe_shared.json_option import as_json, json_option
 
 
 def _where(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -34,13 +33,13 @@ def token() -> None:
     show_default=True,
     help="read: look only; write: also submit, cancel, delete and upload.",
 )
-@_json
+@json_option
 @_where
-def create(name: str, right: str, as_json: bool, data: Path | None, database: str | None) -> None:
+def create(name: str, right: str, data: Path | None, database: str | None) -> None:
     """Create a token called NAME. Its secret is printed once and not stored."""
     with _tokens(settings_of(data, database=database)) as tokens:
         secret = tokens.create(name, Right(right))
-    if as_json:
+    if as_json():
         click.echo(json.dumps({"name": name, "right": right, "secret": secret}))
         return
     click.echo(secret)
@@ -48,13 +47,13 @@ def create(name: str, right: str, as_json: bool, data: Path | None, database: st
 
 
 @token.command("list")
-@_json
+@json_option
 @_where
-def show(as_json: bool, data: Path | None, database: str | None) -> None:
+def show(data: Path | None, database: str | None) -> None:
     """List all tokens, revoked ones included."""
     with _tokens(settings_of(data, database=database)) as tokens:
         rows = [_row(each) for each in tokens.all()]
-    if as_json:
+    if as_json():
         click.echo(json.dumps(rows))
         return
     if not rows:

@@ -104,6 +104,13 @@ def test_a_token_is_made_in_a_folder_that_has_none_yet_and_its_secret_is_all_tha
     assert (found.name, found.right) == ("ci", Right.read)
 
 
+def test_an_error_is_json_where_json_was_asked_for(tmp_path: Path) -> None:
+    token(tmp_path, "create", "ann")
+    status, told = token(tmp_path, "create", "ann", "--json")
+    error = json.loads(told)["error"]
+    assert (error["exit_code"], "'ann'" in error["message"]) == (status, True)
+
+
 def test_tokens_are_listed_with_what_became_of_them(tmp_path: Path) -> None:
     assert token(tmp_path, "list") == (0, "")
     made = json.loads(token(tmp_path, "create", "ann", "--json")[1])
