@@ -139,9 +139,7 @@ def _then_moved(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
 def pretend_device(monkeypatch: pytest.MonkeyPatch) -> str:
     """Name of the device for one test. Skips the test if this torch cannot have one."""
     if register() is None:
-        pytest.skip(
-            "no device written in Python: an older torch, or a graphics card, on which the tests run themselves"
-        )
+        pytest.skip("no device written in Python: this torch is older, or has a graphics card")
     for name in MADE_BY_HAND:
         monkeypatch.setattr(torch, name, _then_moved(getattr(torch, name)))
     return NAME

@@ -7,7 +7,7 @@ import click
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-AS_JSON: Final = "trompe.json"
+_KEY: Final = "trompe.json"
 """Key of the option in click's context."""
 
 
@@ -15,7 +15,7 @@ def json_option(command: F) -> F:
     """Add --json: JSON on standard output, errors as JSON on standard error."""
 
     def remember(ctx: click.Context, _option: click.Parameter, given: bool) -> None:
-        ctx.meta[AS_JSON] = given
+        ctx.meta[_KEY] = given
 
     option = click.option("--json", is_flag=True, expose_value=False, callback=remember, help="Print JSON.")
     return option(command)
@@ -23,4 +23,4 @@ def json_option(command: F) -> F:
 
 def as_json() -> bool:
     """Whether the current command has --json."""
-    return bool(click.get_current_context().meta.get(AS_JSON))
+    return bool(click.get_current_context().meta.get(_KEY))

@@ -119,7 +119,7 @@ class _Trompe(click.Group):
                 raise
             raise _missing_extra(ctx.invoked_subcommand, error) from error
         except (TrompeError, OSError) as error:
-            show_error(ctx, error, code=_exit_code(error), flags=ctx.invoked_subcommand in OWN)
+            show_error(error, code=_exit_code(error), flags=ctx.invoked_subcommand in OWN)
             ctx.exit(_exit_code(error))
 
 

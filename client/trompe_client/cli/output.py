@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from trompe_shared.api import in_flags
-from trompe_shared.json_option import AS_JSON, as_json
+from trompe_shared.json_option import as_json
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -27,12 +27,12 @@ def print_json(value: Any, *, indent: int | None = None, err: bool = False) -> N
     click.echo(to_json(value, indent=indent).decode(), err=err)
 
 
-def show_error(ctx: click.Context, error: Exception, *, code: int, flags: bool) -> None:
+def show_error(error: Exception, *, code: int, flags: bool) -> None:
     """Print an error on standard error, as an object with --json. flags: whether its options are those of the command
     line, not of a file.
     """
     ids = {name: value for name in ("request_id", "job_id") if (value := getattr(error, name, None))}
-    if ctx.meta.get(AS_JSON):
+    if as_json():
         kind = getattr(error, "code", "os")
         print_json({"error": {"code": kind, "message": str(error), "exit_code": code, **ids}}, err=True)
         return

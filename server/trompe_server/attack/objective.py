@@ -137,15 +137,13 @@ class Objective:
     def _groups(self, batches: Sequence[int]) -> Iterator[dict[int, range]]:
         """The views of ``batches`` by batch: on a CPU each batch alone, elsewhere as many as one pass of a network
         takes."""
-        room, group = 0, dict[int, range]()
+        most, group = 1 if self.source.device.type == "cpu" else AT_ONCE, dict[int, range]()
         for batch in batches:
             views = self.surrogate.batches[batch]
-            if group and len(views) > room:
+            if group and sum(map(len, group.values())) + len(views) > most:
                 yield group
                 group = {}
-            if not group:
-                room = 0 if self.source.device.type == "cpu" else AT_ONCE
-            group[batch], room = views, room - len(views)
+            group[batch] = views
         if group:
             yield group
 
