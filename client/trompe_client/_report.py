@@ -51,7 +51,7 @@ def result_report(
 ) -> RenderableType:
     """Accuracies before and after, size of the change, and cost of the attack. ``seconds`` default to the job's own."""
     table = _table("", "views", "A_before", "A_after", "A_drop", right=4)
-    for name, accuracy in _rows(result):
+    for name, accuracy in result.accuracies:
         table.add_row(name, accuracy.counted, *_cells(accuracy))
     facts = _pairs(_facts(result, seconds or result.seconds))
     notes = [Text(f"n.a.: {in_flags(note)}", style="yellow")] if note else []
@@ -186,23 +186,6 @@ def _headline(result: Result) -> str:
         f"{result.object}, class {label}, attacked through {through}: {budget}, {result.steps} steps, "
         f"seed {result.seed}"
     )
-
-
-def _rows(result: Result) -> Iterator[tuple[str, Accuracy]]:
-    rows: list[tuple[str, Accuracy | None]] = []
-    for name, each in result.by_renderer:
-        rows += [
-            (f"{name}surrogate (own views)", each.surrogate),
-            (f"{name}target (own views)", each.target),
-            (f"{name}target (held-out views)", each.held_out),
-        ]
-    for judge in result.judges:
-        rows += [
-            (f"judge {judge.classifier} (own views)", judge.target),
-            (f"judge {judge.classifier} (held-out views)", judge.held_out),
-        ]
-    rows += [(f"held-out views, {each.pipeline}", each.held_out) for each in result.image_pipelines]
-    return ((name, accuracy) for name, accuracy in rows if accuracy is not None)
 
 
 def _cells(accuracy: Accuracy) -> list[str]:

@@ -65,7 +65,7 @@ def differing_options(jobs: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str
     for object, options in jobs:
         reference = first.setdefault(object, options)
         differ |= {name for name in options if options[name] != reference[name]}
-    return [name for name in jobs[0][1] if name in differ]
+    return [name for _, options in jobs[:1] for name in options if name in differ]
 
 
 def charged(jobs: Iterable[Job[K]]) -> list[Job[K]]:

@@ -1,8 +1,10 @@
 """The list of jobs, without a browser: it shows a page at a time, however many there are."""
 
 import asyncio
+import json
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -10,8 +12,11 @@ import pytest
 from fastapi import FastAPI
 
 from tests.pages.conftest import app_on
+from trompe_server.api.examples import RESULT
+from trompe_server.pages.present import _accuracies
+from trompe_server.pages.routes import follow_list
 from trompe_server.pages.serving import _code
-from trompe_shared.api import JobRequest
+from trompe_shared.api import JobRequest, JudgementRequest, Result
 
 JOBS = 120
 TAUS = [None, 0.05, 0.2]
@@ -56,14 +61,14 @@ def test_pages_follow_each_other_until_all_jobs_were_shown(client: Browserless) 
         found = jobs_on(page)
         assert 0 < len(found) <= 50
         seen += found
-        older = re.search(r'<a href="([^"]+)">Older</a>', page)
+        older = re.search(r'href="([^"]+)">Older</a>', page)
         path = older[1].replace("&amp;", "&") if older else ""
     assert len(seen) == len(set(seen)) == JOBS
 
 
 def test_filters_go_along_to_the_next_page(client: Browserless) -> None:
     page = client.get("/jobs", params={"label": "sweep:odd"}).text
-    (older,) = re.findall(r'<a href="([^"]+)">Older</a>', page)
+    (older,) = re.findall(r'href="([^"]+)">Older</a>', page)
     rest = client.get(older.replace("&amp;", "&")).text
     assert len(jobs_on(page)) + len(jobs_on(rest)) == JOBS / 2
 
@@ -81,14 +86,64 @@ def test_an_experiment_shows_of_jobs_that_wait_the_options_in_which_they_differ(
     assert [line[:3] for line in lines] == [["0.05", "0.2", "2"], ["0.05", "0.05", "1"], ["0.05", "–", "0"]]
 
 
-@pytest.mark.parametrize("wrong", ["?state=gone", "?label=nocolon", "?cursor=x", "/0123456789abcdef"])
-def test_a_filter_that_makes_no_sense_and_a_job_that_is_not_there_are_told_on_a_page(
-    client: Browserless, wrong: str
+@pytest.mark.parametrize(
+    ("path", "status", "words"),
+    [
+        ("?state=gone", 422, "state"),
+        ("?state=nxax", 422, "state"),
+        ("?label=nocolon", 422, "nocolon"),
+        ("?cursor=x", 422, "cursor"),
+        ("/0123456789abcdef", 404, "<h1>Not Found"),
+        *(("/turntable/mug.png?distance=" + given, 422, "distance: Input should be") for given in ("0", "nan", "2000")),
+        ("/turntable/mug.png", 503, "No renderer worker is up; start one"),
+        ("/turntable/mug.png?renderer=a+b", 503, "No renderer worker with the engine &#39;a b&#39; is up; start one"),
+    ],
+)
+def test_what_cannot_be_shown_is_told_on_a_page_with_the_headers_of_its_answer(
+    client: Browserless, path: str, status: int, words: str
 ) -> None:
-    answer = client.get(f"/jobs{wrong}", headers={"Accept": "text/html"})
-    assert answer.status_code in ({404} if wrong.startswith("/") else {400, 422})
+    answer = client.get(f"/jobs{path}", headers={"Accept": "text/html"})
+    assert answer.status_code == status
+    assert words in answer.text
     assert answer.headers["content-type"].startswith("text/html")
-    assert ("<h1>Not Found" if wrong.startswith("/") else "<h1>") in answer.text
+    assert int(answer.headers["content-length"]) == len(answer.content)
+    assert "script-src 'self'" in answer.headers["content-security-policy"]
+    assert {"x-request-id", "x-content-type-options", "cache-control"} <= answer.headers.keys()
+    assert answer.headers.get("retry-after") == ("5" if status == 503 else None)
+
+
+def test_a_judgement_alone_is_an_experiment_without_attacks_and_has_no_models(tmp_path: Path) -> None:
+    with app_on(tmp_path) as (app, store):
+        request = JudgementRequest.of("mug", "mug", label="mug", labels={"experiment": "only"})
+        job, _ = store.create(request)
+        client = Browserless(app)
+        experiment = client.get("/experiments/only")
+        assert experiment.status_code == 200
+        assert 'No attacks here yet. <a href="/jobs?label=experiment%3Aonly">' in experiment.text
+        for side in ("before", "after"):
+            answer = client.get(f"/jobs/{job.id}/models/{side}.glb")
+            assert (answer.status_code, "is a judgement" in answer.text) == (404, True)
+
+
+def test_the_live_list_tells_which_jobs_have_left_it_and_where_it_goes_on(tmp_path: Path) -> None:
+    async def told(app: FastAPI) -> list[Any]:
+        stream: Any = follow_list(app.state.services, state="queued", label="a:b", limit=2).body_iterator
+        events = [json.loads((await anext(stream)).data)]
+        store.request_cancel(made[2])
+        return [*events, json.loads((await anext(stream)).data)]
+
+    with app_on(tmp_path) as (app, store):
+        made = [store.create(JobRequest.of("mug", label="mug", seed=k, labels={"a": "b"}))[0].id for k in range(3)]
+        first, second = asyncio.run(told(app))
+    assert [first["ids"], second["ids"]] == [[made[2], made[1]], [made[1], made[0]]]
+    assert [jobs_on(each["html"]) for each in (first, second)] == [first["ids"], made[:1]]
+    assert [each["older"] for each in (first, second)] == ["/jobs?state=queued&label=a%3Ab&cursor=2", None]
+
+
+def test_a_result_shows_all_its_accuracies() -> None:
+    judge = {"classifier": "net", "target": RESULT["target"], "held_out": RESULT["target"]}
+    names = [row["name"] for row in _accuracies(Result.model_validate(RESULT | {"judges": [judge]}))]
+    assert {"target (own views)", "judge net (own views)", "judge net (held-out views)"} <= set(names)
 
 
 def test_names_of_options_are_shown_as_code() -> None:

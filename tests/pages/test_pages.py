@@ -168,7 +168,7 @@ def test_the_page_of_a_result_says_what_the_result_says_and_gives_it_as_one_zip(
         result = client.job(done).result()
     page.goto(f"{service.url}/jobs/{done}")
 
-    row = page.locator("tr", has=page.get_by_role("rowheader", name="target", exact=True))
+    row = page.locator("tr", has=page.get_by_role("rowheader", name="target (own views)", exact=True))
     figures = [str(result.target.views), f"{result.target.a_before:.2f}", f"{result.target.a_after:.2f}"]
     assert row.locator("td").all_inner_texts()[:3] == figures
     judged = [*result.views, *result.held_out_views]
@@ -189,11 +189,16 @@ def test_the_page_of_a_result_says_what_the_result_says_and_gives_it_as_one_zip(
 
 def test_a_running_job_is_cancelled_from_the_list(service: Service, page: Page) -> None:
     job = service.submit(steps=5000, epsilon=0.004)  # so little that it does not win all views and end early
+    row = page.locator(f"#job-{job}")
     page.goto(f"{service.url}/jobs")
+    expect(row.locator(".state")).to_have_text("running")
+    page.goto(f"{service.url}/jobs?state=running")
 
-    page.locator(f"#job-{job}").get_by_role("button", name="Cancel").click()
+    row.get_by_role("button", name="Cancel").click()
 
-    expect(page.locator(f"#job-{job} .state")).to_have_text("cancelled")
+    expect(row).to_have_count(0)
+    page.goto(f"{service.url}/jobs")
+    expect(row.locator(".state")).to_have_text("cancelled")
 
 
 def test_the_list_is_sorted_and_filtered(service: Service, page: Page, done: str, stronger: str) -> None:

@@ -16,7 +16,7 @@ from starlette.exceptions import HTTPException
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.storage.database import DatabaseDownError
 from trompe_shared.api import Problem
-from trompe_shared.errors import TrompeError
+from trompe_shared.errors import RendererError, TrompeError
 from trompe_shared.faults import faults_of
 
 logger = logging.getLogger(__name__)
@@ -24,7 +24,12 @@ logger = logging.getLogger(__name__)
 RETRY_AFTER: Final = 5
 """Seconds until a retry, if a part of the service is down."""
 
-_STATUS: Final[dict[type[TrompeError], int]] = {NotFoundError: 404, ConflictError: 409, ServiceError: 503}
+_STATUS: Final[dict[type[TrompeError], int]] = {
+    NotFoundError: 404,
+    ConflictError: 409,
+    ServiceError: 503,
+    RendererError: 503,
+}
 
 _EXAMPLE: Final = {
     "type": "urn:trompe:unknown-label",

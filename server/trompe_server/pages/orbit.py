@@ -7,7 +7,7 @@ from trompe_server.api.services import Services
 from trompe_server.errors import NotFoundError
 from trompe_server.job.protocol import SAILENV
 from trompe_server.pages.serving import static
-from trompe_shared.api import ADVERSARIAL, ClassifierInfo, Job, Result, ViewPrediction
+from trompe_shared.api import ADVERSARIAL, ClassifierInfo, Job, JudgementSpec, Result, ViewPrediction
 from trompe_shared.geometry import FIELD_OF_VIEW
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.three import FOLDER, LIGHTS, THREE
@@ -41,7 +41,9 @@ def orbit(result: Result, job: str, classifiers: Sequence[ClassifierInfo]) -> Ma
 
 
 def painted(services: Services, job: Job, side: str) -> Object3D:
-    """The object ``before`` or ``after`` the attack. Raises ``NotFoundError`` if it is not stored any more."""
+    """The object ``before`` or ``after`` the attack. Raises ``NotFoundError`` unless it is stored."""
+    if isinstance(job.spec, JudgementSpec):
+        raise NotFoundError(f"Job {job.id} is a judgement and repaints no object; give the id of an attack.")
     if side == "before":
         return load_object(services.library.object_bytes(job.attack.object))
     for ending in ARCHIVES:

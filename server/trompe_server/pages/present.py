@@ -237,27 +237,17 @@ def viewer_record(view: ViewPrediction, labels: Sequence[int], names: ClassNames
 
 
 def _accuracies(result: Result) -> Iterable[dict[str, Any]]:
-    rows: list[tuple[str, Accuracy | None]] = []
-    for name, each in result.by_renderer:
-        rows += [
-            (f"{name}surrogate", each.surrogate),
-            (f"{name}target", each.target),
-            (f"{name}target, held-out", each.held_out),
-        ]
-    rows += [(f"target, judged by {judge.classifier}", judge.target) for judge in result.judges]
-    rows += [(f"target, held-out, {each.pipeline}", each.held_out) for each in result.image_pipelines]
-    for name, accuracy in rows:
-        if accuracy is not None:
-            shares = (accuracy.a_before, accuracy.a_after, accuracy.a_drop)
-            interval = accuracy.a_drop_interval
-            ends = f"{interval[0]:.2f} to {interval[1]:.2f}" if interval else "n.a."
-            yield {
-                "name": name,
-                "views": accuracy.counted,
-                "cells": [*map(_share, shares), ends],
-                "drop": accuracy.a_drop,
-                "ends": interval,
-            }
+    for name, accuracy in result.accuracies:
+        shares = (accuracy.a_before, accuracy.a_after, accuracy.a_drop)
+        interval = accuracy.a_drop_interval
+        ends = f"{interval[0]:.2f} to {interval[1]:.2f}" if interval else "n.a."
+        yield {
+            "name": name,
+            "views": accuracy.counted,
+            "cells": [*map(_share, shares), ends],
+            "drop": accuracy.a_drop,
+            "ends": interval,
+        }
 
 
 def _share(value: float | None) -> str:

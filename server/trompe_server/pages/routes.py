@@ -2,7 +2,9 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Mapping
+import re
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 from urllib.parse import urlencode
@@ -49,7 +51,7 @@ RECENT: Final = 200
 STREAM_INTERVAL: Final = 1.0
 LASTING: Final = {"Cache-Control": "private, max-age=31536000, immutable"}
 
-State = Annotated[str, Query(pattern=f"^({'|'.join(JobState)})?$")]
+State = Annotated[str, Query(pattern=f"^({'|'.join(map(re.escape, JobState))})?$")]
 Label = Annotated[str, Query(max_length=264)]
 
 
@@ -66,9 +68,8 @@ def jobs(
     """The list of jobs."""
     rows, older = _rows(services, state=state, label=label, cursor=cursor)
     filters = {"state": state, "label": label}
-    given = {name: value for name, value in filters.items() if value}
     # Older pages show the same jobs, updated.
-    stream = "/jobs/stream?" + urlencode(given if cursor is None else {"ids": ",".join(row.id for row in rows)})
+    stream = "/jobs/stream?" + urlencode(filters if cursor is None else {"ids": ",".join(row.id for row in rows)})
     return page(
         request,
         "jobs.html",
@@ -78,8 +79,8 @@ def jobs(
         counts={state.value: n for state, n in services.store.counts().items()},
         stream=stream,
         first=cursor is None,
-        newest=f"/jobs?{urlencode(given)}",
-        older=older and f"/jobs?{urlencode({**given, 'cursor': older})}",
+        newest=_list_url(filters),
+        older=older and _list_url(filters, cursor=older),
     )
 
 
@@ -87,12 +88,14 @@ def jobs(
 def follow_list(
     services: ServicesDep, state: State = "", label: Label = "", ids: str = "", limit: int = PAGE
 ) -> EventSourceResponse:
-    """Stream of changed rows as HTML, newest first."""
+    """Stream of the list, newest first: see ``_changes``."""
 
-    def look() -> list[JobRow]:
+    def look() -> tuple[list[JobRow], str | None]:
         if ids:
-            return [_row(services, job) for each in ids.split(",")[:PAGE] if (job := _found(services, each))]
-        return _rows(services, state=state, label=label, limit=min(max(limit, 1), PAGE))[0]
+            rows = [_row(services, job) for each in ids.split(",")[:PAGE] if (job := _found(services, each))]
+            return rows, None
+        rows, older = _rows(services, state=state, label=label, limit=min(max(limit, 1), PAGE))
+        return rows, older and _list_url({"state": state, "label": label}, cursor=older)
 
     return EventSourceResponse(_changes(look), ping=15)
 
@@ -314,6 +317,10 @@ def _choices(services: Services) -> dict[str, Any]:
     }
 
 
+def _list_url(filters: Mapping[str, str], **more: str) -> str:
+    return "/jobs?" + urlencode({name: value for name, value in {**filters, **more}.items() if value})
+
+
 def _rows(
     services: Services,
     *,
@@ -344,19 +351,18 @@ def _found(services: Services, job: str) -> Job | None:
         return None
 
 
-async def _changes(look: Any) -> AsyncIterator[ServerSentEvent]:
-    """New and changed rows, rendered as HTML."""
-    known: dict[str, str] = {}
+async def _changes(look: Callable[[], tuple[list[JobRow], str | None]]) -> AsyncIterator[ServerSentEvent]:
+    """The list as JSON when it changes: ids of its rows, HTML of new and changed ones, address of the next page."""
+    known: dict[str, str] | None = None
     while True:
-        try:
-            rows: list[JobRow] = await asyncio.to_thread(look)
-        except DatabaseDownError:
-            rows = []
-        changed = [row for row in rows if known.get(row.id) != row.version]
-        known = known | {row.id: row.version for row in rows}
-        if changed:
-            html = await asyncio.to_thread(render, "_rows.html", rows=changed)
-            yield ServerSentEvent(data=html, event="rows")
+        with suppress(DatabaseDownError):
+            rows, older = await asyncio.to_thread(look)
+            versions = {row.id: row.version for row in rows}
+            if versions != known:
+                changed = [row for row in rows if known is None or known.get(row.id) != row.version]
+                html = await asyncio.to_thread(render, "_rows.html", rows=changed)
+                yield ServerSentEvent(data=json.dumps({"ids": [*versions], "html": html, "older": older}), event="rows")
+            known = versions
         await asyncio.sleep(STREAM_INTERVAL)
 
 

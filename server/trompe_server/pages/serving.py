@@ -90,12 +90,21 @@ class HtmlProblems(HttpMiddleware):
             elif message is not begin:
                 body += message.get("body", b"")
                 if not message.get("more_body"):
-                    await _as_page(request, begin["status"], body)(scope, receive, send)
+                    await _as_page(request, begin, body)(scope, receive, send)
 
         await self._app(scope, receive, send_page)
 
 
-def _as_page(request: Request, status: int, body: bytes) -> Response:
+def _as_page(request: Request, begin: Message, body: bytes) -> Response:
+    """The page of a problem, with the headers of the answer that it replaces."""
+    answer = _problem_page(request, begin["status"], body)
+    for name, value in Headers(raw=begin["headers"]).items():
+        if name not in {"content-type", "content-length"}:
+            answer.headers.setdefault(name, value)
+    return answer
+
+
+def _problem_page(request: Request, status: int, body: bytes) -> Response:
     if status == HTTPStatus.UNAUTHORIZED:
         wanted = str(request.url.replace(scheme="", netloc=""))
         return RedirectResponse(f"/login?next={quote(wanted)}", status_code=303)

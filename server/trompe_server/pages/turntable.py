@@ -10,7 +10,8 @@ from trompe_server.api.services import Services, ServicesDep
 from trompe_server.pages.orbit import painted
 from trompe_server.spec.framing import framing_of
 from trompe_shared.addresses import host_and_port
-from trompe_shared.api import JOB_RESULT, JobSpec, ViewOptions
+from trompe_shared.api import JOB_RESULT, ViewOptions
+from trompe_shared.api.jobs import Distance
 from trompe_shared.colours import colour_of
 from trompe_shared.errors import RendererError, SpecError
 from trompe_shared.geometry import Camera, Light, View
@@ -23,7 +24,11 @@ ELEVATION: Final = 25.0
 
 
 def turntable(
-    services: ServicesDep, reference: str, background: str = "white", distance: float | None = None, renderer: str = ""
+    services: ServicesDep,
+    reference: str,
+    background: str = "white",
+    distance: Distance | None = None,
+    renderer: str = "",
 ) -> Response:
     """Route to ``TURNS`` pictures side by side as PNG, of a stored object or of a job's painted one (``job:ID``).
 
@@ -31,7 +36,8 @@ def turntable(
     """
     renderers = [each for each in services.renderers() if each.alive and renderer in ("", each.identity)]
     if not renderers:
-        raise RendererError(f"No renderer worker {renderer} is up: start one with `trompe render`.")
+        asked = f" with the engine {renderer!r}" if renderer else ""
+        raise RendererError(f"No renderer worker{asked} is up; start one with `trompe render`.")
     obj, source = _object(services, reference)
     framing = framing_of(obj, ViewOptions(distance=distance), shipped=source)
     behind = colour_of(background)
@@ -49,4 +55,4 @@ def _object(services: Services, reference: str) -> tuple[Object3D, str]:
     if not reference.startswith(JOB_RESULT):
         return load_object(services.library.object_bytes(reference)), reference
     job = services.store.get(reference.removeprefix(JOB_RESULT))
-    return painted(services, job, "after"), job.spec.object if isinstance(job.spec, JobSpec) else ""
+    return painted(services, job, "after"), job.attack.object

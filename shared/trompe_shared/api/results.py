@@ -269,6 +269,24 @@ class Result(Visibility):
         return [*named] or [("", self)]
 
     @property
+    def accuracies(self) -> list[tuple[str, Accuracy]]:
+        """All accuracies, each with its name in tables."""
+        rows: list[tuple[str, Accuracy | None]] = []
+        for name, each in self.by_renderer:
+            rows += [
+                (f"{name}surrogate (own views)", each.surrogate),
+                (f"{name}target (own views)", each.target),
+                (f"{name}target (held-out views)", each.held_out),
+            ]
+        for judge in self.judges:
+            rows += [
+                (f"judge {judge.classifier} (own views)", judge.target),
+                (f"judge {judge.classifier} (held-out views)", judge.held_out),
+            ]
+        rows += [(f"held-out views, {each.pipeline}", each.held_out) for each in self.image_pipelines]
+        return [(name, accuracy) for name, accuracy in rows if accuracy is not None]
+
+    @property
     def became(self) -> str:
         """The most frequent classes of the fooled views in words, with the number of views of each."""
         few, rest = self.fooled_as[:NAMED], sum(each.own + each.held_out for each in self.fooled_as[NAMED:])

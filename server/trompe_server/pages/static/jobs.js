@@ -1,15 +1,20 @@
-// A live list of jobs: the server sends changed rows as HTML.
+// A live list of jobs: the server sends the ids of all rows, changed rows as HTML, and the next page's address.
 import { follow } from "./common.js";
 
 const table = document.querySelector("table[data-stream]");
 const compare = document.getElementById("compare"), find = document.getElementById("find");
 
-function put(html) {
+const idOf = (row) => row.id.slice("job-".length);
+
+function put({ ids, html, older }) {
+  for (const row of [...table.tBodies[0].rows]) if (!ids.includes(idOf(row))) row.remove();
+  const next = document.querySelector("a[rel=next]");
+  if (next && older) Object.assign(next, { href: older, hidden: false });
   const holder = document.createElement("tbody");
   holder.innerHTML = html;
   for (const row of [...holder.children].reverse()) {
     const old = document.getElementById(row.id);
-    if (!old) table.tBodies[0].prepend(row);
+    if (!old) table.tBodies[0].insertBefore(row, document.getElementById(`job-${ids[ids.indexOf(idOf(row)) + 1]}`));
     else if (old.dataset.version !== row.dataset.version && !old.contains(document.activeElement)) {
       const picked = old.querySelector("input:checked");
       old.replaceWith(row);
@@ -38,8 +43,8 @@ function filter() {
 }
 
 if (table) {
-  follow(table.dataset.stream, "rows", (html) => {
-    put(html);
+  follow(table.dataset.stream, "rows", (data) => {
+    put(JSON.parse(data));
     filter();
   });
   table.tHead.addEventListener("click", (event) => event.target.matches("button") && sort(event.target.closest("th")));
