@@ -151,7 +151,9 @@ def plan_judgement(before: Source, after: Source, **options: Any) -> Plan[Judgem
     """
     planned = options | {"before": object_source(before), "after": object_source(after)}
     if "networks" in options:
-        planned["networks"] = [classifier_source(each) for each in options["networks"]]
+        networks = options["networks"]
+        one = isinstance(networks, str | Path)
+        planned["networks"] = [classifier_source(each) for each in ([networks] if one else networks)]
     return Plan(planned, JudgementRequest.of).checked()
 
 

@@ -3,6 +3,7 @@
 import os
 from dataclasses import dataclass, field
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 from trompe_shared.errors import SpecError
 
@@ -23,6 +24,14 @@ class Connection:
     def find(cls, url: str | None, *, token: str | None, timeout: float, transport: Any) -> "Connection":
         """Defaults are TROMPE_SERVER and TROMPE_TOKEN. Raises ``SpecError`` for a wrong address."""
         address = (url or os.environ.get("TROMPE_SERVER") or DEFAULT_SERVER).rstrip("/")
-        if not address.startswith(("http://", "https://")):
-            raise SpecError(f"The server's URL must begin with http:// or https://, got {address!r}.")
+        if not _is_url(address):
+            raise SpecError(f"The server's URL must be http://HOST:PORT or https://HOST, got {address!r}.")
         return cls(address, token or os.environ.get("TROMPE_TOKEN") or None, timeout, transport)
+
+
+def _is_url(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+        return parts.scheme in {"http", "https"} and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # a port or an IPv6 address that is none
+        return False

@@ -1,18 +1,30 @@
 """Settings of the service: environment variables that begin with TROMPE_, and options of the commands."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
+from pydantic_core import from_json
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from trompe_shared.engine import DEFAULT_ENGINE
 
 
+def _decoded(value: Any) -> Any:
+    """JSON of the environment as what it says, other values as they are. Raises ``ValueError``."""
+    try:
+        return from_json(value) if isinstance(value, str) else value
+    except ValueError as error:
+        raise ValueError(f'{value!r} is not a JSON list, such as ["a", "b"]') from error
+
+
+Texts = Annotated[tuple[str, ...], BeforeValidator(_decoded)]
+
+
 class Settings(BaseSettings):
     """Settings of the service. ``TROMPE_DATA`` sets ``data``, and so on."""
 
-    model_config = SettingsConfigDict(env_prefix="TROMPE_", frozen=True)
+    model_config = SettingsConfigDict(env_prefix="TROMPE_", frozen=True, enable_decoding=False)
 
     data: Path = Path.home() / ".local" / "share" / "trompe"
     """Folder of all data, except what ``database`` and ``store`` place elsewhere."""
@@ -41,9 +53,9 @@ class Settings(BaseSettings):
     """Renderer workers started by ``serve``."""
     engine: str = DEFAULT_ENGINE
     """Engine of these renderer workers, as in ``trompe render --engine``: a name or ``module:Class``."""
-    engine_options: tuple[str, ...] = ()
+    engine_options: Texts = ()
     """Options of that engine, each ``NAME=VALUE``; in the environment a JSON list."""
-    networks: tuple[str, ...] = ()
+    networks: Texts = ()
     """Networks by name that jobs may use, as patterns (``timm:*``, ``hf:google/vit-base-patch16-224``); in the
     environment a JSON list."""
     renderer_patience: float = 10.0

@@ -109,7 +109,7 @@ def test_a_job_from_its_submission_to_its_files(client: Any, tmp_path: Path) -> 
 
 
 def test_a_judgement_from_its_submission_to_its_manifest(client: Any, tmp_path: Path) -> None:
-    job = client.judge("mug", "mug", label="mug", epsilon=0.05, views=4, labels={"who": "me"})
+    job = client.judge("mug", "mug", label="mug", networks="tiny", epsilon=0.05, views=4, labels={"who": "me"})
     with pytest.raises(Conflict, match=r"queued|running|No result"):
         job.manifest()
     job.wait(timeout=120)

@@ -70,8 +70,9 @@ def test_uploads_can_be_named_and_bring_their_own_class_names(client: Client, mu
 
 
 def test_what_is_wrong_is_found_before_anything_is_sent() -> None:
-    with pytest.raises(SpecError, match="http://"):
-        Client("localhost:8000")
+    for address in ("localhost:8000", "http://", "http://host:port", "http://[::1"):
+        with pytest.raises(SpecError, match="http://HOST:PORT"):
+            Client(address)
     with Client("http://127.0.0.1:9") as client:
         with pytest.raises(SpecError, match="epsilon"):
             client.attack("mug", label=0, epsilon=3.0)

@@ -212,6 +212,7 @@ def test_renderers_are_scaled_and_share_the_work_and_a_second_worker_waits(stack
     heard = [received(stack, each) for each in stack.containers("renderer")]
     assert len(heard) == 3
     assert min(heard) > 50_000, heard
+    wait_until(lambda: [each.alive for each in client.renderers()] == [True] * 3)
 
 
 def test_a_renderer_that_dies_in_mid_job_costs_only_time(stack: Stack, client: Client) -> None:

@@ -341,6 +341,18 @@ def test_a_job_given_back_does_not_count_as_lost(store: JobStore) -> None:
     assert (store.get(job).state, store.get(job).attempts) == (JobState.succeeded, 6)
 
 
+def test_a_job_to_be_cancelled_ends_when_its_worker_stops(store: JobStore) -> None:
+    job, taken = create(store), claim(store)
+    store.request_cancel(job)
+    claims_of(store).give_back(taken)
+    assert (store.get(job).state, store.get(job).finished is None) == (JobState.cancelled, False)
+
+
+def test_a_word_that_the_database_cannot_hold_is_a_wrong_word(store: JobStore) -> None:
+    with pytest.raises((NotFoundError, SpecError)):
+        store.get("job\0")
+
+
 def test_a_loss_is_counted_once_whoever_notices_it(store: JobStore) -> None:
     job, taken = create(store), claim(store)
     with ThreadPoolExecutor(4) as pool:

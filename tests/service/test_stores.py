@@ -230,6 +230,27 @@ def test_retention_deletes_what_is_old_and_nothing_else(store: JobStore, tmp_pat
     assert files.within("jobs").folders() == sorted([running, queued])
 
 
+def test_retention_goes_on_after_a_job_whose_files_cannot_be_deleted(
+    store: JobStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files, stuck, other = open_folder(f"memory://{secrets.token_hex(4)}"), create(store), create(store)
+    for job in (stuck, other):
+        job_artifacts(files, job, attempt=1).write("result.json", b"{}")
+        claims_of(store).finish(claim(store), DONE)
+    remove = type(files.system).rm  # type: ignore[union-attr]
+
+    def rm(self: Any, path: str, **how: Any) -> None:
+        if stuck in path:
+            raise PermissionError(path)
+        remove(self, path, **how)
+
+    monkeypatch.setattr(type(files.system), "rm", rm)  # type: ignore[union-attr]
+    assert Retention(store, files, days=-1 / 86400).run() == 1
+    assert store.get(stuck).state is JobState.succeeded
+    with pytest.raises(NotFoundError):
+        store.get(other)
+
+
 @pytest.mark.parametrize(
     ("days", "seconds"),
     [

@@ -29,7 +29,7 @@ OWN: Final = {
 
 EXTENSIONS: Final = {
     "serve": "Run the service: API, attack worker and renderer.",
-    "worker": "Run an additional attack worker.",
+    "worker": "Run the jobs of a database, without the API.",
     "demo": "Attack a shipped object and show the result.",
     "doctor": "Check this machine and suggest repairs.",
     "experiment": "Run grids of jobs and report their results.",
@@ -50,7 +50,7 @@ INTERRUPTED: Final = 130
 
 EXITS: Final = {
     0: "success; n.a. is a success too",
-    1: "any other error; `doctor` found a fault",
+    1: "any other error; `doctor` or `judge --verify` found a fault",
     2: "invalid options or files",
     3: "no server answers",
     4: "refused: missing or wrong token, or missing right; or too many requests",

@@ -15,7 +15,7 @@ from trompe_client._progress import shown
 from trompe_client.cli.connection import out_option, token_option
 from trompe_client.cli.following import deliver, follow
 from trompe_client.cli.options import flag_of
-from trompe_client.cli.output import say
+from trompe_client.cli.output import print_json, say
 from trompe_shared.api import (
     JUDGEMENT_OPTIONS,
     MANIFEST,
@@ -28,7 +28,7 @@ from trompe_shared.api import (
     Progress,
 )
 from trompe_shared.errors import SpecError
-from trompe_shared.json_option import json_option
+from trompe_shared.json_option import as_json, json_option
 
 HERE: Final = "trompe.here"
 """Entry points of the server package with the functions that judge without a service."""
@@ -69,15 +69,13 @@ def judge(
     spec = JudgementSpec.of(before, after, **given)
     out.mkdir(parents=True, exist_ok=True)
     if server is None:
-        manifest = _judge_here(spec, out)
+        _judge_here(spec, out)
     else:
         with Client(server, token=token) as client:
             deliver(follow(client.judge(before, after, **given)), out)
-        manifest = Manifest.model_validate_json((out / MANIFEST).read_bytes())
-    sys.exit(not any(cell.accuracy for cell in manifest.cells))
 
 
-def _judge_here(spec: JudgementSpec, out: Path) -> Manifest:
+def _judge_here(spec: JudgementSpec, out: Path) -> None:
     from trompe_client._report import judgement_report
 
     judge_here = _here("judge")
@@ -92,7 +90,6 @@ def _judge_here(spec: JudgementSpec, out: Path) -> Manifest:
             click.echo(f"\nFinished work is kept in {out}. The same command goes on with it.", err=True)
             raise
     say(manifest, lambda: judgement_report(manifest, [out / MANIFEST, out / MANIFEST_PAGE]))
-    return manifest
 
 
 def _here(name: str) -> Callable[..., Any]:
@@ -108,10 +105,13 @@ def _verify(file: Path) -> int:
         manifest = Manifest.model_validate_json(file.read_bytes())
     except ValidationError as error:
         raise SpecError(f"{file} is not a manifest of trompe judge ({error.error_count()} faults).") from error
-    faults = 0
+    faults = []
     for fault in _here("verify")(manifest, file.parent):
-        click.echo(fault)
-        faults += 1
-    if not faults:
+        faults.append(fault)
+        if not as_json():
+            click.echo(fault)
+    if as_json():
+        print_json({"faults": faults}, indent=2)
+    elif not faults:
         click.echo("The files are those of the manifest, and random views rendered again have the same classes.")
-    return int(faults > 0)
+    return int(bool(faults))

@@ -155,14 +155,11 @@ class _Slot:
 
 def _environment(settings: Settings) -> dict[str, str]:
     """Variables added to the environment of the processes."""
+    threads = max(1, len(os.sched_getaffinity(0)) // settings.workers)
     return {
-        "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(_threads(settings.workers))),
+        "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(threads)),
         "PROMETHEUS_MULTIPROC_DIR": str(settings.metrics_folder),
     }
-
-
-def _threads(workers: int) -> int:
-    return max(1, len(os.sched_getaffinity(0)) // workers)
 
 
 def _memory() -> float:

@@ -10,7 +10,7 @@ from typing import Any, Final, TypeVar
 from trompe_server.job.protocol import PhasedJob
 from trompe_server.library import Library
 from trompe_server.queue.claims import Claim
-from trompe_server.renderers.choice import JobEngines, listed, named
+from trompe_server.renderers.choice import JOB_ENGINES, JobEngines, listed, named
 from trompe_server.renderers.discovery import Address, DiscoveredRenderers, RendererAddresses, engines_at
 from trompe_server.renderers.protocol import TargetRenderer
 from trompe_server.settings import Settings
@@ -80,10 +80,10 @@ class JobOpener:
 
     def _engines(self, spec: JobSpec, artifacts: JobArtifacts) -> JobEngines:
         """The engines of the job's renderers, recorded at its first opening, once they answer."""
-        known = JobEngines.from_text(artifacts.read(ENGINES)) if artifacts.exists(ENGINES) else None
+        known = JOB_ENGINES.validate_json(artifacts.read(ENGINES)) if artifacts.exists(ENGINES) else None
         engines = self._patiently(partial(self._engines_now, spec, known))
         if known is None:
-            artifacts.write(ENGINES, engines.to_text().encode())
+            artifacts.write(ENGINES, JOB_ENGINES.dump_json(engines))
         return engines
 
     def _patiently(self, look: Callable[..., T]) -> T:

@@ -135,11 +135,10 @@ class Claims:
             return artifacts
 
     def give_back(self, claim: Claim) -> None:
-        """Requeue the job at an orderly stop. It does not count as lost."""
+        """Requeue the job at an orderly stop, or cancel it if that was asked. It does not count as lost."""
         with write(self.engine) as connection:
             row = _held(connection, claim)
-            message = "the worker stopped; the next one continues the job"
-            update_job(connection, row.id, message=message, state=JobState.queued.value)
+            _requeue(connection, row, "the worker stopped; the next one continues the job")
 
     def lose(self, claim: Claim, reason: str) -> None:
         """Take the job from its attempt, which died or stands still, unless the attempt is over."""
@@ -206,14 +205,21 @@ def _lose(connection: sa.Connection, row: Row, reason: str, counter: sa.Column[i
     """Requeue a running job, or fail it after too many losses of the kind that ``counter`` counts."""
     count = getattr(row, counter.name) + 1
     most, dead = (MAX_LOST, "workers") if counter is jobs.c.lost else (MAX_ORPHANED, "dispatchers")
-    ended = {counter.name: count, "finished": clock()}
-    if row.cancel_requested:
-        update_job(connection, row.id, message="cancelled", state=JobState.cancelled.value, **ended)
-    elif count >= most:
+    if count >= most and not row.cancel_requested:
         error = f"{count} {dead} died while running this job; it is not retried. Last cause: {reason}."
+        ended = {counter.name: count, "finished": clock()}
         update_job(connection, row.id, message=error, state=JobState.failed.value, error=error, **ended)
     else:
-        update_job(connection, row.id, message=reason, state=JobState.queued.value, **{counter.name: count})
+        _requeue(connection, row, reason, **{counter.name: count})
+
+
+def _requeue(connection: sa.Connection, row: Row, reason: str, **values: int) -> None:
+    """Put a running job back into the queue, or cancel it, as it was asked to."""
+    if row.cancel_requested:
+        state = {"state": JobState.cancelled.value, "finished": clock()}
+        update_job(connection, row.id, message="cancelled", **state, **values)
+    else:
+        update_job(connection, row.id, message=reason, state=JobState.queued.value, **values)
 
 
 def _queued(needs: Needs) -> sa.ColumnElement[bool]:

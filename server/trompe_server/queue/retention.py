@@ -5,7 +5,7 @@ import secrets
 import time
 from typing import Final
 
-from trompe_server.errors import ConflictError, NotFoundError
+from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.queue.leases import RETENTION, take_lease
 from trompe_server.queue.store import JobStore
 from trompe_server.storage.folders import Folder, job_artifacts
@@ -48,14 +48,17 @@ class Retention:
 
     def run(self) -> int:
         """Run once. Returns the number of deleted jobs."""
-        deleted = 0
-        while jobs := self._store.ended_before(self._kept):
+        deleted, kept = 0, set[str]()
+        while jobs := [job for job in self._store.ended_before(self._kept) if job not in kept]:
             for job in jobs:
                 try:
                     delete_job(self._store, self._files, job)
+                    deleted += 1
                 except (NotFoundError, ConflictError):
                     logger.info("job %s was deleted by another process", job)
-            deleted += len(jobs)
+                except ServiceError as error:
+                    logger.warning("job %s stays until the next run: %s", job, error)
+                    kept.add(job)
         calibrations = self._files.within("library").within("calibrations")
         for name in calibrations.names():
             if time.time() - calibrations.touched(name) > self._kept:

@@ -1,9 +1,10 @@
 """Which of the engines that answer draw the pictures of a job."""
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Self
+from dataclasses import dataclass
+from typing import Final, Self
+
+from pydantic import TypeAdapter
 
 from trompe_shared.api import JobSpec
 from trompe_shared.engine import EngineInfo
@@ -38,15 +39,9 @@ class JobEngines:
         """The attacked ones, then the others."""
         return (*self.attacked, *self.judging)
 
-    def to_text(self) -> str:
-        """The engines as JSON."""
-        return json.dumps(asdict(self))
 
-    @classmethod
-    def from_text(cls, text: str | bytes) -> Self:
-        """Inverse of ``to_text``."""
-        parts = json.loads(text)
-        return cls(*(tuple(EngineInfo(**each) for each in parts[name]) for name in ("attacked", "judging")))
+JOB_ENGINES: Final = TypeAdapter(JobEngines)
+"""Their form as JSON."""
 
 
 def named(name: str, option: str, there: Sequence[EngineInfo]) -> EngineInfo:

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from pydantic import ValidationError
@@ -64,9 +64,9 @@ _executor = click.option(
 def settings_of(data: Path | None, **others: object) -> Settings:
     """Settings from the environment, overridden by the given options. Raises ``SpecError``."""
     options = {"data": data and data.absolute(), **others}
-    given = {name: value for name, value in options.items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     try:
-        return Settings.model_validate(Settings().model_dump() | given)
+        return Settings(**given)
     except ValidationError as error:
         wrong = "; ".join(f"{fault} (TROMPE_{fault.place.partition('.')[0].upper()})" for fault in faults_of(error))
         raise SpecError(

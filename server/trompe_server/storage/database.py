@@ -2,7 +2,7 @@
 
 SQLite serves one machine: WAL, and write transactions that lock the whole database. PostgreSQL serves many machines:
 it locks rows, and a process frozen within a transaction loses its locks. Every call raises ``DatabaseDownError`` if the
-database cannot be reached.
+database cannot be reached, and ``SpecError`` for a value that it cannot hold.
 """
 
 import re
@@ -12,11 +12,12 @@ from typing import Any, Final
 
 import sqlalchemy as sa
 from sqlalchemy.engine.interfaces import ExceptionContext
-from sqlalchemy.exc import ArgumentError, InterfaceError, NoSuchModuleError, OperationalError
+from sqlalchemy.exc import ArgumentError, DataError, InterfaceError, NoSuchModuleError, OperationalError
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 
 from trompe_server.errors import ServiceError
+from trompe_shared.errors import SpecError
 
 BUSY_TIMEOUT: Final = 30_000
 """Milliseconds a writer of SQLite waits for the writer before it."""
@@ -71,7 +72,7 @@ def connect(url: str) -> sa.Engine:
         engine = _postgres(parsed.set(drivername="postgresql+psycopg"))
     else:
         raise ServiceError(_invalid_url(url))
-    sa.event.listen(engine, "handle_error", _translate_outage, retval=True)
+    sa.event.listen(engine, "handle_error", _translate, retval=True)
     return engine
 
 
@@ -97,13 +98,15 @@ def _prepare_sqlite(connection: Any, _record: Any) -> None:
     connection.execute("PRAGMA synchronous=NORMAL")
 
 
-def _translate_outage(context: ExceptionContext) -> BaseException | None:
+def _translate(context: ExceptionContext) -> BaseException | None:
     error = context.sqlalchemy_exception
     if context.is_pre_ping:
         return None  # the pool replaces a broken connection
+    words = (str(context.original_exception).strip().splitlines() or [type(context.original_exception).__name__])[0]
     if context.is_disconnect or isinstance(error, (OperationalError, InterfaceError)):
-        words = str(context.original_exception).strip().splitlines() or [type(context.original_exception).__name__]
-        return DatabaseDownError(f"The database is not available ({words[0]}).")
+        return DatabaseDownError(f"The database is not available ({words}).")
+    if isinstance(error, DataError):
+        return SpecError(f"The database cannot hold such a value ({words}); use text without NUL characters.")
     return None
 
 

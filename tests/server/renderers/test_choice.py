@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from trompe_server.renderers.choice import JobEngines
+from trompe_server.renderers.choice import JOB_ENGINES, JobEngines
 from trompe_shared.api import JobSpec
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, SpecError
@@ -33,7 +33,7 @@ def test_names_choose_among_those_that_answer(
 ) -> None:
     found = JobEngines.of(spec(**options), THERE)
     assert (found.attacked, found.judging) == (attacked, judging)
-    assert JobEngines.from_text(found.to_text()) == found
+    assert JOB_ENGINES.validate_json(JOB_ENGINES.dump_json(found)) == found
 
 
 @pytest.mark.parametrize(

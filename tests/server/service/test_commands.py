@@ -71,12 +71,25 @@ def test_serve_says_what_is_wrong_with_the_data_folder(tmp_path: Path) -> None:
     assert "TROMPE_DATA" in words
 
 
-def test_wrong_settings_are_named_with_their_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TROMPE_WORKERS", "many")
+@pytest.mark.parametrize(
+    ("variable", "value", "fault"),
+    [
+        ("TROMPE_WORKERS", "many", "workers: Input should be a valid integer, unable to parse"),
+        ("TROMPE_NETWORKS", "tiny", "networks: 'tiny' is not a JSON list"),
+    ],
+)
+def test_wrong_settings_are_named_with_their_variable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variable: str, value: str, fault: str
+) -> None:
+    monkeypatch.setenv(variable, value)
     status, words = run(commands.migrate, "--data", str(tmp_path))
     assert status == 2
-    assert "workers: Input should be a valid integer" in words
-    assert "(TROMPE_WORKERS)" in words
+    assert re.search(rf"{fault}[^()]* \({variable}\)", words)
+
+
+def test_an_option_goes_before_a_wrong_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TROMPE_WORKERS", "many")
+    assert commands.settings_of(None, workers=2).workers == 2
 
 
 def test_the_data_folder_is_set_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,6 +212,8 @@ def test_a_judgement_is_interrupted_continued_and_verified(painted: Path, tmp_pa
     verified = subprocess.run([*TROMPE, "--verify", str(out / "judgement.json")], capture_output=True, text=True)
     assert (verified.returncode, verified.stderr) == (0, "")
     assert "random views rendered again have the same classes" in verified.stdout
+    in_json = CliRunner().invoke(main, ["judge", "--verify", str(out / "judgement.json"), "--json"])
+    assert json.loads(in_json.output) == {"faults": []}
 
 
 WRONG = [
