@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from math import nan
 from statistics import fmean
-from typing import Any, Final
+from typing import Final
 
 from trompe_experiments.markdown import figure_words, markdown_table
-from trompe_experiments.style import MARKERS, PALETTE, Drawing, drawing
+from trompe_experiments.style import Drawing, drawing, look
 from trompe_experiments.table import ResultRow
 from trompe_shared.comparison import average, grouped
 
@@ -21,13 +21,13 @@ def between_chart(rows: Sequence[ResultRow]) -> Drawing:
     with drawing(size=(7.0, 1.2 + 0.36 * len(places))) as made:
         (axes,) = made.panels
         for number, (attack, own) in enumerate(attacks.items()):
-            look: Any = {"color": PALETTE[number], "marker": MARKERS[number], "ls": "", "clip_on": False}
+            style = look(number) | {"ls": "", "clip_on": False}
             shift = 0.16 * (number - (len(attacks) - 1) / 2)
             for place, change in enumerate(places):
                 drops = [drop for row in own if (drop := _drop(row, change)) is not None]
-                axes.plot(drops, [place + shift] * len(drops), ms=3, alpha=0.45, mew=0, **look)
+                axes.plot(drops, [place + shift] * len(drops), ms=3, alpha=0.45, mew=0, **style)
                 label = f"attacked through {attack}" if not place else None
-                axes.plot(fmean(drops or [nan]), place + shift, ms=8, mec="white", mew=0.6, label=label, **look)
+                axes.plot(fmean(drops or [nan]), place + shift, ms=8, mec="white", mew=0.6, label=label, **style)
         axes.set_yticks(range(len(places)), places)
         axes.invert_yaxis()
         axes.set_xlim(0, 1)

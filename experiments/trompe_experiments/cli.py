@@ -1,5 +1,6 @@
 """``trompe experiment``."""
 
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from trompe_experiments.about import estimated_seconds, in_words, write_about
 from trompe_experiments.design import experiment_file, load_experiment, shipped_experiments
 from trompe_experiments.plan import Plan, plan_experiment
 from trompe_experiments.service import Service
+from trompe_shared.api import JudgementSpec
 
 if TYPE_CHECKING:
     from trompe_experiments.table import ResultRow
@@ -105,17 +107,19 @@ def show(client: Client, what: str) -> None:
 
 
 def _on_server(found: Service, name: str) -> list["ResultRow"]:
-    """The jobs of an experiment, oldest first, with their results so far."""
+    """The attacks of an experiment, oldest first, with their results so far."""
     from trompe_experiments.table import ResultRow, RowId
 
     rows = []
     for job in found.jobs(name):
+        if isinstance(job.spec, JudgementSpec):
+            continue
         place = RowId(experiment=name, key=job.id)
         if job.state.final and "result.json" in job.artifacts:
             rows.append(ResultRow.of_result(place, found.result(job.id), state=job.state.value, job=job.id))
         else:
             said = job.error or f"{job.progress.phase}, {job.progress.fraction:.0%}"
-            rows.append(ResultRow.of_spec(place, job.attack, state=job.state.value, job=job.id, error=said))
+            rows.append(ResultRow.of_spec(place, job.spec, state=job.state.value, job=job.id, error=said))
     return rows[::-1]
 
 
@@ -178,7 +182,9 @@ def stability(out: Path, objects: tuple[str, ...], seeds: int, only: str, retry_
     click.echo(_announcement(plan, out))
     with local_renderer() as target, experiment_display(console(stderr=True)) as show:
         rows = run_experiment(plan, DisturbedService(target), out, show=show, retry_failed=retry_failed)
-    write_about(out, f"trompe experiment stability --out {out}", seconds=monotonic() - started)
+    asked = "".join(f" --object {name}" for name in objects) + f" --seeds {seeds}"
+    asked += f" --only {shlex.quote(only)}" if only else ""
+    write_about(out, f"trompe experiment stability --out {out}{asked}", seconds=monotonic() - started)
     _conclude(rows, out)
 
 

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Final, Literal
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from trompe_shared.api import OPTIONS
+from trompe_shared.api import OPTIONS, JudgementRequest
 from trompe_shared.errors import SpecError
 from trompe_shared.faults import Fault, faults_of
 from trompe_shared.presets import with_preset
@@ -31,19 +31,24 @@ from trompe_shared.presets import with_preset
 ELSEWHERE: Final = {"object": "list objects under `objects`", "seed": "list seeds under `seeds`"}
 """Options of a job that a file sets in another place."""
 ALLOWED: Final = [*(name for name in OPTIONS if name not in ELSEWHERE), "priority", "needs"]
+OF_JOBS: Final = dict.fromkeys(
+    ("before", "after", "label", "networks", "epsilon", "distance", "elevation", "background", "priority"),
+    "the experiment sets it for each object",
+)
+"""Options of a judgement that a file cannot set, and why."""
+JUDGED: Final = [name for name in JudgementRequest.model_fields if name not in OF_JOBS]
 FRACTION: Final = re.compile(r"^(\d+(?:\.\d+)?)/(\d+)$")
 
 Options = dict[str, Any]
 
 
-def _known(options: Options, *, also: Sequence[str] = ()) -> Options:
+def _known(options: Options, *, allowed: Sequence[str] = ALLOWED, elsewhere: Mapping[str, str] = ELSEWHERE) -> Options:
     """Options with fractions such as 4/255 as numbers. Raises ``ValueError`` for an unknown one."""
-    allowed = [*ALLOWED, *also]
     for name in options:
         if name in allowed:
             continue
-        if name in ELSEWHERE:
-            raise ValueError(f"{name!r} is not an option here: {ELSEWHERE[name]}")
+        if name in elsewhere:
+            raise ValueError(f"{name!r} is not an option here: {elsewhere[name]}")
         close = get_close_matches(str(name), allowed, n=1)
         hint = f"did you mean {close[0]!r}? " if close else ""
         raise ValueError(f"unknown option {name!r}; {hint}Options: {', '.join(allowed)}")
@@ -54,6 +59,8 @@ def _number(value: Any) -> Any:
     if isinstance(value, list):
         return [_number(each) for each in value]
     found = FRACTION.match(value) if isinstance(value, str) else None
+    if found and not float(found[2]):
+        raise ValueError(f"{value!r} divides by zero; give a fraction such as 4/255, or a number")
     return float(found[1]) / float(found[2]) if found else value
 
 
@@ -71,7 +78,7 @@ def _case(options: Options) -> Options:
 
 
 def _object(options: Options) -> Options:
-    return _known(options, also=["file"])
+    return _known(options, allowed=[*ALLOWED, "file"])
 
 
 def _grids(given: Any) -> Any:
@@ -86,6 +93,16 @@ def _grid(options: Options) -> Options:
     for preset in options.get("preset", []):
         with_preset({"preset": preset})
     return known | {name: options[name] for name in options if name == "preset"}
+
+
+def _judgement(options: Options) -> Options:
+    """Checked as those of a judgement of any two objects."""
+    known = _known(options, allowed=JUDGED, elsewhere=OF_JOBS)
+    try:
+        JudgementRequest.of("mug", "mug", label="mug", **known)
+    except SpecError as error:
+        raise ValueError(str(error)) from error
+    return known
 
 
 def _seeds(given: Any) -> Any:
@@ -122,7 +139,7 @@ class Experiment(_Schema):
     )
     cases: dict[str, Annotated[Options, AfterValidator(_case)]] = Field(default_factory=dict)
     seeds: Annotated[list[int], BeforeValidator(_seeds), Field(min_length=1)] = Field(default_factory=lambda: [0])
-    judgement: dict[str, Any] | None = Field(
+    judgement: Annotated[Options, AfterValidator(_judgement)] | None = Field(
         default=None, description="judge the painted objects, the unpainted one and noise, with these options"
     )
     artifacts: list[str] = Field(default_factory=list, description="files of each job to keep; * and ? match")

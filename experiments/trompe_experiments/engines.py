@@ -1,10 +1,10 @@
 """Renderers side by side: how well the surrogate agrees with each, and what the paint keeps in it."""
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 from trompe_experiments.markdown import figure_words, markdown_table
-from trompe_experiments.style import MARKERS, PALETTE, Drawing, drawing
+from trompe_experiments.style import Drawing, drawing, look
 from trompe_experiments.table import ResultRow
 from trompe_shared.comparison import average, grouped
 
@@ -21,11 +21,11 @@ def engines_chart(rows: Sequence[ResultRow]) -> Drawing:
     with drawing(size=size, panels=(1, 2), sharey=True) as made:
         for number, engine in enumerate(engines):
             own = [row for row in rows if row.renderers == engine]
-            look: Any = {"marker": MARKERS[number], "color": PALETTE[number], "ls": "", "mec": "white", "mew": 0.6}
+            style = look(number) | {"ls": "", "mec": "white", "mew": 0.6}
             places = [objects.index(_what(row)) + 0.12 * (number - (len(engines) - 1) / 2) for row in own]
             labels = (engine or OWN, None)
             for axes, column, label in zip(made.panels, ("judged_drop", "margin_error"), labels, strict=True):
-                axes.plot([getattr(row, column) for row in own], places, ms=7, clip_on=False, label=label, **look)
+                axes.plot([getattr(row, column) for row in own], places, ms=7, clip_on=False, label=label, **style)
         drops, errors = made.panels
         drops.set_yticks(range(len(objects)), objects)
         drops.invert_yaxis()

@@ -10,10 +10,10 @@ from trompe_experiments.engines import engines_chart, engines_markdown
 from trompe_experiments.histograms import prediction_histograms
 from trompe_experiments.judged import JUDGEMENTS, JudgedRow
 from trompe_experiments.paper import paper_means_markdown, table_one_chart, table_one_markdown, texels_scatter
-from trompe_experiments.pareto import pareto_markdown, speed_accuracy_chart
+from trompe_experiments.pareto import Cost, configurations, pareto_markdown, speed_accuracy_chart
 from trompe_experiments.stability.chart import stability_chart, stability_markdown
 from trompe_experiments.style import Drawing, stamp_of
-from trompe_experiments.surrogates import surrogates_chart, surrogates_markdown, surrogates_of
+from trompe_experiments.surrogates import surrogates_chart, surrogates_markdown, surrogates_of, with_all_surrogates
 from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, read_table
 from trompe_shared.comparison import grouped
 from trompe_shared.errors import SpecError
@@ -96,13 +96,13 @@ FIGURES: dict[str, Kind] = {
     ),
     "scatter": Kind(
         "A_drop against the share of texels altered",
-        lambda data: _one_setting(data) and _values(data, "tau") + _values(data, "keep") > 2,
+        lambda data: _one_setting(data) and len({(row.tau, row.keep) for row in _done(data.grid)}) > 1,
         lambda data: texels_scatter(_done(data.grid)),
         lambda data: paper_means_markdown(data.grid),
     ),
     "surrogates": Kind(
         "What the surrogate predicts, and what the target keeps",
-        lambda data: _one_setting(data) and len(surrogates_of(data.results)) > 1,
+        lambda data: _one_setting(data) and len(surrogates_of(with_all_surrogates(data.results))) > 1,
         lambda data: surrogates_chart(data.results),
         lambda data: surrogates_markdown(data.results),
     ),
@@ -131,23 +131,23 @@ FIGURES: dict[str, Kind] = {
     ),
     "speed_accuracy": Kind(
         "Speed against accuracy",
-        lambda data: _compares(data),
+        lambda data: _compares(data, "seconds"),
         lambda data: speed_accuracy_chart(data.results),
         lambda data: pareto_markdown(data.results),
     ),
     "evaluations_accuracy": Kind(
         "Images shown to the classifier against accuracy",
-        lambda data: _compares(data),
+        lambda data: _compares(data, "evaluations"),
         lambda data: speed_accuracy_chart(data.results, cost="evaluations"),
     ),
     "visibility": Kind(
         "Visibility of the change (colour difference) against accuracy",
-        lambda data: _compares(data) and _values(data, "perceptual") > 1,
+        lambda data: _compares(data, "delta_e") and _values(data, "perceptual") > 1,
         lambda data: speed_accuracy_chart(data.results, cost="delta_e"),
     ),
     "visibility_ssim": Kind(
         "Visibility of the change (structure) against accuracy",
-        lambda data: _compares(data) and _values(data, "perceptual") > 1,
+        lambda data: _compares(data, "dissimilarity") and _values(data, "perceptual") > 1,
         lambda data: speed_accuracy_chart(data.results, cost="dissimilarity"),
     ),
     "stability": Kind(
@@ -170,10 +170,11 @@ def _values(data: Data, column: str) -> int:
     return len({getattr(row, column) for row in data.results})
 
 
-def _compares(data: Data) -> bool:
-    """Whether the rows are series of configurations."""
+def _compares(data: Data, cost: Cost) -> bool:
+    """Whether the rows are series of configurations with ``cost`` and an object in common."""
     several = _values(data, "configuration") > 2 and _values(data, "series") > 1
-    return several and not _cases(data) and not _one_setting(data)
+    fits = several and not _cases(data) and not _one_setting(data)
+    return fits and bool(configurations(data.results, cost=cost))
 
 
 def _cases(data: Data) -> bool:

@@ -3,6 +3,7 @@
 All objects of an experiment are judged on views that no attack has seen; ``judgements.csv`` has a row for each.
 """
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Self
@@ -16,6 +17,7 @@ from trompe_experiments.table import RowId, job_key, read_table, write_table
 from trompe_server.formats import import_file
 from trompe_shared.api import ADVERSARIAL, AS_RENDERED, JobRequest, JudgementRequest, Manifest, levels_within
 from trompe_shared.comparison import grouped
+from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
 
@@ -27,7 +29,7 @@ HALF_SIZE, JPEG = "half size", "JPEG 30"
 
 
 class JudgedRow(RowId):
-    """One judgement. ``case``: the method; shares, intervals and colour differences as in ``Accuracy``, ``Visibility``.
+    """One judgement. Shares, intervals and colour differences as in ``Accuracy`` and ``Visibility``.
 
     seconds: of the attack. max_levels: largest change of a texel, in levels of 255.
     """
@@ -47,13 +49,13 @@ class JudgedRow(RowId):
 
     @classmethod
     def of(cls, place: RowId, name: str, manifest: Manifest, seconds: float | None) -> Self:
-        """A judgement with one network and one renderer. Raises ``ValueError`` for one without figures."""
+        """A judgement with one network and one renderer. Raises ``SpecError`` for one without figures."""
         through = {cell.pipeline: cell.accuracy for cell in manifest.cells}
         drops = {pipeline: each.a_drop for pipeline, each in through.items() if each is not None}
         found, seen = through.get(AS_RENDERED), manifest.renderers[0].visibility
         if found is None:
-            raise ValueError(
-                f"{name}, {place.case}: {manifest.findings[0].text if manifest.findings else 'no figures'}"
+            raise SpecError(
+                f"{name}, {place.configuration}: {manifest.findings[0].text if manifest.findings else 'no figures'}"
             )
         low, high = found.a_drop_interval or (None, None)
         return cls(
@@ -76,22 +78,22 @@ class JudgedRow(RowId):
 def judge_all(
     plan: Plan, service: Service, folder: Path, *, seconds: Mapping[str, float | None], show: Callable[[str], None]
 ) -> list[JudgedRow]:
-    """Judge all painted objects in ``folder``, and write the table. Rows that it has already are kept.
+    """Judge all painted objects in ``folder``, and write the table. Rows of equal judgements are kept.
 
-    seconds: of each job, by key. show: gets a line before each judgement. Raises ``ClientError``, and ``ValueError``
+    seconds: of each job, by key. show: gets a line before each judgement. Raises ``ClientError``, and ``SpecError``
     for a judgement without figures.
     """
-    path = folder / JUDGEMENTS
-    known = {(row.object, row.case): row for row in read_table(path, JudgedRow, optional=True)}
+    path, options = folder / JUDGEMENTS, json.dumps(plan.experiment.judgement, sort_keys=True)
+    known = {row.key: row for row in read_table(path, JudgedRow, optional=True)}
     rows: list[JudgedRow] = []
     for name, own in grouped(plan.rows, lambda row: row.object).items():
         for place, after in _judged(own, folder):
-            row = known.get((name, place.case))
-            if row is None or row.key != place.key:
-                show(f"judging {name}, {place.case}")
-                manifest = _judgement(plan, own[0], after, service, key=place.key)
-                row = JudgedRow.of(place, name, manifest, seconds.get(place.key))
-            rows.append(row)
+            key = job_key(place.experiment, own[0].request.spec(), place.key, options)
+            if key not in known:
+                show(f"judging {name}, {place.configuration}")
+                manifest = _judgement(plan, own[0], after, service, key=key)
+                known[key] = JudgedRow.of(place, name, manifest, seconds.get(place.key))
+            rows.append(known[key].model_copy(update=place.model_dump() | {"key": key, "object": name}))
             write_table(path, rows, JudgedRow)
     return rows
 
@@ -112,8 +114,7 @@ def _judged(rows: Sequence[Row], folder: Path) -> Iterator[tuple[RowId, Upload |
     first = rows[0]
     given, request = first.attack.options["object"], first.request
     for case in (NOTHING, NOISE):
-        key = job_key(first.place.experiment, request.spec(), case)
-        place = first.place.model_copy(update={"case": case, "configuration": case, "key": key})
+        place = first.place.model_copy(update={"case": case, "configuration": case, "key": f"{first.key} {case}"})
         yield place, given if case == NOTHING else _noise(given, request)
     for row in rows:
         for file in sorted((folder / "jobs" / row.key).glob(f"*{ADVERSARIAL}.zip")):
@@ -147,4 +148,4 @@ def _judgement(plan: Plan, row: Row, after: Upload | str, service: Service, *, k
         priority="sweep",
         **(plan.experiment.judgement or {}),
     )
-    return service.judge(request, key=f"{key}-judged")
+    return service.judge(request, key=key)

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from trompe_experiments.markdown import figure_words, markdown_table
-from trompe_experiments.style import BLUE, GREEN, GREY, INK, MARKERS, PALETTE, Drawing, drawing, drawing_in_rows
+from trompe_experiments.style import BLUE, GREEN, GREY, INK, Drawing, drawing, drawing_in_rows, look
 from trompe_experiments.table import ResultRow
 from trompe_shared.api import FEW_RECOGNISED
 from trompe_shared.comparison import average, grouped
@@ -226,13 +226,13 @@ def texels_scatter(rows: Iterable[ResultRow]) -> Drawing:
     }
     dots = [dot for group in panels.values() for dot in group]
     texels = sorted({(dot.keep, dot.tau) for dot in dots}, key=lambda pair: [value or -1.0 for value in pair])
-    colours = dict(zip(texels, PALETTE, strict=False))
-    markers = dict(zip(sorted({dot.epsilon for dot in dots}), MARKERS, strict=False))
+    colours = {pair: look(k)["color"] for k, pair in enumerate(texels)}
+    markers = {epsilon: look(k)["marker"] for k, epsilon in enumerate(sorted({dot.epsilon for dot in dots}))}
     with drawing(size=(1.6 + 3.4 * len(panels), 4.2), panels=(1, len(panels)), sharey=True) as made:
         for axes, (name, group) in zip(made.panels, panels.items(), strict=True):
             for dot in group:
-                look: Any = {"color": colours[dot.keep, dot.tau], "marker": markers[dot.epsilon]}
-                axes.plot(100 * dot.texels_altered, dot.target_a_drop, ls="", ms=6, mec="white", mew=0.6, **look)
+                style: Any = {"color": colours[dot.keep, dot.tau], "marker": markers[dot.epsilon]}
+                axes.plot(100 * dot.texels_altered, dot.target_a_drop, ls="", ms=6, mec="white", mew=0.6, **style)
             axes.set_title(name)
             axes.set_xlabel("texels altered, N (%)")
             axes.set_xlim(left=0)

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogFormatter
 
 from trompe_experiments.markdown import figure_words, markdown_table
-from trompe_experiments.style import GREY, INK, MARKERS, PALETTE, Drawing, drawing
+from trompe_experiments.style import GREY, INK, Drawing, drawing, look
 from trompe_experiments.table import ResultRow
 from trompe_shared.comparison import Job, Mean, charged, grouped, means_of, pareto_front
 
@@ -84,13 +84,11 @@ def speed_accuracy_chart(rows: Sequence[ResultRow], *, cost: Cost = "seconds") -
     points = configurations(rows, cost=cost)
     front = pareto_front(points)
     series = list(dict.fromkeys(point.configuration[0] for point in points))
-    look = {name: (PALETTE[k % len(PALETTE)], MARKERS[k % len(MARKERS)]) for k, name in enumerate(series)}
+    styles = {name: look(k) | {"mec": INK, "mew": 0.5} for k, name in enumerate(series)}
     with drawing(size=(10.5, 5.8)) as made:
         (axes,) = made.panels
         for point in points:
-            colour, marker = look[point.configuration[0]]
-            style: Any = {"color": colour, "marker": marker, "ms": 7, "lw": 1, "mec": INK, "mew": 0.5}
-            axes.errorbar(point.cost, point.drop, yerr=point.spread, **style)
+            axes.errorbar(point.cost, point.drop, yerr=point.spread, ms=7, lw=1, **styles[point.configuration[0]])
         axes.step([p.cost for p in front], [p.drop for p in front], where="post", color=INK, lw=1, ls="--", zorder=1)
         axes.set_xscale("log")
         for ticks in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
@@ -99,10 +97,7 @@ def speed_accuracy_chart(rows: Sequence[ResultRow], *, cost: Cost = "seconds") -
         axes.set_ylabel("A_drop on held-out views (mean; bars: deviation over seeds)")
         axes.set_title("Up and to the left is better")
         _name_points(axes, front, points, cost)
-        handles = [
-            Line2D([], [], color=look[n][0], marker=look[n][1], mec=INK, mew=0.5, ls="", label=n or "configurations")
-            for n in series
-        ]
+        handles = [Line2D([], [], ls="", label=name or "configurations", **styles[name]) for name in series]
         handles.append(Line2D([], [], color=INK, ls="--", lw=1, label="Pareto front"))
         made.figure.legend(handles=handles, loc="outside right upper", title="varied", alignment="left")
     return made

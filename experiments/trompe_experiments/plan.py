@@ -87,7 +87,16 @@ def _word(value: Any) -> str:
         return " + ".join(map(_word, value))
     if isinstance(value, float):
         return f"{value:.3g}"
-    return Path(value).stem if isinstance(value, str) else str(value)
+    return name_of(str(value))
+
+
+def name_of(source: str) -> str:
+    """The name of a file without folder and suffix; any other word as it is."""
+    return Path(source).stem if _is_file(source) else source
+
+
+def _is_file(source: str | Path) -> bool:
+    return Path(source).suffix.lower() in FILE_SUFFIXES
 
 
 def _row(place: RowId, name: str, options: Options, files: "_Files") -> Row:
@@ -144,5 +153,5 @@ class _Files:
 
     def _read(self, kind: str, source: str | Path) -> Upload | str:
         """See ``trompe_client._plan.Read``. Objects are names unless they are paths."""
-        is_file = isinstance(source, Path) or kind == "mask" or Path(source).suffix.lower() in FILE_SUFFIXES
+        is_file = isinstance(source, Path) or kind == "mask" or _is_file(source)
         return source_of(kind, self.path(str(source))) if is_file else str(source)

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict
 
 from trompe_client._errors import APIError
 from trompe_client._plan import Upload
-from trompe_experiments.plan import Plan, Row
+from trompe_experiments.plan import Plan, Row, name_of
 from trompe_experiments.service import Service
 from trompe_experiments.table import (
     PREDICTIONS,
@@ -222,7 +222,7 @@ def _result_row(row: Row, finished: Finished) -> ResultRow:
         return kept
     if finished.result is not None:
         return ResultRow.of_result(row.place, finished.result, state=finished.state, job=finished.job)
-    names = {"object": row.object, "classifier": Path(row.request.victim.classifier).stem}
+    names = {"object": row.object, "classifier": name_of(row.request.victim.classifier)}
     return ResultRow.of_spec(
         row.place, row.request.spec(), state=finished.state, job=finished.job, error=finished.error, **names
     )

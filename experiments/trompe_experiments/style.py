@@ -36,6 +36,11 @@ RC: Final[Any] = {
 }
 
 
+def look(number: int) -> dict[str, Any]:
+    """Colour and marker of a series; beyond the palette they begin again."""
+    return {"color": PALETTE[number % len(PALETTE)], "marker": MARKERS[number % len(MARKERS)]}
+
+
 class Drawing:
     """A figure with its panels, row by row."""
 

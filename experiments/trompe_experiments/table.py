@@ -199,7 +199,9 @@ def _text(value: Any) -> str:
     if isinstance(value, list | tuple):
         return SEPARATOR.join(map(str, value))
     fields = value.model_dump(exclude_defaults=True) if isinstance(value, BaseModel) else value
-    return json.dumps(fields) if fields and isinstance(fields, dict) else str(fields or "")
+    if fields is None or fields == {}:
+        return ""
+    return json.dumps(fields) if isinstance(fields, dict) else str(fields)
 
 
 def _accuracy(views: str, found: Accuracy | None, *, interval: bool = True) -> dict[str, float | None]:

@@ -235,6 +235,14 @@ def test_files_are_named_by_their_bytes_and_then_by_what_the_server_called_them(
     assert stored.labels == {"experiment": "small"}
 
 
+def test_configurations_name_files_without_folder_and_suffix_and_other_networks_in_full(assets: Path) -> None:
+    networks = ["timm:resnet50.a1_in1k", "timm:resnet50.tv_in1k", "$TROMPE_ASSETS/classifiers/mobilenet_v2.pt2"]
+    plan = planned(grid={"classifier": networks})
+    assert [row.place.configuration for row in plan.rows] == [
+        f"classifier {name}" for name in (*networks[:2], "mobilenet_v2")
+    ]
+
+
 @pytest.mark.parametrize("name", shipped_experiments())
 def test_what_comes_with_trompe_can_be_planned(name: str, assets: Path) -> None:
     experiment = load_experiment(name)
@@ -257,6 +265,10 @@ def test_what_comes_with_trompe_can_be_planned(name: str, assets: Path) -> None:
         pytest.param({"objects": {"mug": {"distanc": 1}}}, "did you mean 'distance'", id="field of an object"),
         pytest.param({"base": {"preset": "quickest"}}, "presets: fast, balanced, best", id="preset"),
         pytest.param({"grid": {"preset": ["slow"]}}, "unknown preset 'slow'", id="preset in a grid"),
+        pytest.param({"base": {"epsilon": "1/0"}}, "base: '1/0' divides by zero", id="fraction"),
+        pytest.param({"judgement": {"veiws": 60}}, "judgement: unknown .* did you mean 'views'", id="judgement"),
+        pytest.param({"judgement": {"epsilon": 0.1}}, "'epsilon' .* the experiment sets it", id="set for a judgement"),
+        pytest.param({"judgement": {"views": 0}}, "views: .* greater than or equal to 1", id="value of a judgement"),
         pytest.param({"grd": {}}, "unknown key 'grd'; keys: name,", id="part"),
         pytest.param({"name": "no spaces"}, "name", id="name"),
     ],

@@ -2,7 +2,7 @@
 
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -12,9 +12,9 @@ from click.testing import CliRunner
 from PIL import Image
 
 from trompe_client.cli import main
-from trompe_experiments.between import between_markdown
+from trompe_experiments.between import between_chart, between_markdown
 from trompe_experiments.documents import fill, outdated
-from trompe_experiments.engines import engines_markdown
+from trompe_experiments.engines import engines_chart, engines_markdown
 from trompe_experiments.figures import FIGURES, Data, figures_of, histogram_rows, plain_rows, read_data
 from trompe_experiments.histograms import prediction_histograms
 from trompe_experiments.paper import (
@@ -23,12 +23,13 @@ from trompe_experiments.paper import (
     table_one,
     table_one_chart,
     table_one_markdown,
+    texels_scatter,
 )
 from trompe_experiments.pareto import configurations, pareto_markdown
 from trompe_experiments.report import write_report
 from trompe_experiments.stability.chart import behaviours, stability_markdown
-from trompe_experiments.style import stamp_of
-from trompe_experiments.surrogates import surrogates_markdown
+from trompe_experiments.style import Drawing, stamp_of
+from trompe_experiments.surrogates import surrogates_chart, surrogates_markdown
 from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, write_table
 from trompe_shared.errors import SpecError
 
@@ -353,6 +354,23 @@ def written(folder: Path, rows: Sequence[ResultRow]) -> Path:
         pytest.param(engine_rows(), ["engines"], id="engines"),
         pytest.param(surrogate_rows(), ["table_one", "scatter", "surrogates", "histograms"], id="surrogates"),
         pytest.param(
+            [row(object="mug", surrogate="diffuse"), row(object="lamp", surrogate="curve")],
+            ["table_one", "histograms"],
+            id="surrogates on different objects",
+        ),
+        pytest.param(
+            [row(surrogate="diffuse", state="failed", target_a_drop=None)]
+            + [row(surrogate="curve", tau=tau) for tau in (None, 0.1, 0.2)],
+            [],
+            id="no result of the first surrogate",
+        ),
+        pytest.param(
+            [row(series=str(n > 1), configuration=f"steps {n}", object=f"object {n}", alpha=n / 9) for n in range(4)]
+            + [row(series="True", configuration="steps 3", object="object 3", alpha=0.5)],
+            [],
+            id="series on different objects",
+        ),
+        pytest.param(
             [*grid_rows(), row(key="small", series="small", epsilon=0.01, alpha=0.004, configuration="epsilon 0.01")],
             ["table_one", "scatter", "histograms"],
             id="grid in two series",
@@ -373,6 +391,22 @@ def test_a_report_holds_what_fits_its_rows_and_needs_nothing_else(
     assert len(links) >= len(names) + 1
     assert all(link.startswith("data:") for link in links)
     assert "<script" not in page
+
+
+@pytest.mark.parametrize(
+    ("chart", "column"),
+    [
+        (texels_scatter, "tau"),
+        (texels_scatter, "epsilon"),
+        (engines_chart, "renderers"),
+        (surrogates_chart, "surrogate"),
+        (between_chart, "image_pipeline"),
+    ],
+)
+def test_charts_of_more_series_than_colours_begin_again(
+    chart: Callable[[Sequence[ResultRow]], Drawing], column: str
+) -> None:
+    assert chart([row(**{column: str(k / 10)}) for k in range(1, 10)]).panels
 
 
 def test_a_report_shows_pictures_warnings_and_failures_and_takes_words_literally(tmp_path: Path) -> None:

@@ -131,6 +131,11 @@ def test_cases_of_the_suite_have_names_of_their_own_and_a_reference() -> None:
     assert not any("|" in name for name in CASES)
 
 
+def test_words_of_no_case_are_refused_with_the_cases() -> None:
+    with pytest.raises(SpecError, match=r"contains 'nonsense'; cases: as it should be; field of view"):
+        stability_plan(objects=["mug"], seeds=1, only="nonsense")
+
+
 @pytest.fixture
 def fake_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "disturbed_renderer", lambda **_: nullcontext(FakeTarget()))

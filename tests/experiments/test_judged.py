@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.experiments.test_run import FakeService, Silent
 from trompe_experiments.baselines import baselines_markdown
-from trompe_experiments.design import Experiment, load_experiment
+from trompe_experiments.design import OF_JOBS, Experiment, load_experiment
 from trompe_experiments.figures import read_data
 from trompe_experiments.judged import JUDGEMENTS, NOISE, NOTHING, JudgedRow, judge_all, noised
 from trompe_experiments.plan import Plan, plan_experiment
@@ -17,6 +17,7 @@ from trompe_experiments.run import run_experiment
 from trompe_experiments.table import read_table
 from trompe_server.api.examples import MANIFEST as EXAMPLE
 from trompe_shared.api import Job, JudgementRequest, Manifest
+from trompe_shared.errors import SpecError
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
@@ -31,11 +32,12 @@ FILE = {
 
 
 class JudgingService(FakeService):
-    """Keeps the requests of judgements; the painted objects are the shipped ones."""
+    """Keeps the requests of judgements and their keys; the painted objects are the shipped ones."""
 
     def __init__(self) -> None:
         super().__init__()
         self.judged: list[JudgementRequest] = []
+        self.keys: list[str] = []
 
     def job(self, job: str) -> Job:
         found = super().job(job)
@@ -46,12 +48,17 @@ class JudgingService(FakeService):
 
     def judge(self, request: JudgementRequest, *, key: str) -> Manifest:
         self.judged.append(request)
+        self.keys.append(key)
         return Manifest.model_validate(EXAMPLE)
+
+
+def planned(**changes: object) -> Plan:
+    return plan_experiment(Experiment.model_validate(FILE | changes))
 
 
 @pytest.fixture
 def plan() -> Plan:
-    return plan_experiment(Experiment.model_validate(FILE))
+    return planned()
 
 
 def judged(plan: Plan, service: JudgingService, folder: Path) -> list[JudgedRow]:
@@ -72,6 +79,7 @@ def test_each_object_is_judged_as_it_is_with_noise_and_painted(plan: Plan, tmp_p
         ("ball", 0.05, 4, 1, None),
     }
     assert [list(one.label) for one in service.judged] == [["mug"]] * 4 + [["ball"]] * 4
+    assert service.judged[0].model_fields_set == {*OF_JOBS, "views", "seed"}
 
 
 def test_rows_are_kept_and_made_into_a_table_and_a_chart(plan: Plan, tmp_path: Path) -> None:
@@ -85,10 +93,25 @@ def test_rows_are_kept_and_made_into_a_table_and_a_chart(plan: Plan, tmp_path: P
     assert [path.suffix for path in read_data(tmp_path).draw("baselines")] == [".svg", ".png"]
 
 
+def test_changed_options_of_the_judgement_judge_everything_again_under_other_keys(plan: Plan, tmp_path: Path) -> None:
+    first, again = JudgingService(), JudgingService()
+    judged(plan, first, tmp_path)
+    rows = judged(planned(judgement={"views": 4, "seed": 2}), again, tmp_path)
+    assert [one.seed for one in again.judged] == [2] * 8
+    assert [row.key for row in rows] == again.keys
+    assert not {*first.keys} & {*again.keys}
+
+
+def test_without_cases_each_configuration_of_the_grid_is_a_method(tmp_path: Path) -> None:
+    rows = judged(planned(cases={}, grid={"epsilon": [0.02, 0.05]}), JudgingService(), tmp_path)
+    methods = [line.split(" | ")[0] for line in baselines_markdown(rows).splitlines()[2:]]
+    assert methods == ["| no change", "| noise", "| epsilon 0.02", "| epsilon 0.05"]
+
+
 def test_a_judgement_without_figures_says_why(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     empty = Manifest.model_validate(EXAMPLE | {"cells": []})
     monkeypatch.setattr(JudgingService, "judge", lambda *_args, **_options: empty)
-    with pytest.raises(ValueError, match=f"mug, {NOTHING}: The texture is 512"):
+    with pytest.raises(SpecError, match=f"mug, {NOTHING}: The texture is 512"):
         judged(plan, JudgingService(), tmp_path)
 
 

@@ -2,8 +2,10 @@
 
 import csv
 import json
+import shlex
 import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from datetime import UTC, datetime
 from io import StringIO
 from itertools import count
@@ -28,8 +30,9 @@ from trompe_experiments.run import run_experiment
 from trompe_experiments.service import Service
 from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, RowId, read_table
 from trompe_experiments.terminal import compared, differences, failures, read_results
+from trompe_server import renderers
 from trompe_server.api.examples import RESULT as EXAMPLE
-from trompe_shared.api import Job, JobRequest, JobSpec, JobState, Problem, Progress, Result
+from trompe_shared.api import Job, JobRequest, JobSpec, JobState, JudgementSpec, Problem, Progress, Result
 from trompe_shared.errors import SpecError
 
 
@@ -290,7 +293,8 @@ def test_failures_stay_and_are_listed_until_they_are_to_be_tried_again(service: 
 
 def test_a_row_that_the_server_refuses_does_not_stop_the_others(service: FakeService, tmp_path: Path) -> None:
     service.refused = {"mug"}
-    rows, _ = ran(plan_of(), service, tmp_path)
+    rows, _ = ran(plan_of(base={"classifier": "timm:resnet50.a1_in1k"}), service, tmp_path)
+    assert rows[0].classifier == "timm:resnet50.a1_in1k"
     assert [row.state for row in rows] == ["refused", "refused", "succeeded", "succeeded"]
     assert "No such class" in rows[0].error
 
@@ -313,6 +317,12 @@ def test_a_shared_job_fills_the_rows_of_all_its_series(service: FakeService, tmp
 def row_of(**columns: Any) -> ResultRow:
     spec = JobRequest.of("mug", label="mug").spec()
     return ResultRow.of_spec(RowId(experiment="x", key="k"), spec, state="succeeded", **columns)
+
+
+@pytest.mark.parametrize(("target", "cell"), [(0, "0"), (None, ""), ("ball", "ball")])
+def test_rows_hold_the_class_to_be_taken_for(target: int | str | None, cell: str) -> None:
+    spec = JobRequest.of("mug", label="mug", target=target).spec()
+    assert ResultRow.of_spec(RowId(experiment="x", key="k"), spec, state="succeeded").target == cell
 
 
 def test_two_experiments_are_compared_on_what_they_share() -> None:
@@ -433,6 +443,9 @@ def test_the_jobs_of_an_experiment_are_found_on_a_server(
 ) -> None:
     service.failing = {"chair"}
     ran(plan_of(), service, tmp_path)
+    spec, attacks = JudgementSpec.of("mug", "mug", label="mug"), service.jobs
+    judgement = Job(id="j", state=JobState.succeeded, spec=spec, created=datetime.now(UTC), worker=None)
+    monkeypatch.setattr(service, "jobs", lambda name: [judgement, *attacks(name)])
     monkeypatch.setattr(cli, "Service", lambda client: service)
     assert "mean of 4 rows: target A_drop 0.35" in invoked("show", "small")
     assert "no job of an experiment 'other'" in invoked("show", "other", status=1)
@@ -476,6 +489,15 @@ def test_how_an_experiment_was_made_is_noted_and_its_runs_add_up(tmp_path: Path)
     note = json.loads((tmp_path / ABOUT).read_text())
     assert (note["command"], note["seconds"], note["took"]) == ("trompe experiment run mine.yaml", 60.0, "60 s")
     assert (tmp_path / "experiment.yaml").read_text() == "name: mine\n"
+
+
+def test_the_stability_suite_notes_its_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "run_experiment", lambda *_args, **_options: ())
+    monkeypatch.setattr(renderers, "local_renderer", nullcontext)
+    asked = ["--object", "mug", "--seeds", "1", "--only", "quality 75"]
+    invoked("stability", "--out", tmp_path, *asked)
+    command = json.loads((tmp_path / ABOUT).read_text())["command"]
+    assert shlex.split(command) == ["trompe", "experiment", "stability", "--out", str(tmp_path), *asked]
 
 
 def test_more_views_steps_and_networks_take_longer() -> None:

@@ -14,6 +14,7 @@ from trompe_experiments.in_process import Change
 from trompe_experiments.plan import Plan, plan_experiment
 from trompe_experiments.stability import AFTERWARDS, REFERENCE
 from trompe_experiments.stability.disturbed import bfloat16, quantised, saturated
+from trompe_shared.errors import SpecError
 
 NAME: Final = "stability_targets"
 
@@ -80,12 +81,15 @@ def stability_plan(
     *, objects: Sequence[str], seeds: int, only: str = "", options: Mapping[str, Any] | None = None
 ) -> Plan:
     """Jobs of the cases whose name contains ``only``, on shipped objects, with the options of the experiment
-    ``stability``, which ``options`` override."""
+    ``stability``, which ``options`` override. Raises ``SpecError`` without such a case."""
+    chosen = {words: dict(case.options) for words, case in CASES.items() if only in words}
+    if not chosen:
+        raise SpecError(f"No case of the stability suite contains {only!r}; cases: {'; '.join(CASES)}.")
     file = {
         "name": NAME,
         "base": {**load_experiment("stability").base, **(options or {})},
         "objects": {name: {} for name in objects},
-        "cases": {words: dict(case.options) for words, case in CASES.items() if only in words},
+        "cases": chosen,
         "seeds": seeds,
     }
     return plan_experiment(Experiment.model_validate(file))
