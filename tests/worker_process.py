@@ -1,4 +1,4 @@
-"""Renderer worker processes for tests."""
+"""Renderer worker processes for tests, and what a process of any kind holds."""
 
 import re
 import subprocess
@@ -16,6 +16,12 @@ FLAT, FLAT_SETTINGS = ("--set", "shadows=no"), "shadows=False"
 READY = re.compile(r"trompe renderer listening on (127\.0\.0\.1):(\d+), (.+)\n")
 
 
+def memory(pid: int, kind: str = "VmRSS") -> int:
+    """Bytes of memory that a process holds, or of another ``kind`` in its status: VmHWM is its peak."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+    return 1024 * int(re.search(rf"{kind}:\s+(\d+)", status)[1])  # type: ignore[index]
+
+
 @dataclass(frozen=True)
 class Worker:
     """A renderer worker on a free port."""
@@ -26,8 +32,7 @@ class Worker:
     @property
     def memory(self) -> int:
         """Resident bytes."""
-        status = Path(f"/proc/{self.process.pid}/status").read_text(encoding="ascii")
-        return 1024 * int(re.search(r"VmRSS:\s+(\d+)", status)[1])  # type: ignore[index]
+        return memory(self.process.pid)
 
     @property
     def open(self) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from typing import Final, NoReturn
 
 import click
 
-from trompe_renderer.options import Options
+from trompe_renderer.protocol.limits import Options
 from trompe_shared.engine import DEFAULT_ENGINE
 from trompe_shared.errors import RendererError
 
@@ -102,7 +102,8 @@ def render(
 
 def _listen(host: str, port: int) -> socket.socket:
     try:
-        return socket.create_server((host, port), backlog=BACKLOG)
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        return socket.create_server((host, port), family=family, backlog=BACKLOG)
     except OSError as error:
         raise RendererError(f"Cannot listen on {host}:{port} ({error}). Choose another --host or --port.") from error
 
@@ -138,7 +139,8 @@ def _serve(
     thread = RenderThread(engine_maker(engine, settings))
     server = Server(listener, thread, options)
     stop.stop_server = server.stop
-    click.echo("trompe renderer listening on {}:{}, {}".format(*server.address, thread.info))
+    host, port = server.address
+    click.echo(f"trompe renderer listening on {f'[{host}]' if ':' in host else host}:{port}, {thread.info}")
     server.serve_forever()
 
 

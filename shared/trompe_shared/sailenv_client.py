@@ -19,6 +19,7 @@ from trompe_shared.sailenv import (
     EXTENSIONS,
     LIGHT_NOT_FOUND,
     MAIN_LIGHT,
+    MAX_FILE,
     REGISTER,
     VIEW_FLAGS,
     decode_frame,
@@ -242,7 +243,13 @@ class _Connection:
 
     def _spawn(self, obj: Object3D) -> int:
         """Upload the object and spawn it at the origin; return the number of the instance."""
-        (path,) = self.ask("send_obj_zip", file=(f"{obj.name}.zip", obj.to_zip()))
+        archive = obj.to_zip()
+        if len(archive) > MAX_FILE:
+            raise ObjectError(
+                f"The object {obj.name!r} has {len(archive) >> 20} MiB as a zip, more than the {MAX_FILE >> 20} MiB "
+                "that can be sent to a renderer. Use smaller textures or a simpler mesh."
+            )
+        (path,) = self.ask("send_obj_zip", file=(f"{obj.name}.zip", archive))
         (instance,) = self.ask(
             "spawn_object",
             name=f"file:{path}",

@@ -9,7 +9,7 @@ from trompe_shared.engine import EngineInfo
 
 
 class Noisy:
-    def __init__(self, level: int = 100, *, spread: float = 50.0, wrong: bool = False) -> None:
+    def __init__(self, level: int = 100, *, spread: float = 50.0, wrong: bool | None = None) -> None:
         self.info = EngineInfo("pyrender", "7", deterministic=False)
         self._level, self._spread, self._kind = level, spread, np.float32 if wrong else np.uint8
 

@@ -1,6 +1,7 @@
 """Limits of time, size and number; fair turns; the end of a worker by a signal, a crash or the loss of OpenGL."""
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -9,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,10 +28,13 @@ from trompe_renderer.protocol.link import Link
 from trompe_renderer.protocol.session import Session
 from trompe_renderer.protocol.upload import ModelCache
 from trompe_renderer.world.snapshot import Snapshot
+from trompe_server.service.supervisor import LISTENING
+from trompe_shared.addresses import host_and_port
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import ProtocolError, RendererError
 from trompe_shared.geometry import Camera
 from trompe_shared.sailenv import MAX_VIEWS, REGISTER, decode_frame, take_status
+from trompe_shared.sailenv_client import SailenvTarget
 
 Connect = Callable[..., Wire]
 Pair = tuple[socket.socket, socket.socket]
@@ -191,6 +195,22 @@ def test_a_starting_worker_stops_at_once(number: signal.Signals, status: int) ->
 
     with reserved_port() as port:
         assert any(said(port) == "" for _ in range(5))
+
+
+def test_a_worker_on_an_ipv6_address_prints_it_for_the_supervisor_and_for_clients() -> None:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("NOT TESTED: this machine has no IPv6")
+    command = [sys.executable, "-m", "trompe_renderer", "--host", "::1", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        ready = re.match(r"trompe renderer listening on (\[::1\]:\d+), (.+)\n", line := process.stdout.readline())
+        assert ready, line
+        with closing(SailenvTarget(*host_and_port(ready[1]))) as target:
+            assert str(target.engine) == ready[2]
+            assert LISTENING.findall(line) == [str(target.address[1])]
+        process.kill()
 
 
 def test_a_batch_ends_with_a_reason_when_the_worker_stops(own_worker: Worker, wire: Connect) -> None:

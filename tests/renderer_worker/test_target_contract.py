@@ -10,7 +10,7 @@ import pytest
 from tests.fakes import FakeTarget
 from tests.wire import boxes, plain
 from trompe_server.renderers import RendererPool, SailenvTarget, TargetRenderer
-from trompe_shared.errors import RendererError
+from trompe_shared.errors import ObjectError, RendererError
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D, encode_png, object_from_files
 
@@ -71,6 +71,18 @@ def test_right_is_right_and_up_is_up(renderer: TargetRenderer) -> None:
     rows, columns = np.nonzero((image != 255).any(axis=-1))
     assert rows.max() < SIZE[0] / 2
     assert columns.min() > SIZE[1] / 2
+
+
+def test_an_object_too_large_to_be_sent_is_refused_and_the_renderer_is_not_blamed(
+    renderer: TargetRenderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if isinstance(renderer, FakeTarget):
+        pytest.skip("nothing is sent")
+    monkeypatch.setattr("trompe_shared.sailenv_client.MAX_FILE", 100)
+    with pytest.raises(ObjectError, match=r"^The object 'box' has 0 MiB as a zip, more than"):
+        renderer.render(boxes(), VIEWS, size=SIZE)
+    monkeypatch.undo()
+    assert renderer.render(boxes(), VIEWS, size=SIZE).any()
 
 
 def test_every_way_to_a_worker_shows_exactly_the_same_bytes(

@@ -15,9 +15,8 @@ import pytest
 from PIL import Image
 
 from tests.wire import ORIGIN, Wire, boxes
-from trompe_renderer.options import Options
 from trompe_renderer.protocol.agent import MAX_REASON
-from trompe_renderer.protocol.limits import Limits, MemoryBudget
+from trompe_renderer.protocol.limits import Limits, MemoryBudget, Options
 from trompe_renderer.protocol.link import Link
 from trompe_renderer.protocol.server import Server
 from trompe_renderer.protocol.session import Session

@@ -5,7 +5,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from importlib import import_module
 from inspect import Parameter, signature
-from typing import Annotated, Any, Final, Literal, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
 import click
 
@@ -98,7 +99,9 @@ def _values(name: str, takes: Any, settings: Mapping[str, str]) -> tuple[dict[st
 
 
 def _click_type(hint: Any, default: Any) -> "click.ParamType[Any]":
-    """The click type of an annotation, or of a default without one."""
+    """The click type of an annotation (of a union: of its last type but None), or of a default without one."""
+    if get_origin(hint) in {Union, UnionType}:
+        *_, hint = (each for each in get_args(hint) if each is not NoneType)
     kind: click.ParamType[Any] = click.types.convert_type(hint, None if default is Parameter.empty else default)
     if get_origin(hint) is Literal:
         kind = click.Choice(get_args(hint))

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from trompe_renderer.engines.engine import Engine, GBuffer, LabellingEngine, draw
 from trompe_renderer.engines.render_thread import RenderThread
-from trompe_renderer.options import Options
 from trompe_renderer.protocol.label_views import flat_view, label_views, main_view
-from trompe_renderer.protocol.limits import Limits, MemoryBudget
+from trompe_renderer.protocol.limits import Limits, MemoryBudget, Options
 from trompe_renderer.protocol.link import Link
 from trompe_renderer.protocol.session import Session
 from trompe_renderer.protocol.upload import ModelCache

@@ -1,4 +1,4 @@
-"""Limits on agents: time, bytes, numbers."""
+"""Options of a worker, and limits on its agents: time, bytes, numbers."""
 
 import contextlib
 import threading
@@ -9,6 +9,14 @@ from weakref import WeakKeyDictionary
 from trompe_shared.errors import RendererError
 
 MIB = 2**20
+
+
+@dataclass(frozen=True)
+class Options:
+    """depth_range: metres shown as white in depth views. time_step: seconds between frames; the clock's if none."""
+
+    depth_range: float = 10.0
+    time_step: float | None = None
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ from select import select
 from typing import Final
 
 from trompe_renderer.engines.render_thread import RenderThread
-from trompe_renderer.options import Options
 from trompe_renderer.protocol.agent import MAX_REASON, Agent, Shared
-from trompe_renderer.protocol.limits import Limits
+from trompe_renderer.protocol.limits import Limits, Options
 from trompe_renderer.protocol.link import Link
 from trompe_shared.errors import ProtocolError
 

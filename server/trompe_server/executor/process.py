@@ -15,6 +15,7 @@ from typing import Final
 
 from trompe_server.renderers.discovery import RendererAddresses
 from trompe_server.settings import Settings
+from trompe_server.system.threads import threads
 
 READY: Final = "ready"
 _FORKING: Final = threading.Lock()
@@ -51,9 +52,8 @@ def run_attempts(connection: Connection, environment: Mapping[str, str], setup: 
     from trompe_server.executor.attempts import Attempts
 
     attempts = Attempts(setup.settings, setup.renderers)
-    torch, threads = sys.modules.get("torch"), os.environ.get("OMP_NUM_THREADS")
-    if torch is not None and threads is not None:  # the fork server has imported it with its own number of threads
-        torch.set_num_threads(int(threads))
+    if torch := sys.modules.get("torch"):  # the fork server has imported it with its own number of threads
+        torch.set_num_threads(threads())
     connection.send(READY)
     while True:
         try:

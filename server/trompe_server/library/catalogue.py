@@ -75,11 +75,11 @@ class Catalogue(Generic[Info]):
         folder, name = self.place(info)
         return folder.read(name)
 
-    def put(self, info: Info, file: Path) -> Info:
-        """Store ``file``. If the same bytes are stored already, only the info is replaced."""
+    def put(self, info: Info, name: str, data: bytes | Path) -> Info:
+        """Store bytes or a file as ``name``. If the same bytes are stored already, only the info is replaced."""
         folder = self.folder.within(info.id)
         if not folder.exists(_INFO):
-            folder.write(file.name, file)
+            folder.write(name, data)
         folder.write(_INFO, info.model_dump_json().encode())
         return info
 

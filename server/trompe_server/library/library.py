@@ -2,6 +2,8 @@
 
 import hashlib
 import os
+import re
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,7 +26,8 @@ from trompe_shared.shipped import shipped_objects
 
 _UPLOAD: Final = "upload"
 """File of an object as uploaded, beside ``data.zip``."""
-_PART: Final = 2**20
+_UNSAFE: Final = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+"""Characters of a name that a command line or JSON cannot carry."""
 _SECONDS: Final = 300.0
 _MEMORY: Final = 8 * 2**30
 """Bytes of address space to inspect a classifier; networks for ImageNet take less than half."""
@@ -91,13 +94,14 @@ class Library:
         Textures are shrunk to at most ``max_texture`` texels a side. Raises ``ObjectError`` for an unreadable file and
         stores nothing then.
         """
+        filename = _clean(filename)
         with _intake() as folder:
             upload = folder / _UPLOAD
             identity = _copy(file, upload)
             made = import_file(upload, name=filename, max_texture=max_texture)
             info = ObjectInfo(
                 id=identity if max_texture is None else identity_of(f"{identity} at most {max_texture}".encode()),
-                name=Path(name or filename).stem or "object",
+                name=_named(name, filename) or "object",
                 materials=made.materials,
                 textures=dict(made.textures),
                 triangles=made.triangles,
@@ -105,10 +109,8 @@ class Library:
                 format=made.format,
                 filename=filename,
             )
-            payload = folder / "data.zip"
-            write_whole(payload, made.archive)
             self.objects.folder.within(info.id).write(_UPLOAD, upload)
-            return self.objects.put(info, payload)
+            return self.objects.put(info, "data.zip", made.archive)
 
     def classifier(self, reference: str) -> ClassifierInfo:
         """One classifier, or a network by name (``timm:NAME``).
@@ -176,9 +178,9 @@ class Library:
                     "logit, in order."
                 )
             info = ClassifierInfo.model_validate(
-                found | {"id": identity, "name": name or Path(filename).stem, "classes": classes}
+                found | {"id": identity, "name": _named(name, filename), "classes": classes}
             )
-            return self.classifiers.put(info, payload)
+            return self.classifiers.put(info, payload.name, payload)
 
     def background_bytes(self, reference: str) -> bytes:
         """Image file of a background. Raises ``NotFoundError`` or ``AmbiguousError``."""
@@ -190,10 +192,7 @@ class Library:
             decode_rgb(data, name)
         except ObjectError as error:
             raise SpecError(f"The background {name!r} is not a readable image. Send a PNG or a JPEG.") from error
-        with _intake() as folder:
-            payload = folder / f"data{Path(name).suffix.lower()}"
-            write_whole(payload, data)
-            return self.backgrounds.put(BackgroundInfo(id=identity_of(data), name=Path(name).stem), payload)
+        return self.backgrounds.put(BackgroundInfo(id=identity_of(data), name=_named(None, name)), "data", data)
 
 
 @contextmanager
@@ -205,14 +204,19 @@ def _intake() -> Iterator[Path]:
 
 def _copy(source: BinaryIO, path: Path) -> str:
     """Copy a file to ``path`` and return its id."""
-    digest = hashlib.sha256()
-    with path.open("wb") as target:
-        while part := source.read(_PART):
-            digest.update(part)
-            target.write(part)
-        target.flush()
-        os.fsync(target.fileno())
-    return digest.hexdigest()
+    with path.open("w+b") as target:
+        shutil.copyfileobj(source, target)
+        target.seek(0)
+        return hashlib.file_digest(target, "sha256").hexdigest()
+
+
+def _clean(name: str) -> str:
+    return _UNSAFE.sub("_", name)
+
+
+def _named(name: str | None, filename: str) -> str:
+    """The name to store: the given one, or that of the file without its suffix."""
+    return _clean(name or Path(filename).stem)
 
 
 @cache

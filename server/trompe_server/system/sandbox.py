@@ -93,8 +93,10 @@ def _too_long(seconds: float) -> str:
 
 
 def _ended(code: int, memory: int, seconds: float) -> str:
-    if code in {-signal.SIGXCPU, -signal.SIGKILL}:
+    if code == -signal.SIGXCPU:
         return _too_long(seconds)
+    if code == -signal.SIGKILL:
+        return "The process reading it was killed, probably for want of memory. Send a smaller or simpler file."
     if code in {OUT_OF_MEMORY, -signal.SIGABRT}:
         return f"Reading it took more than {memory >> 20} MiB of memory. Send a smaller or simpler file."
     how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
@@ -102,15 +104,15 @@ def _ended(code: int, memory: int, seconds: float) -> str:
 
 
 def _limit(memory: int, seconds: int) -> None:
-    for what, limit in (
-        (resource.RLIMIT_AS, memory),
-        (resource.RLIMIT_CPU, seconds),
-        (resource.RLIMIT_FSIZE, MAX_FILE),
-        (resource.RLIMIT_CORE, 0),
+    for what, limit, grace in (
+        (resource.RLIMIT_AS, memory, 0),
+        (resource.RLIMIT_CPU, seconds, 1),  # SIGXCPU comes before SIGKILL and tells the cause
+        (resource.RLIMIT_FSIZE, MAX_FILE, 0),
+        (resource.RLIMIT_CORE, 0, 0),
     ):
         hard = resource.getrlimit(what)[1]
-        allowed = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
-        resource.setrlimit(what, (allowed, allowed))
+        soft, last = (each if hard == resource.RLIM_INFINITY else min(each, hard) for each in (limit, limit + grace))
+        resource.setrlimit(what, (soft, last))
 
 
 def _main(arguments: Sequence[str]) -> None:

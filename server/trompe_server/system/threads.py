@@ -35,6 +35,11 @@ def in_threads(make: Callable[..., T], *items: Iterable[Any]) -> list[T]:
     rows = list(zip(*items, strict=True))
     if len(rows) < WORTH:
         return [make(*row) for row in rows]
-    count = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
-    with ThreadPoolExecutor(count, thread_name_prefix="in_threads") as executor:
+    with ThreadPoolExecutor(threads(), thread_name_prefix="in_threads") as executor:
         return list(executor.map(lambda row: make(*row), rows))
+
+
+def threads() -> int:
+    """Number of threads that the environment allows; by default one for each core."""
+    outermost = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]  # a list has a number for each nested level
+    return int(outermost or len(os.sched_getaffinity(0)))

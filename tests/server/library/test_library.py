@@ -6,6 +6,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,7 +17,7 @@ from trompe_server.library import Library
 from trompe_server.library.library import inspect_classifier
 from trompe_server.storage.folders import open_folder
 from trompe_shared.errors import ClassifierError
-from trompe_shared.object3d import load_object
+from trompe_shared.object3d import encode_png, load_object
 from trompe_shared.shipped import shipped_objects
 
 
@@ -32,6 +33,34 @@ def test_an_object_comes_back_byte_for_byte(tmp_path: Path) -> None:
     again = Library(tmp_path)
     assert again.objects.find("triangle") == info
     assert again.object_bytes(info.id) == again.object_bytes(info.id[:6]) == triangle_zip()
+
+
+@pytest.mark.parametrize(
+    ("name", "filename", "expected"),
+    [
+        pytest.param("mug v1.2", "a.zip", "mug v1.2", id="a dot in a given name"),
+        pytest.param(None, "mug v1.2.zip", "mug v1.2", id="a dot in the name of a file"),
+        pytest.param(None, "a\0\n.zip", "a__", id="control characters"),
+        pytest.param(None, "\udce9t\ud800.zip", "_t_", id="bytes that are not UTF-8"),
+        pytest.param("\udce9", "a.zip", "_", id="bytes that are not UTF-8 in a given name"),
+    ],
+)
+def test_an_object_has_the_given_name_or_the_stem_of_its_file(
+    tmp_path: Path, name: str | None, filename: str, expected: str
+) -> None:
+    info = Library(tmp_path).add_object(io.BytesIO(triangle_zip()), filename, name=name)
+    assert info.name == expected
+    assert Library(tmp_path).objects.find(expected) == info
+
+
+@pytest.mark.parametrize("filename", ["photo.été", "photo." + "x" * 300, "photo", "photo.\udce9"])
+def test_a_background_is_stored_under_any_file_name(tmp_path: Path, filename: str) -> None:
+    data = encode_png(np.zeros((4, 4, 3), np.uint8))
+    info = Library(tmp_path).add_background(data, filename)
+    assert Library(tmp_path).background_bytes("photo") == data
+    file = tmp_path / "backgrounds" / info.id / "data"
+    file.rename(file.with_suffix(".png"))  # as earlier versions stored it
+    assert Library(tmp_path).background_bytes("photo") == data
 
 
 def test_the_same_upload_from_many_sides_at_once_is_stored_once(tmp_path: Path) -> None:

@@ -18,8 +18,9 @@ def test_few_items_are_not_worth_a_thread(count: int, others: bool) -> None:
     assert (threading.get_ident() not in used) is others
 
 
-def test_as_many_threads_as_torch_has(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+@pytest.mark.parametrize("setting", ["3", "3,2"])
+def test_as_many_threads_as_torch_has(monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", setting)
     together = threading.Barrier(3, timeout=30)
     assert len(in_threads(lambda _: together.wait(), range(9))) == 9
 
