@@ -168,7 +168,7 @@ def object_source(source: Source) -> Upload | str:
 
 
 def object_upload(path: Path, *, name: str | None = None) -> Upload:
-    """A zip, a model file (an .obj or .gltf with the files beside it), or a folder with one.
+    """A zip, a model file (an .obj or .gltf with the files it names), or a folder with one.
 
     name: to store it under; default: the file's. Raises ``ObjectError``.
     """

@@ -1,10 +1,15 @@
-"""Model files and classifiers on this machine, as a user names them: files, folders, and what lies beside them."""
+"""Model files and classifiers on this machine, as a user names them, and the files that a model names."""
 
 import io
 import json
+import os
+import posixpath
+import re
 import zipfile
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+from urllib.parse import unquote
 
 from trompe_shared.errors import ClassifierError, ObjectError
 
@@ -16,10 +21,14 @@ SPLIT_SUFFIXES: Final = {".obj", ".gltf"}
 MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, ".glb", ".fbx", ".ply", ".stl"}
 PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".gif"}
 """Of the formats of textures (``object3d.IMAGE_FORMATS``)."""
+_MTLLIB: Final = re.compile(r"mtllib(?<![^\r\n]mtllib)[ \t]+([^\r\n]+)")
+"""The literal comes first: 50 times as fast as the check for the start of a line."""
+_MAP: Final = re.compile(r"map_|(?:bump|norm|disp|decal|refl)$", re.IGNORECASE)
+"""The first word of an MTL's line with a picture."""
 
 
 def model_file(path: Path) -> tuple[str, bytes | Path]:
-    """(Name, content) of a zip, a model file (an .obj or .gltf with the files beside it), or a folder with one.
+    """(Name, content) of a zip, a model file (an .obj or .gltf with the files it names), or a folder with one.
 
     The content is the path of a single file, or a zip's bytes. Raises ``ObjectError``.
     """
@@ -30,7 +39,7 @@ def model_file(path: Path) -> tuple[str, bytes | Path]:
             f"There is no file {str(path)!r}. Give a zip, a model file, a folder with one, or a stored object's name."
         )
     if path.suffix.lower() in SPLIT_SUFFIXES:
-        return f"{path.stem}.zip", _zip_files([path, *_companions(path)])
+        return f"{path.stem}.zip", _zip_files(path.parent, files_of(path))
     if path.suffix.lower() not in MODEL_SUFFIXES and not zipfile.is_zipfile(path):
         raise ObjectError(f"{str(path)!r} is not a zip archive. Give a zip, a model file, or a folder with one.")
     return path.name, path
@@ -54,10 +63,12 @@ def classes_beside(path: Path) -> list[str] | None:
 
 
 def _zip_folder(folder: Path) -> bytes:
-    files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
-    if not models_in(folder):
+    models = models_in(folder)
+    if not models:
         raise ObjectError(f"The folder {str(folder)!r} holds no .obj, .gltf or other model file.")
-    return _zip_files(files)
+    files = [file.name for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
+    split = [model for model in models if model.suffix.lower() in SPLIT_SUFFIXES]
+    return _zip_files(folder, [*files, *(name for model in split for name in files_of(model))])
 
 
 def models_in(folder: Path) -> list[Path]:
@@ -65,17 +76,133 @@ def models_in(folder: Path) -> list[Path]:
     return [file for file in folder.iterdir() if file.suffix.lower() in MODEL_SUFFIXES]
 
 
-def _companions(mesh: Path) -> list[Path]:
-    """Material files, buffers and pictures beside an .obj or .gltf file."""
-    wanted = {".mtl", ".json", ".bin", *PICTURE_SUFFIXES}
-    return [file for file in mesh.parent.iterdir() if file.is_file() and file.suffix.lower() in wanted]
+def files_of(mesh: Path) -> list[str]:
+    """An .obj or .gltf file and the files it names, also through its materials, as paths below its folder."""
+    folder = mesh.parent
+    if mesh.suffix.lower() == ".gltf":
+        return [mesh.name, *_found(folder, _uris(_json(mesh)))]
+    table = _found(folder, [f"{mesh.stem}_mat_def.json"])
+    mtls = _found(folder, library_names(text_of(mesh.read_bytes())))
+    if not mtls and not table:
+        mtls = _found(folder, [file.name for file in folder.iterdir() if file.suffix.lower() == ".mtl"])
+    maps = [name for file in table for name in _found(folder, _strings(_json(folder / file)))]
+    return list(
+        dict.fromkeys([mesh.name, *table, *mtls, *maps, *(name for mtl in mtls for name in _maps(folder, mtl))])
+    )
 
 
-def _zip_files(files: list[Path]) -> bytes:
-    """A flat zip, sorted by name, with fixed time stamps: the same files give the same bytes."""
+def _maps(folder: Path, mtl: str) -> Iterator[str]:
+    """The pictures of an MTL. A name may contain blanks and follow options, so the longest that exists counts."""
+    for words in map(str.split, re.split(r"[\r\n]+", text_of((folder / mtl).read_bytes()))):
+        if words and _MAP.match(words[0]):
+            names = [" ".join(words[k:]) for k in range(1, len(words))]
+            yield from _found(folder, names, beside=posixpath.dirname(mtl))[:1]
+
+
+def _found(folder: Path, names: Collection[str], *, beside: str = "") -> list[str]:
+    """The files that ``names`` mean, by path below ``folder``: relative to it or to ``beside``, else by last part."""
+    found = []
+    for name in (name.replace("\\", "/") for name in names):
+        paths = [posixpath.join(base, each) for each in (name, posixpath.basename(name)) for base in (beside, "")]
+        files = (_spelled(folder, posixpath.normpath(path)) for path in paths)
+        found += [file for file in files if file is not None][:1]
+    return found
+
+
+def _spelled(folder: Path, path: str) -> str | None:
+    """A file at ``path`` below ``folder``, in any capitals; no link out of it."""
+    here = ""
+    for part in path.split("/"):
+        found = named(part, os.listdir(folder / here)) if (folder / here).is_dir() else None
+        if found is None:
+            return None
+        here = posixpath.join(here, found)
+    inside = (folder / here).resolve().is_relative_to(folder.resolve())
+    return here if inside and (folder / here).is_file() else None
+
+
+def _json(file: Path) -> Any:
+    """The file's JSON; ``None`` for a malformed one, which its reader will refuse."""
+    try:
+        return json.loads(file.read_bytes())
+    except (ValueError, RecursionError):
+        return None
+
+
+def _uris(document: Any) -> list[str]:
+    """The files that a glTF names."""
+    tables = [document.get(kind) for kind in ("buffers", "images")] if isinstance(document, dict) else []
+    entries = [entry for table in tables if isinstance(table, list) for entry in table if isinstance(entry, dict)]
+    uris = [uri for entry in entries if isinstance(uri := entry.get("uri"), str)]
+    return [unquote(uri) for uri in uris if not uri.startswith("data:")]
+
+
+def _strings(table: Any) -> list[str]:
+    """The file names in a material definition."""
+    materials = table.values() if isinstance(table, dict) else ()
+    return [name for maps in materials if isinstance(maps, dict) for name in maps.values() if isinstance(name, str)]
+
+
+def text_of(data: bytes) -> str:
+    """The text of an OBJ or MTL file."""
+    return data.decode(encoding_of(data))
+
+
+def encoding_of(data: bytes) -> str:
+    """UTF-8 with or without byte order mark, else Latin-1, which loses no byte."""
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8-sig" if data.startswith(b"\xef\xbb\xbf") else "utf-8"
+
+
+def library_names(text: str) -> list[str]:
+    """The names on the ``mtllib`` lines of an OBJ, several a line; a name may contain blanks."""
+    names = []
+    for line in _MTLLIB.findall(text):
+        words: list[str] = []
+        for word in line.split():
+            words.append(word)
+            if word.lower().endswith(".mtl"):
+                names.append(" ".join(words))
+                words = []
+    return list(dict.fromkeys(names))
+
+
+def libraries(text: str, files: Collection[str]) -> dict[str, str]:
+    """The MTLs among ``files`` (names without folders) that an OBJ names, with their paths there, in that order.
+
+    All MTLs if it names none of them.
+    """
+    beside = [name for name in files if name.lower().endswith(".mtl")]
+    spelled = {name.casefold(): name for name in beside} | {name: name for name in beside}
+    found: dict[str, str] = {}
+    for written in library_names(text):
+        name = written.replace("\\", "/").rsplit("/", 1)[-1]
+        if (file := spelled.get(name, spelled.get(name.casefold()))) is not None:
+            found.setdefault(file, written.removesuffix(name) + file)
+    return found or {name: name for name in beside}
+
+
+def named(name: str, files: Collection[str]) -> str | None:
+    """The file ``name`` among ``files``, or the only one that differs in capitals alone."""
+    if name in files:
+        return name
+    alike = [file for file in files if file.casefold() == name.casefold()]
+    return alike[0] if len(alike) == 1 else None
+
+
+def pack_zip(files: Mapping[str, bytes]) -> bytes:
+    """A deflated zip of ``files`` with fixed time stamps, in the order of the mapping."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for file in sorted(files, key=lambda file: file.name):
-            info = zipfile.ZipInfo(file.name, (1980, 1, 1, 0, 0, 0))
-            archive.writestr(info, file.read_bytes(), compress_type=zipfile.ZIP_DEFLATED, compresslevel=1)
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, data in files.items():
+            stored = zipfile.ZIP_STORED if name.lower().endswith((".png", ".jpg")) else zipfile.ZIP_DEFLATED
+            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data, compress_type=stored)
     return buffer.getvalue()
+
+
+def _zip_files(folder: Path, files: list[str]) -> bytes:
+    """A zip of files below ``folder``, sorted by path: the same files give the same bytes."""
+    return pack_zip({name: (folder / name).read_bytes() for name in sorted(set(files))})

@@ -13,7 +13,7 @@ import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from trompe_shared.errors import ObjectError
+from trompe_shared.local_files import files_of, libraries, named, pack_zip, text_of
 from trompe_shared.wavefront import Part, dissolve, parse_mtl, parse_obj
 
 __all__ = [
@@ -35,14 +36,18 @@ __all__ = [
     "Part",
     "decode_alpha",
     "decode_rgb",
+    "definition_of",
     "encode_png",
     "load_object",
+    "mtl_texts",
     "object_from_files",
     "open_image",
     "pack_zip",
+    "resized",
     "unpack",
     "unpacked_size",
     "unzip",
+    "with_alpha_of",
 ]
 
 MAX_ARCHIVE_BYTES: Final = 512 * 2**20
@@ -149,11 +154,7 @@ class Object3D:
 
     def _repaint(self, name: str, image: Texture) -> bytes:
         """PNG bytes of ``image`` with the alpha channel (opacity) of the replaced file."""
-        alpha = decode_alpha(self.files[name], name)
-        picture = Image.fromarray(image)
-        if alpha is not None and alpha.shape == image.shape[:2]:
-            picture.putalpha(Image.fromarray(alpha))
-        return encode_png(picture)
+        return with_alpha_of(image, decode_alpha(self.files[name], name))
 
     def to_zip(self) -> bytes:
         """The archive as a flat zip; the same content gives the same bytes."""
@@ -166,6 +167,20 @@ def encode_png(image: Image.Image | Texture) -> bytes:
     picture = image if isinstance(image, Image.Image) else Image.fromarray(image)
     picture.save(buffer, "PNG", compress_level=1)
     return buffer.getvalue()
+
+
+def with_alpha_of(rgb: Texture, alpha: Texture | None) -> bytes:
+    """PNG bytes of ``rgb`` with ``alpha`` (h, w), resized if necessary."""
+    if alpha is None:
+        return encode_png(np.ascontiguousarray(rgb))
+    return encode_png(np.dstack([rgb, resized(alpha, (rgb.shape[1], rgb.shape[0]))]))
+
+
+def resized(pixels: Texture, size: tuple[int, int]) -> Texture:
+    """A picture (H, W) or (H, W, 3) at the size (width, height)."""
+    if (pixels.shape[1], pixels.shape[0]) == size:
+        return pixels
+    return np.array(Image.fromarray(np.ascontiguousarray(pixels)).resize(size, Image.Resampling.LANCZOS))
 
 
 @contextmanager
@@ -205,18 +220,8 @@ def decode_alpha(data: bytes, name: str) -> Texture | None:
         return np.array(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
 
 
-def pack_zip(files: Mapping[str, bytes]) -> bytes:
-    """A flat, deflated zip of ``files`` with fixed time stamps, in the order of the mapping."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, data in files.items():
-            stored = zipfile.ZIP_STORED if name.lower().endswith((".png", ".jpg")) else zipfile.ZIP_DEFLATED
-            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data, compress_type=stored)
-    return buffer.getvalue()
-
-
 def load_object(source: bytes | str | Path) -> Object3D:
-    """Read an object from the bytes of a zip, or from the path of a zip, a folder or an OBJ file.
+    """Read an object from the bytes of a zip, or from the path of a zip, a folder, or an OBJ with the files it names.
 
     Raises ``ObjectError`` for a missing, inconsistent or too large object.
     """
@@ -228,8 +233,17 @@ def load_object(source: bytes | str | Path) -> Object3D:
     if not path.is_file():
         raise ObjectError(f"There is no file or folder {str(path)!r}.")
     if path.suffix.lower() == ".obj":
-        return load_object(path.parent)
+        return object_from_files(_with_files(path))
     return object_from_files(unzip(path.read_bytes()))
+
+
+def _with_files(mesh: Path) -> dict[str, bytes]:
+    """An OBJ and the files it names, by name without folders."""
+    names = files_of(mesh)
+    files = {Path(name).name: (mesh.parent / name).read_bytes() for name in names}
+    if len(files) < len(names):
+        raise ObjectError(f"{str(mesh)!r} names files of one name in different folders, {names}; rename one of them.")
+    return files
 
 
 def unzip(data: bytes) -> dict[str, bytes]:
@@ -256,7 +270,8 @@ def unpack(data: bytes) -> dict[str, bytes]:
     common = len(PurePosixPath(commonpath([path.parent for path in paths] or [PurePosixPath()])).parts)
     names = ["/".join(path.parts[common:]) for path in paths]
     if len(set(names)) < len(names):
-        raise ObjectError("The archive holds two files of one name; zip the folder again.")
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ObjectError(f"The archive holds two files of one name, {twice!r}; zip the folder again.")
     try:
         return {name: _read_member(archive, info) for name, info in zip(names, members, strict=True)}
     except _DAMAGED as error:
@@ -302,10 +317,10 @@ def object_from_files(files: Mapping[str, bytes]) -> Object3D:
     """Read an object from the files of its archive. Raises ``ObjectError``."""
     mesh = _mesh_name(files)
     name = mesh[: -len(".obj")]
-    parts = parse_obj(files[mesh].decode("utf-8-sig", "replace"), mesh)
+    parts = parse_obj(text_of(files[mesh]), mesh)
     if not any(np.ptp(part.vertices, axis=0).any() for part in parts):
         raise ObjectError(f"{mesh!r} has no extent: all its corners are in one place.")
-    materials = _materials(name, files)
+    materials = _materials(files, {part.material for part in parts})
     for part in parts:
         if part.material not in materials:
             raise ObjectError(
@@ -346,19 +361,40 @@ def _member(files: Mapping[str, bytes], name: str) -> bytes:
     return files[name]
 
 
-def _materials(name: str, files: Mapping[str, bytes]) -> dict[str, Material]:
-    """Materials of the mat_def file, else of the MTL files."""
-    definition = next((f for f in (f"{name}_mat_def.json", *files) if f in files and f.endswith("_mat_def.json")), None)
-    if definition is not None:
+def definition_of(files: Mapping[str, bytes]) -> str | None:
+    """The name of the mat_def file of the archive's mesh: that of its name, or any without an MTL."""
+    if (own := named(f"{_mesh_name(files)[: -len('.obj')]}_mat_def.json", files)) is not None:
+        return own
+    if any(name.lower().endswith(".mtl") for name in files):
+        return None
+    return next((name for name in files if name.endswith("_mat_def.json")), None)
+
+
+def mtl_texts(files: Mapping[str, bytes]) -> dict[str, str]:
+    """The texts of the MTL files of the archive's mesh, by name; the first to define a material counts."""
+    return {name: text_of(files[name]) for name in libraries(text_of(files[_mesh_name(files)]), files)}
+
+
+def _materials(files: Mapping[str, bytes], used: Collection[str]) -> dict[str, Material]:
+    """Materials of the mat_def file, else of the MTL files; normal maps of the ``used`` ones."""
+    if (definition := definition_of(files)) is not None:
         return _materials_from_json(files[definition], definition)
-    materials = {}
-    for file in files:
-        if file.lower().endswith(".mtl"):
-            for material, maps in parse_mtl(files[file].decode("utf-8-sig", "replace")).items():
-                if "albedo" in maps:
-                    opacity = dissolve(maps, material)
-                    materials[material] = Material(material, maps["albedo"], maps.get("normal"), opacity=opacity)
+    materials: dict[str, Material] = {}
+    for text in mtl_texts(files).values():
+        for name, maps in parse_mtl(text).items():
+            if "albedo" in maps and name not in materials:
+                normal = _normal(maps, files) if name in used else None
+                materials[name] = Material(name, maps["albedo"], normal, opacity=dissolve(maps, name))
     return materials
+
+
+def _normal(maps: Mapping[str, str], files: Mapping[str, bytes]) -> str | None:
+    """The normal map of an MTL's material: ``norm``, or a bump map in colours; a grey one holds heights."""
+    bump = maps.get("bump")
+    if bump is None or "normal" in maps:
+        return maps.get("normal")
+    rgb = decode_rgb(_member(files, bump), bump)
+    return None if (rgb == rgb[..., :1]).all() else bump
 
 
 def _materials_from_json(data: bytes, file: str) -> dict[str, Material]:

@@ -6,7 +6,7 @@ changes nothing else.
 
 import re
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -25,6 +25,18 @@ MAX_LINES: Final = 20_000_000
 """Lines of a file: ten for each triangle."""
 _LINE: Final = re.compile(r"[\r\n]{0,65536}([^\r\n]*)")
 """The end of a line and the next line. The bound on empty lines lets other threads run."""
+_CONTINUED: Final = re.compile(r"\\[ \t]*(?:\r\n|\r|\n)")
+_LONG: Final = re.compile(rf"(?<![^\r\n])[fv][^\r\n#\\]*(?:{_CONTINUED.pattern}[^\r\n#\\]*)+")
+"""A statement of numbers that a backslash continues on the next line; comments may end in one, too."""
+_JOINT: Final = " \v"
+"""Stands for the end of a continued line, so that lines can be counted."""
+_NUMBER: Final = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
+_OPTION: Final = re.compile(
+    r"-(?:(?:blend[uv]|boost|bm|cc|clamp|imfchan|texres|type)\s+\S+|mm\s+\S+\s+\S+|"
+    rf"[ost](?:\s+{_NUMBER}(?=\s)){{1,3}})\s+",
+    re.IGNORECASE,
+)
+"""An option before the file name of a map, with its values."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +83,8 @@ class _Reader:
         self._triangles = 0
 
     def read(self, text: str) -> None:
+        if _CONTINUED.search(text):
+            text = _LONG.sub(lambda statement: _CONTINUED.sub(_JOINT, statement[0]), text)
         for count, found in enumerate(_LINE.finditer(text)):  # a list of all lines would take many times the memory
             line = found[1]
             if count == MAX_LINES:
@@ -91,6 +105,8 @@ class _Reader:
                 ) from error
 
     def _statement(self, words: list[str], line: str) -> None:
+        if words[0] != "usemtl" and "#" in line:  # names may contain it
+            words = line.split("#")[0].split() or ["#"]
         if words[0] == "f":
             ring = [self._corner(word) for word in words[1:]]
             if len(ring) < 3:
@@ -104,6 +120,8 @@ class _Reader:
         elif words[0] in self.numbers:
             size = _WIDTHS[words[0]]
             values = [float(word) for word in words[1 : size + 1]]
+            if words[0] == "vt" and len(values) == 1:
+                values.append(0.0)
             if len(values) != size:
                 raise ValueError(f"expected {size} numbers")
             self.numbers[words[0]].extend(values)
@@ -129,7 +147,8 @@ class _Reader:
 
 def _number(line: re.Match[str]) -> int:
     """The number of a line, from 1, for all kinds of line ends."""
-    return 1 + max(line.string.count(end, 0, line.start(1)) for end in "\r\n")
+    text, end = line.string, line.start(1)
+    return 1 + max(text.count(mark, 0, end) for mark in "\r\n") + text.count(_JOINT, 0, end)
 
 
 def parse_obj(text: str, file: str) -> tuple[Part, ...]:
@@ -204,13 +223,13 @@ def _normalised(vectors: NDArray[np.floating], *, fallback: NDArray[np.floating]
     return np.where(lengths > 1e-12, vectors / np.maximum(lengths, 1e-12), fallback).astype(np.float32)
 
 
-def obj_text(parts: tuple[Part, ...], *, library: str | None = None) -> str:
-    """An OBJ text that ``parse_obj`` reads as exactly these parts; ``library`` names its .mtl."""
-    return "".join(_statements(parts, library))
+def obj_text(parts: tuple[Part, ...], *, libraries: Iterable[str] = ()) -> str:
+    """An OBJ text that ``parse_obj`` reads as exactly these parts; ``libraries`` are its MTL files."""
+    return "".join(_statements(parts, libraries))
 
 
-def _statements(parts: tuple[Part, ...], library: str | None) -> Iterator[str]:
-    if library is not None:
+def _statements(parts: tuple[Part, ...], libraries: Iterable[str]) -> Iterator[str]:
+    for library in libraries:
         yield f"mtllib {library}\n"
     first = 1
     for part in parts:
@@ -226,10 +245,10 @@ def _statements(parts: tuple[Part, ...], library: str | None) -> Iterator[str]:
 def parse_mtl(text: str) -> dict[str, dict[str, str]]:
     """Maps of each material of an MTL text: ``{name: {"albedo": file, "normal": file}}``, files without folders.
 
-    Transparent materials have ``map_d`` (a file), ``d`` or ``tr`` (numbers), too; see ``dissolve``. Raises
-    ``ObjectError`` for a map that is scaled or moved.
+    ``bump`` maps normals or heights. Transparent materials have ``map_d`` (a file), ``d`` or ``tr`` (numbers), too;
+    see ``dissolve``. Raises ``ObjectError`` for a map that is scaled or moved.
     """
-    keys = {"map_kd": "albedo", "map_bump": "normal", "bump": "normal", "norm": "normal"}
+    keys = {"map_kd": "albedo", "map_bump": "bump", "bump": "bump", "norm": "normal", "map_kn": "normal"}
     keys |= {key: key for key in ("map_d", "d", "tr")}
     materials: dict[str, dict[str, str]] = {}
     current: dict[str, str] = {}
@@ -240,9 +259,8 @@ def parse_mtl(text: str) -> dict[str, dict[str, str]]:
         if words[0] == "newmtl":
             current = materials.setdefault(words[1].strip(), {})
         elif words[0].lower() in keys:
-            # Options (-bm 1.0) precede the file name, then the last word. A name with blanks has no options.
-            name = words[1].strip() if not words[1].startswith("-") else words[1].split()[-1]
-            if _moves(words[1].removesuffix(name)):
+            options, name = _split(words[1].strip())
+            if _moves(options):
                 raise ObjectError(
                     f"The MTL scales or moves the texture {name!r} ({words[1].strip()[:80]}), which is not supported; "
                     "apply that to the texture coordinates in a modelling program."
@@ -251,9 +269,19 @@ def parse_mtl(text: str) -> dict[str, dict[str, str]]:
     return materials
 
 
+def _split(words: str) -> tuple[str, str]:
+    """(Options, file name) of a map. The name may contain blanks, but not after options unknown here."""
+    start = 0
+    while (option := _OPTION.match(words, start)) is not None:
+        start = option.end()
+    if words.startswith("-", start):
+        start = len(words) - len(words.split()[-1])
+    return words[:start], words[start:]
+
+
 def _moves(options: str) -> bool:
     """Whether the options of a map change its scale (``-s``, by default 1 1 1) or its place (``-o``, 0 0 0)."""
-    given = re.findall(r"-([so])((?:\s+[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:e[-+]?\d+)?)+)", options.lower())
+    given = re.findall(rf"-([so])((?:\s+{_NUMBER})+)", options.lower())
     return any(float(number) != (flag == "s") for flag, numbers in given for number in numbers.split())
 
 

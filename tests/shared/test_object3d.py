@@ -82,10 +82,82 @@ def test_a_zip_a_folder_and_the_obj_itself_are_the_same_object(tmp_path: Path) -
     archive.write_bytes(zipped(FILES))
     in_a_folder = zipped({f"things/my thing/{name}": data for name, data in FILES.items()})
     littered = zipped(FILES | {"__MACOSX/._thing.obj": b"finder", "empty/": b""})
-    sources: list[bytes | str | Path] = [folder, str(folder), folder / "thing.obj", archive, in_a_folder, littered]
+    sources: list[bytes | str | Path] = [folder, str(folder), archive, in_a_folder, littered]
     assert {(obj.name, frozenset(obj.files.items())) for obj in map(load_object, sources)} == {
         ("thing", frozenset(FILES.items()))
     }
+    (folder / "other.obj").write_bytes(b"")
+    assert load_object(folder / "thing.obj").files == with_files(readme__txt=None)
+    (folder / "subfolder/paint.png").write_bytes(b"")
+    (folder / "thing.mtl").write_bytes(b"norm subfolder/paint.png")
+    assert "subfolder/paint.png" in refusal(folder / "thing.obj")
+
+
+LIBRARY = b"newmtl paint\nmap_Kd paint.png\n"
+OTHER = b"newmtl paint\nmap_Kd other.png\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "mtls"),
+    [
+        pytest.param("mtllib thing.mtl", {"thing.mtl": LIBRARY, "table.mtl": OTHER}, id="one"),
+        pytest.param(
+            "# mtllib table.mtl\nmtllib ./a/Thing.mtl", {"table.mtl": OTHER, "thing.mtl": LIBRARY}, id="folder"
+        ),
+        pytest.param(
+            "mtllib my thing.mtl b.mtl", {"b.mtl": OTHER, "my thing.mtl": LIBRARY, "c.mtl": OTHER}, id="several"
+        ),
+        pytest.param("mtllib b.mtl\nmtllib a.mtl", {"a.mtl": OTHER, "b.mtl": LIBRARY}, id="the first counts"),
+        pytest.param("mtllib gone.mtl", {"thing.mtl": LIBRARY, "table.mtl": b"newmtl x"}, id="none is there"),
+        pytest.param(
+            "", {"thing.mtl": LIBRARY, "table_mat_def.json": b'{"x": {"albedo": "x.png"}}'}, id="foreign mat_def"
+        ),
+    ],
+)
+def test_a_mesh_has_the_materials_that_it_names(line: str, mtls: dict[str, bytes]) -> None:
+    mesh = MESH.replace("mtllib thing.mtl", line).encode()
+    files = with_files(thing_mat_def__json=None, thing__obj=mesh) | mtls
+    assert object_from_files(files).materials["paint"].albedo == "paint.png"
+
+
+def test_materials_in_latin_1_stay_apart() -> None:
+    mesh = MESH.replace("usemtl paint", "usemtl M\xe9") + "usemtl M\xe8\nf 1/1 2/2 3/3\n"
+    mtl = "newmtl M\xe9\nmap_Kd paint.png\nnewmtl M\xe8\nmap_Kd b.png\n"
+    texts = {"thing.obj": mesh.encode("latin-1"), "thing.mtl": mtl.encode("latin-1"), "b.png": FILES["paint.png"]}
+    obj = object_from_files(with_files(thing_mat_def__json=None) | texts)
+    assert {name: each.albedo for name, each in obj.materials.items()} == {"M\xe9": "paint.png", "M\xe8": "b.png"}
+
+
+@pytest.mark.parametrize(
+    ("key", "colour", "normal"),
+    [
+        pytest.param("map_Bump", (128, 128, 128), None, id="heights"),
+        pytest.param("bump", (128, 128, 255), "n.png", id="normals"),
+        pytest.param("norm", (128, 128, 128), "n.png", id="norm"),
+        pytest.param("map_Kn", (128, 128, 255), "n.png", id="map_Kn"),
+    ],
+)
+def test_a_grey_bump_map_has_heights_and_is_no_normal_map(
+    key: str, colour: tuple[int, ...], normal: str | None
+) -> None:
+    picture = encode_png(np.full((2, 2, 3), colour, np.uint8))
+    obj = object_from_files(
+        with_files(thing_mat_def__json=None, thing__mtl=LIBRARY + f"{key} n.png".encode(), n__png=picture)
+    )
+    assert obj.materials["paint"].normal == normal
+    assert obj.files["n.png"] == picture
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ("-clamp on my tex.png", "my tex.png"),
+        ("-bm 1.0 -o 0 0 -mm 0 1 -imfchan r maps\\my 2 tex.png ", "my 2 tex.png"),
+        ("-unknown my tex.png", "tex.png"),
+    ],
+)
+def test_options_of_a_map_are_no_part_of_its_name(words: str, name: str) -> None:
+    assert parse_mtl(f"newmtl m\nmap_Kd {words}\n") == {"m": {"albedo": name}}
 
 
 def test_an_mtl_replaces_a_missing_material_definition() -> None:
@@ -164,6 +236,19 @@ def test_computed_normals_are_smooth_across_a_shared_edge() -> None:
         np.testing.assert_allclose(np.linalg.norm(only_part(mesh)[1], axis=2), 1, atol=1e-6)
 
 
+def test_long_lines_comments_and_single_texture_coordinates_are_read() -> None:
+    mesh = (
+        MESH.replace("f 1/1 2/2 3/3", "f 1/1 \\\n2/2 \\\r\n 3/3 # three")
+        .replace("vt 0 0", "vt 0 # u")
+        .replace("v 0 1 0", "v 0 1 0#")
+    )
+    mesh = mesh.replace("# a triangle", "# C:\\")
+    np.testing.assert_array_equal(only_part(mesh)[0], only_part(MESH)[0])
+    with pytest.raises(ObjectError, match="line 13: 'f 9'"):
+        parse_obj(mesh + "f 9", "thing.obj")
+    assert parse_obj(MESH.replace("paint", "Material #25"), "thing.obj")[0].material == "Material #25"
+
+
 @pytest.mark.parametrize("mode", ["L", "LA", "P", "RGB", "RGBA", "1"])
 def test_images_of_every_mode_are_read_as_rgb(mode: str) -> None:
     """Transparent pixels keep the colour that they have beneath."""
@@ -233,6 +318,8 @@ def test_a_repainted_texture_keeps_its_opacity_and_may_change_its_size(mode: str
         assert (np.array(image.convert("RGB")) == 255 - PAINT).all()
     resized = obj.with_textures({"paint.png": np.full((1, 1, 3), 7, np.uint8)})
     assert load_object(resized.to_zip()).textures["paint.png"].tolist() == [[[7, 7, 7]]]
+    with Image.open(io.BytesIO(resized.files["paint.png"])) as image:
+        assert 0 < np.array(image.getchannel("A"))[0, 0] < 230
 
 
 # What is refused

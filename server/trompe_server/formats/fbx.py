@@ -16,11 +16,11 @@ import numpy as np
 
 from trompe_server.formats.assembly import assemble, repainted, safe_name
 from trompe_server.formats.fbx_tree import MAGIC, Tree, parse_tree
-from trompe_server.formats.pictures import decode, with_alpha_of
+from trompe_server.formats.pictures import decode
 from trompe_server.formats.upload import Upload, base_name
 from trompe_server.formats.wavefront import complete, dissolved
 from trompe_shared.errors import ObjectError
-from trompe_shared.object3d import Object3D, object_from_files
+from trompe_shared.object3d import Object3D, object_from_files, with_alpha_of
 
 CENTIMETRE: Final = 0.01
 """Metres of FBX's default unit."""

@@ -20,13 +20,12 @@ from trompe_server.formats.pictures import (
     scaled_normals,
     shrink,
     tinted,
-    with_alpha_of,
 )
 from trompe_server.formats.unwrap import Unwrapped, bake, unwrap
 from trompe_server.formats.upload import Upload, base_name
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Material as Maps
-from trompe_shared.object3d import Object3D, encode_png
+from trompe_shared.object3d import Object3D, encode_png, with_alpha_of
 from trompe_shared.wavefront import Part
 
 Key = tuple[int, int]
@@ -92,8 +91,6 @@ class Model:
 
     def _read_mesh(self, index: int) -> None:
         mesh = at(self.document.meshes, index, "mesh")
-        if any(mesh.weights):
-            raise ObjectError("The glTF blends morph targets, which are not supported; apply them and export it again.")
         for number, primitive in enumerate(mesh.primitives):
             if primitive.mode >= 4:
                 self.shapes[index, number] = read_shape(self.container, primitive)

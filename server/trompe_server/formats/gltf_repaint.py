@@ -8,9 +8,10 @@ its triangles stay.
 import base64
 import copy
 import json
+import posixpath
 from collections.abc import Iterator
 from typing import Final
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +21,10 @@ from trompe_server.formats.gltf import Model, Slot, load
 from trompe_server.formats.gltf_container import BIN_CHUNK, Container, split_glb
 from trompe_server.formats.gltf_shapes import Shape
 from trompe_server.formats.gltf_write import Json, Writer, append, glb
-from trompe_server.formats.pictures import Pixels, decode, with_alpha_of
+from trompe_server.formats.pictures import Pixels, decode
 from trompe_server.formats.unwrap import Unwrapped
 from trompe_server.formats.upload import Upload
-from trompe_shared.object3d import Object3D
+from trompe_shared.object3d import Object3D, with_alpha_of
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
@@ -158,6 +159,9 @@ class _Editor(Writer):
                 dropped |= others
                 _keep(texture, "extensions", {k: v for k, v in texture["extensions"].items() if k not in others})
         unused = dropped.difference(*map(_encodings, textures))
+        self._unlist(unused)
+
+    def _unlist(self, unused: set[str]) -> None:
         for key in {"extensionsUsed", "extensionsRequired"} & self.document.keys():
             _keep(self.document, key, [name for name in self.document[key] if name not in unused])
 
@@ -176,7 +180,7 @@ class _Editor(Writer):
         view = views[entry["bufferView"]]
         start = view.get("byteOffset", 0)
         end = start + view["byteLength"]
-        others = [other for other in views if other is not view and other["buffer"] == view["buffer"]]
+        others = [o for other in views for o in _ranges(other) if o is not view and o["buffer"] == view["buffer"]]
         overlaps = any(
             o.get("byteOffset", 0) < end and o.get("byteOffset", 0) + o["byteLength"] > start for o in others
         )
@@ -213,6 +217,11 @@ class _Editor(Writer):
         primitive["attributes"]["TEXCOORD_0"] = self.add_uvs(cut.uvs)
         primitive["indices"] = self.add_corners(cut.faces)
         primitive["mode"] = 4
+        if _extensions(primitive).pop(DRACO, None) is not None:
+            _keep(primitive, "extensions", primitive["extensions"])
+            primitives = [each for mesh in self.document["meshes"] for each in mesh["primitives"]]
+            if not any(DRACO in _extensions(each) for each in primitives):
+                self._unlist({DRACO})
 
     def _gather(self, index: int, source: NDArray[np.int64]) -> int:
         accessor = self.document["accessors"][index]
@@ -255,6 +264,8 @@ class _Editor(Writer):
 
 
 _BYTES: Final = "application/octet-stream"
+DRACO: Final = "KHR_draco_mesh_compression"
+"""Holds a compressed copy of a primitive."""
 
 
 def _dumped(document: Json, before: bytes) -> bytes:
@@ -269,7 +280,23 @@ def _data_uri(data: bytes | bytearray, kind: str) -> str:
 
 
 def _source(image: Json) -> tuple[object, object]:
-    return image.get("uri"), image.get("bufferView")
+    """What two images of one file have in common."""
+    uri = image.get("uri")
+    if uri is not None and not uri.startswith("data:"):
+        uri = posixpath.normpath(unquote(uri).replace("\\", "/")).casefold()
+    return uri, image.get("bufferView")
+
+
+def _extensions(entry: Json) -> Json:
+    found = entry.get("extensions")
+    return found if isinstance(found, dict) else {}
+
+
+def _ranges(view: Json) -> list[Json]:
+    """The ranges of a buffer view, also that of its compressed copy (``EXT_meshopt_compression``)."""
+    keys = ("buffer", "byteOffset", "byteLength")
+    copies = (each for each in _extensions(view).values() if isinstance(each, dict) and "buffer" in each)
+    return [view, *(each for each in copies if all(isinstance(each.setdefault(key, 0), int) for key in keys))]
 
 
 def _users_of_images(document: Json) -> dict[int, set[int | str]]:
@@ -304,7 +331,7 @@ def _keep(entry: Json, key: str, left: Json | list[str]) -> None:
 
 def _encodings(texture: Json) -> dict[str, int]:
     """Extensions of a texture that name an image, with its number."""
-    found = texture.get("extensions", {}).items()
+    found = _extensions(texture).items()
     return {k: v["source"] for k, v in found if isinstance(v, dict) and isinstance(v.get("source"), int)}
 
 

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, AliasPath, BaseModel, ConfigDict, Field
 from pydantic.alias_generators import to_camel
 
 from trompe_shared.wavefront import MAX_FACES
@@ -21,7 +21,8 @@ MAX_NODES: Final = 100_000
 Index = Annotated[int, Field(ge=0, lt=2**31)]
 Size = Annotated[int, Field(ge=0, lt=2**40)]
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
-Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+Unit = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6), AfterValidator(lambda value: min(max(value, 0.0), 1.0))]
+"""From 0 to 1, up to rounding."""
 Pair = tuple[Number, Number]
 Triple = tuple[Number, Number, Number]
 Quadruple = tuple[Number, Number, Number, Number]
@@ -130,29 +131,17 @@ class Image(_Part):
     name: str | None = None
 
 
-class Encoding(_Part):
-    """The same image in another encoding."""
-
-    source: Index | None = None
-
-
-class Encodings(_Part):
-    """Extensions of a texture that name its image."""
-
-    webp: Encoding = Field(default=Encoding(), alias="EXT_texture_webp")
-
-
 class Texture(_Part):
     """An image with a sampler."""
 
     source: Index | None = None
     sampler: Index | None = None
-    extensions: Encodings = Encodings()
+    webp: Index | None = Field(default=None, validation_alias=AliasPath("extensions", "EXT_texture_webp", "source"))
 
     @property
     def image(self) -> Index | None:
         """The image in an encoding that is read."""
-        return self.extensions.webp.source if self.source is None else self.source
+        return self.webp if self.source is None else self.source
 
 
 class Sampler(_Part):
@@ -171,24 +160,20 @@ class UvTransform(_Part):
     tex_coord: Index | None = None
 
 
-class TextureExtensions(_Part):
-    """Extensions of a texture's use."""
-
-    transform: UvTransform | None = Field(default=None, alias="KHR_texture_transform")
-
-
 class TextureInfo(_Part):
     """The use of a texture; ``scale`` is that of a normal map."""
 
     index: Index
     tex_coord: Index = 0
     scale: Number = 1.0
-    extensions: TextureExtensions = TextureExtensions()
+    transform: UvTransform | None = Field(
+        default=None, validation_alias=AliasPath("extensions", "KHR_texture_transform")
+    )
 
     @property
     def placement(self) -> tuple[int, UvTransform]:
         """The set of texture coordinates and their transform."""
-        transform = self.extensions.transform or UvTransform()
+        transform = self.transform or UvTransform()
         return (self.tex_coord if transform.tex_coord is None else transform.tex_coord), transform
 
 
@@ -202,12 +187,6 @@ class Pbr(_Part):
     metallic_roughness_texture: TextureInfo | None = None
 
 
-class MaterialExtensions(_Part):
-    """The extension of a material that replaces its base colour."""
-
-    specular_glossiness: Any = Field(default=None, alias="KHR_materials_pbrSpecularGlossiness")
-
-
 class Material(_Part):
     """The supported properties of a material."""
 
@@ -217,12 +196,14 @@ class Material(_Part):
     alpha_mode: Literal["OPAQUE", "MASK", "BLEND"] = "OPAQUE"
     alpha_cutoff: Annotated[float, Field(ge=0.0, le=1e3)] = 0.5
     double_sided: bool = False
-    extensions: MaterialExtensions = MaterialExtensions()
+    specular_glossiness: Any = Field(
+        default=None, validation_alias=AliasPath("extensions", "KHR_materials_pbrSpecularGlossiness")
+    )
 
     @property
     def colour_unread(self) -> bool:
         """Whether only the older specular-glossiness extension tells the colour."""
-        return self.extensions.specular_glossiness is not None and self.pbr == Pbr()
+        return self.specular_glossiness is not None and self.pbr == Pbr()
 
     @property
     def maps(self) -> tuple[TextureInfo, ...]:

@@ -46,7 +46,7 @@ def instances(document: Document) -> Iterator[tuple[int, Matrix]]:
         node = at(document.nodes, index, "node")
         matrix = above @ _local(node)
         if node.mesh is not None:
-            if node.skin is not None or any(node.weights):
+            if node.skin is not None or any(node.weights or at(document.meshes, node.mesh, "mesh").weights):
                 raise ObjectError("The glTF has skins or morph targets; apply them and export it again.")
             triangles += count_of(node.mesh)
             if triangles > MAX_FACES:

@@ -8,9 +8,8 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
 
-from trompe_shared.object3d import decode_alpha, decode_rgb, encode_png
+from trompe_shared.object3d import decode_alpha, decode_rgb, resized
 
 Pixels = NDArray[np.uint8]
 
@@ -36,21 +35,12 @@ def decode(data: bytes, name: str) -> tuple[Pixels, Pixels | None]:
 
 
 def shrink(pixels: Pixels, side: int | None) -> Pixels:
-    """The image with its longer side at most ``side``; filters each channel alone, as channels may be unrelated."""
+    """The image with its longer side at most ``side``."""
     height, width = pixels.shape[:2]
     if side is None or max(height, width) <= side:
         return pixels
     size = max(1, round(width * side / max(height, width))), max(1, round(height * side / max(height, width)))
-    return _resized(pixels, size)
-
-
-def _resized(pixels: Pixels, size: tuple[int, int]) -> Pixels:
-    channels = pixels[..., None] if pixels.ndim == 2 else pixels
-    filtered = [
-        np.array(Image.fromarray(np.ascontiguousarray(channels[..., k])).resize(size, Image.Resampling.LANCZOS))
-        for k in range(channels.shape[2])
-    ]
-    return filtered[0] if pixels.ndim == 2 else np.stack(filtered, axis=-1)
+    return resized(pixels, size)
 
 
 def tinted(rgb: Pixels, factor: Sequence[float]) -> Pixels:
@@ -65,6 +55,8 @@ def cutout_alpha(alpha: Pixels, *, factor: float, cutoff: float) -> Pixels:
 
     Scaling, not thresholding, keeps the filtering of the edge.
     """
+    if cutoff == 0:
+        return np.full_like(alpha, 255)
     scale = factor * 0.5 / max(cutoff, 1e-3)
     table = np.asarray(np.rint(np.minimum(np.arange(256) * scale, 255)), np.uint8)
     return table[alpha]
@@ -85,12 +77,3 @@ def scaled_normals(pixels: Pixels, scale: float) -> Pixels:
     vectors[..., :2] *= scale
     lengths = np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-6)
     return np.asarray(np.rint((vectors / lengths + 1) * 127.5), np.uint8)
-
-
-def with_alpha_of(rgb: Pixels, alpha: Pixels | None) -> bytes:
-    """PNG bytes of ``rgb`` with ``alpha`` (h, w), resized if necessary."""
-    if alpha is None:
-        return encode_png(np.ascontiguousarray(rgb))
-    size = (rgb.shape[1], rgb.shape[0])
-    fitted = alpha if alpha.shape == rgb.shape[:2] else _resized(alpha, size)
-    return encode_png(np.dstack([rgb, fitted]))

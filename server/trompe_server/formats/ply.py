@@ -21,16 +21,16 @@ from trompe_server.formats.assembly import (
     repainted,
     safe_name,
 )
-from trompe_server.formats.pictures import decode, with_alpha_of
 from trompe_server.formats.upload import Upload, refusing
 from trompe_shared.errors import ObjectError
-from trompe_shared.object3d import Material, Object3D, encode_png
+from trompe_shared.object3d import Material, Object3D, decode_alpha, encode_png, with_alpha_of
 from trompe_shared.wavefront import MAX_FACES, Part, Surface, smooth_normals
 
 MATERIAL: Final = "surface"
 WHITE: Final = (1.0, 1.0, 1.0)
 MAX_HEADER: Final = 2**16
 REMEDY: Final = "Save it again as triangles, binary or text."
+HEADER: Final = re.compile(rb"ply(?:\r?\n.*?^end_header\r?\n|\r[^\n]*?\rend_header\r)", re.DOTALL | re.MULTILINE)
 ELEMENT: Final = re.compile(rb"^element +(\w+) +(\d{1,18})\s*\n((?:(?!element|end_header).*\n)*)", re.MULTILINE)
 PROPERTY: Final = re.compile(rb"^property +(?:list +(\w+) +)?(\w+) +(\S+)", re.MULTILINE)
 TYPES: Final = {"char": "i1", "uchar": "u1", "int": "i4", "uint": "u4", "float": "f4"}
@@ -39,26 +39,26 @@ TYPES: Final = {"char": "i1", "uchar": "u1", "int": "i4", "uint": "u4", "float":
 
 @dataclass(frozen=True)
 class _Header:
-    """texture: file name of the texture, if any. corner_uvs: whether faces list the coordinates of their corners."""
+    """size: bytes in the file. textures: their file names. corner_uvs: whether faces list the coordinates of their
+    corners."""
 
     text: bytes
+    size: int
     rows: int
-    texture: str | None
+    textures: tuple[str, ...]
     corner_uvs: bool
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
     """``upload`` with the texture of ``painted``: replaces its texture file, or adds one to a new PLY."""
-    original = read(upload)
+    original, texture = _read(upload)
     changed = repainted(original, painted)
     if not changed:
         return upload
     ((name, rgb),) = changed.items()
-    texture = _header(upload.data).texture
     if texture is not None:
-        path = upload.beside(texture)
-        alpha = decode(upload.files[path], texture)[1]
-        return Upload(upload.main, {**upload.files, path: with_alpha_of(rgb, alpha)}, upload.packed)
+        alpha = decode_alpha(upload.files[texture], texture)
+        return Upload(upload.main, {**upload.files, texture: with_alpha_of(rgb, alpha)}, upload.packed)
     (part,) = original.parts
     place = free_name(name, upload.flat())
     return upload.with_flat({upload.main.rsplit("/", 1)[-1]: _written(part, place), place: encode_png(rgb)})
@@ -66,41 +66,57 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
 
 def read(upload: Upload) -> Object3D:
     """Read a PLY and the texture beside it. Raises ``ObjectError``."""
+    return _read(upload)[0]
+
+
+def _read(upload: Upload) -> tuple[Object3D, str | None]:
+    """The object and the path of its texture; ``None`` without a texture or without texture coordinates."""
     header = _header(upload.data)
     surface = _surface(upload.data, header)
-    if header.texture is None or surface.uvs is None:
-        return painted_object(upload.stem, surface, DEFAULT_COLOUR if surface.colours is None else WHITE)
-    file = safe_name(header.texture, default="texture.png")
+    if not header.textures or surface.uvs is None:
+        return painted_object(upload.stem, surface, DEFAULT_COLOUR if surface.colours is None else WHITE), None
+    if len(header.textures) > 1:
+        raise ObjectError(
+            f"The PLY has {len(header.textures)} textures, {', '.join(header.textures)[:200]}; one is supported. Bake "
+            "them into one, or export it as glTF."
+        )
+    (texture,) = header.textures
+    file, path = safe_name(texture, default="texture.png"), upload.beside(texture)
     part = Part(MATERIAL, surface.vertices, surface.normals, surface.uvs, surface.faces)
-    picture = upload.files[upload.beside(header.texture)]
-    return assemble(safe_name(upload.stem), [part], {MATERIAL: Material(MATERIAL, file)}, {file: picture})
+    materials = {MATERIAL: Material(MATERIAL, file)}
+    return assemble(safe_name(upload.stem), [part], materials, {file: upload.files[path]}), path
 
 
 def _header(data: bytes) -> _Header:
     """Facts of the header that trimesh does not check or tell. Raises ``ObjectError``."""
-    found = re.match(rb"ply\r?\n.*?^end_header\r?\n", data[:MAX_HEADER], re.DOTALL | re.MULTILINE)
+    found = HEADER.match(data[:MAX_HEADER])
     if found is None:
         raise ObjectError("The PLY file has no complete header; save it again.")
-    rows = sum(int(element[2]) for element in ELEMENT.finditer(found[0]))
+    text = found[0].replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    rows = sum(int(element[2]) for element in ELEMENT.finditer(text))
     if rows > 3 * MAX_FACES:
         raise ObjectError(f"The PLY's header announces {rows} rows; at most {3 * MAX_FACES} are read.")
-    if b"format ascii" in found[0] and len(data[len(found[0]) :].splitlines()) < rows:
+    if b"format ascii" in text and len(_lines(data[found.end() :])) < rows:
         raise ObjectError(f"The PLY file ends too early: its header announces {rows} rows; save it again.")
-    texture = re.search(rb"^comment TextureFile +(.+?)\s*$", found[0], re.MULTILINE)
-    name = texture[1].decode("utf-8", "replace") if texture is not None else None
-    return _Header(found[0], rows, name, b" texcoord" in found[0])
+    names = dict.fromkeys(re.findall(rb"^comment TextureFile +(.+?)\s*$", text, re.MULTILINE))
+    textures = tuple(name.decode("utf-8", "replace") for name in names)
+    return _Header(text, found.end(), rows, textures, b" texcoord" in text)
+
+
+def _lines(rows: bytes) -> list[bytes]:
+    return [line for line in rows.splitlines() if line.strip()]
 
 
 def _regular(data: bytes, header: _Header) -> bytes:
     """``data`` as trimesh reads it: nothing after the last row, polygons of one size in a binary file."""
-    text, position, body = header.text, len(header.text), []
+    text, position, body = header.text, header.size, []
     if b"format ascii" in text:
-        return text + b"\n".join(data[position:].splitlines()[: header.rows])
+        return text + b"\n".join(_lines(data[position:])[: header.rows])
     order = ">" if b"format binary_big_endian" in text else "<"
     for element in ELEMENT.finditer(header.text):
         polygons, end = _polygons(data, position, element, order)
         if len({len(polygon) for polygon in polygons}) > 1:
-            if header.corner_uvs and header.texture is not None:
+            if header.corner_uvs and header.textures:
                 raise ObjectError(f"The PLY has texture coordinates of polygons of different sizes. {REMEDY}")
             faces = np.array([(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)])
             announced = f"element face {len(faces)}\nproperty list uchar int vertex_indices\n"
@@ -139,7 +155,7 @@ def _dtype(name: bytes, order: str) -> np.dtype[Any]:
 
 
 def _surface(data: bytes, header: _Header) -> Surface:
-    split = header.corner_uvs and header.texture is not None
+    split = header.corner_uvs and bool(header.textures)
     with refusing("The PLY file", remedy=REMEDY), np.errstate(over="ignore"):
         from trimesh.exchange.ply import load_ply  # takes a second to import
         from trimesh.geometry import triangulate_quads

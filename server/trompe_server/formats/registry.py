@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from trompe_server.formats import fbx, gltf, gltf_repaint, ply, stl, wavefront
-from trompe_server.formats.upload import Upload
+from trompe_server.formats.upload import Upload, is_litter
 from trompe_shared.errors import ObjectError
-from trompe_shared.object3d import MAX_ARCHIVE_BYTES, Object3D, unpack
+from trompe_shared.object3d import MAX_ARCHIVE_BYTES, Object3D, definition_of, unpack
 
 
 def _reduced(read: Callable[[Upload], Object3D]) -> Callable[[Upload, int | None], Object3D]:
@@ -68,7 +68,7 @@ def read_object(data: bytes, *, name: str, max_texture: int | None = None) -> Im
     max_texture: longest side of a texture; larger ones are reduced. Raises ``ObjectError``.
     """
     upload, found = _opened(data, name)
-    sailenv = found.name == "obj" and any(path.endswith("_mat_def.json") for path in upload.files)
+    sailenv = found.name == "obj" and definition_of(upload.flat()) is not None
     return Imported(found.read(upload, max_texture), "sailenv" if sailenv else found.name)
 
 
@@ -97,7 +97,7 @@ def _recognised(data: bytes, name: str) -> Format:
     for beginning, format in _BEGINNINGS:
         if head.startswith(beginning):
             return by_name[format]
-    if stl.looks_binary(data) or head.startswith(b"solid"):
+    if stl.looks_binary(data) or head.lower().startswith(b"solid") or name.lower().endswith(".stl"):
         return by_name["stl"]
     if name.lower().endswith(".obj"):
         return by_name["obj"]
@@ -109,7 +109,7 @@ def _recognised(data: bytes, name: str) -> Format:
 
 def _in_archive(files: Mapping[str, bytes]) -> tuple[Upload, Format]:
     for format in FORMATS:
-        meshes = sorted(path for path in files if path.lower().endswith(format.endings))
+        meshes = sorted(path for path in files if path.lower().endswith(format.endings) and not is_litter(path))
         if len(meshes) > 1:
             raise ObjectError(f"The archive contains several models, {meshes[:8]}; send them one by one.")
         if meshes:

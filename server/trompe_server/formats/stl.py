@@ -19,7 +19,12 @@ TRIANGLE: Final = 50
 
 def looks_binary(data: bytes) -> bool:
     """Whether ``data`` has the length of a binary STL with as many triangles as its header announces."""
-    return len(data) >= HEADER and len(data) == HEADER + TRIANGLE * int.from_bytes(data[80:HEADER], "little")
+    return len(data) == _end(data)
+
+
+def _end(data: bytes) -> int:
+    """The length of a binary STL with this header."""
+    return HEADER + TRIANGLE * int.from_bytes(data[80:HEADER], "little")
 
 
 def read(upload: Upload) -> Object3D:
@@ -40,10 +45,13 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
 
 def _corners(data: bytes) -> NDArray[np.float32]:
     """Corners (3 F, 3) of all solids of the file, three for each triangle."""
+    end = _end(data)
     with refusing("The STL file", remedy="Save it again."), np.errstate(over="ignore"):
         from trimesh.exchange.stl import load_stl  # takes a second to import
 
-        loaded = load_stl(io.BytesIO(data))
+        loaded = load_stl(io.BytesIO(data[:end] if end <= len(data) else data))  # bytes may follow the triangles
         solids = loaded["geometry"].values() if "geometry" in loaded else [loaded]
+        if not solids:
+            raise ObjectError("The STL file has no triangles, neither as text nor in binary; save it again.")
         corners: NDArray[np.float32] = np.concatenate([solid["vertices"] for solid in solids]).astype(np.float32)
         return corners

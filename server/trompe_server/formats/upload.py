@@ -2,12 +2,14 @@
 
 import posixpath
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from urllib.parse import unquote
 
 from trompe_shared.errors import ObjectError
+from trompe_shared.local_files import named
 from trompe_shared.object3d import pack_zip
 
 
@@ -47,11 +49,13 @@ class Upload:
         return found
 
     def flat(self) -> dict[str, bytes]:
-        """The files by name without folders. Raises ``ObjectError`` if two names are equal."""
-        names = {base_name(path): data for path, data in self.files.items()}
-        if len(names) < len(self.files):
-            raise ObjectError("Two files in different folders have the same name; rename one of them.")
-        return names
+        """The files by name without folders, but litter. Raises ``ObjectError`` if two names are equal."""
+        paths = [path for path in self.files if not is_litter(path)]
+        count = Counter(map(base_name, paths))
+        if len(count) < len(paths):
+            one, other, *_ = (path for path in paths if count[base_name(path)] > 1)
+            raise ObjectError(f"{one!r} and {other!r} have the same name; rename one of them.")
+        return {base_name(path): self.files[path] for path in paths}
 
     def with_flat(self, files: Mapping[str, bytes]) -> "Upload":
         """The upload with files replaced, by name without folders; new ones go beside the mesh."""
@@ -70,12 +74,9 @@ def base_name(path: str) -> str:
     return path.replace("\\", "/").rsplit("/", 1)[-1]
 
 
-def named(name: str, files: Collection[str]) -> str | None:
-    """The file ``name`` among ``files``, or the only one that differs in capitals alone."""
-    if name in files:
-        return name
-    alike = [file for file in files if file.casefold() == name.casefold()]
-    return alike[0] if len(alike) == 1 else None
+def is_litter(path: str) -> bool:
+    """Whether a file is hidden or a cache of Windows."""
+    return base_name(path).startswith(".") or base_name(path).lower() == "thumbs.db"
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """OBJ with MTL or SAILenv's mat_def: kept if complete, otherwise completed with maps and UVs."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -8,11 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_server.formats.assembly import DEFAULT_COLOUR, free_name, painted_flat, repainted, safe_name
-from trompe_server.formats.pictures import decode, shrink, with_alpha_of
-from trompe_server.formats.upload import Upload, named
+from trompe_server.formats.pictures import decode, shrink
+from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
-from trompe_shared.local_files import PICTURE_SUFFIXES
-from trompe_shared.object3d import Object3D, decode_alpha, decode_rgb, encode_png, object_from_files
+from trompe_shared.local_files import PICTURE_SUFFIXES, encoding_of, libraries, named, text_of
+from trompe_shared.object3d import (
+    Object3D,
+    decode_alpha,
+    decode_rgb,
+    definition_of,
+    encode_png,
+    mtl_texts,
+    object_from_files,
+    with_alpha_of,
+)
 from trompe_shared.wavefront import Part, Surface, obj_text, parse_mtl, parse_surfaces
 
 
@@ -23,15 +31,11 @@ def read(upload: Upload) -> Object3D:
 
 def _completed(upload: Upload) -> Mapping[str, bytes]:
     files = upload.flat()
-    return files if _has_table(files) else complete(files)
+    return complete(files) if definition_of(files) is None else files
 
 
 def _object(files: Mapping[str, bytes]) -> Object3D:
-    return object_from_files(files if _has_table(files) else dissolved(files))
-
-
-def _has_table(files: Mapping[str, bytes]) -> bool:
-    return any(name.endswith("_mat_def.json") for name in files)
+    return object_from_files(dissolved(files) if definition_of(files) is None else files)
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
@@ -66,14 +70,24 @@ def complete(files: Mapping[str, bytes]) -> dict[str, bytes]:
 
 def _spelled(files: Mapping[str, bytes]) -> dict[str, bytes]:
     """``files`` with the capitals of pictures' names in MTLs as in the files' names; Windows takes either."""
-    spelled = dict(files)
-    for library in (name for name in files if name.lower().endswith(".mtl")):
-        text = files[library].decode("utf-8-sig", "replace")
-        for picture in {name for maps in parse_mtl(text).values() for name in maps.values()} - files.keys():
-            if (found := named(picture, files)) is not None:
-                text = re.sub(rf"{re.escape(picture)}(?=\s*$)", found, text, flags=re.MULTILINE)
-                spelled[library] = text.encode()
-    return spelled
+    texts = {
+        name: (text, "".join(_respelled(line, files) for _, line in _lines(text)))
+        for name, text in mtl_texts(files).items()
+    }
+    return dict(files) | {name: _encoded(after, files[name]) for name, (text, after) in texts.items() if after != text}
+
+
+def _respelled(line: str, files: Mapping[str, bytes]) -> str:
+    for picture in parse_mtl(f"newmtl m\n{line}")["m"].values():
+        if (found := named(picture, files)) is not None:
+            before, _, after = line.rpartition(picture)
+            return f"{before}{found}{after}"
+    return line
+
+
+def _encoded(text: str, before: bytes) -> bytes:
+    """``text`` in the encoding of the file ``before`` the change."""
+    return text.encode(encoding_of(before), "replace")
 
 
 def dissolved(files: Mapping[str, bytes]) -> dict[str, bytes]:
@@ -82,9 +96,8 @@ def dissolved(files: Mapping[str, bytes]) -> dict[str, bytes]:
     A ``map_d`` that names the albedo itself means its alpha channel. Raises ``ObjectError`` for an albedo with several.
     """
     masks: dict[str, str] = {}
-    for name, data in files.items():
-        tables = parse_mtl(data.decode("utf-8-sig", "replace")).values() if name.lower().endswith(".mtl") else ()
-        for albedo, mask in ((maps.get("albedo", ""), maps.get("map_d", "")) for maps in tables):
+    for text in mtl_texts(files).values():
+        for albedo, mask in ((maps.get("albedo", ""), maps.get("map_d", "")) for maps in parse_mtl(text).values()):
             if albedo in files and mask in files and masks.setdefault(albedo, mask) != mask:
                 raise ObjectError(
                     f"The MTL gives the texture {albedo!r} two opacities (map_d), {masks[albedo]!r} and {mask!r}. "
@@ -107,11 +120,9 @@ class _Completion:
     def __init__(self, files: dict[str, bytes]) -> None:
         self._files = files
         self._mesh = next(name for name in files if name.lower().endswith(".obj"))
-        self._libraries = {
-            name: data.decode("utf-8-sig", "replace") for name, data in files.items() if name.lower().endswith(".mtl")
-        }
-        self._surfaces = parse_surfaces(files[self._mesh].decode("utf-8-sig", "replace"), self._mesh)
-        self._library = next(iter(self._libraries), f"{self._mesh[:-4]}.mtl")
+        self._text = text_of(files[self._mesh])
+        self._libraries = mtl_texts(files)
+        self._surfaces = parse_surfaces(self._text, self._mesh)
         self._parts: list[Part] = []
         self._rewritten = not self._libraries
 
@@ -123,15 +134,16 @@ class _Completion:
                 replace(surface, material=safe_name(surface.material, default="default")) for surface in self._surfaces
             )
             names = dict.fromkeys(surface.material for surface in self._surfaces)
-            self._libraries = {self._library: "".join(f"newmtl {name}\n" for name in names)}
+            self._libraries = {f"{self._mesh[:-4]}.mtl": "".join(f"newmtl {name}\n" for name in names)}
         texts = dict(self._libraries)
         for surface in self._surfaces:
             self._add(surface)
-        changed = {name: text.encode() for name, text in self._libraries.items() if text != texts[name]}
+        changed = {name: text for name, text in self._libraries.items() if text != texts[name]}
         if self._rewritten:
-            changed |= {name: text.encode() for name, text in self._libraries.items()}
-            changed[self._mesh] = obj_text(tuple(self._parts), library=self._library).encode()
-        return self._files | changed
+            changed |= self._libraries
+            written = libraries(self._text, self._libraries).values()
+            changed[self._mesh] = obj_text(tuple(self._parts), libraries=written)
+        return self._files | {name: _encoded(text, self._files.get(name, b"")) for name, text in changed.items()}
 
     def _refuse_unnamed_pictures(self) -> None:
         """Raise ``ObjectError`` if the mesh is ready for a picture that no material names."""
@@ -143,7 +155,7 @@ class _Completion:
             )
 
     def _add(self, surface: Surface) -> None:
-        maps = {name: found for text in self._libraries.values() for name, found in parse_mtl(text).items()}
+        maps = {name: found for text in reversed(self._libraries.values()) for name, found in parse_mtl(text).items()}
         if surface.material not in maps:
             raise ObjectError(
                 f"{self._mesh!r} uses the undefined material {surface.material!r}; the .mtl defines "

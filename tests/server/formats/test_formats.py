@@ -16,7 +16,7 @@ from tests.small_models import corners, painted, refusal, same_paint, with_pictu
 from trompe_server.formats import FORMATS, import_file, read_object, repaint_file, repaint_limited, write_glb
 from trompe_server.formats.fbx import unit
 from trompe_server.formats.fbx_tree import MAGIC, parse_tree
-from trompe_server.formats.pictures import cutout_alpha, encode_srgb, linear_rgb, shrink, tinted
+from trompe_server.formats.pictures import cutout_alpha, encode_srgb, linear_rgb, tinted
 from trompe_server.formats.unwrap import unwrap
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.errors import ObjectError
@@ -69,6 +69,22 @@ def test_pictures_in_other_capitals_are_found_where_only_one_is_meant() -> None:
     assert (decode_rgb(out["red.png"], "red.png") == painted(obj).textures["red.png"]).all()
 
     assert "Red.PNG" in refusal(pack_zip(files | {"RED.png": encode_png(PICTURE)}), "t.zip")
+
+
+def test_capitals_change_in_whole_names_alone_and_an_mtl_keeps_its_encoding() -> None:
+    mtl = "newmtl red\nmap_Kd \xe9\\a.png\nnewmtl other\nmap_Kd data.png\nmap_d my a.png\n".encode("latin-1")
+    pictures = dict.fromkeys(("A.png", "data.png", "my a.png"), encode_png(PICTURE))
+    files = {"t.obj": OBJ.encode(), "t.mtl": mtl, "table.mtl": b"newmtl red\nmap_Kd DATA.PNG", **pictures}
+    out = unpack(comes_back(pack_zip(files), "t.zip")[1])
+    assert [name for name in files if files[name] != out[name]] == ["t.mtl", "A.png"]
+    assert out["t.mtl"] == mtl.replace(b"\\a.png", b"\\A.png")
+
+
+def test_two_files_of_one_name_are_named_unless_the_system_left_them() -> None:
+    litter = dict.fromkeys(("a/.DS_Store", "b/.DS_Store", "._t.obj", "a/Thumbs.db", "b/Thumbs.db"), b"?")
+    files = {"t.obj": OBJ.encode(), "t.mtl": MTL.encode(), **litter}
+    assert litter.items() <= unpack(comes_back(pack_zip(files), "t.zip")[1]).items()
+    assert "'a/x.txt' and 'b/x.txt'" in refusal(pack_zip(files | {"a/x.txt": b"1", "b/x.txt": b"2"}), "t.zip")
 
 
 def test_an_obj_with_textures_in_a_folder_of_their_own_keeps_its_folders() -> None:
@@ -173,6 +189,16 @@ def test_a_mesh_without_texture_coordinates_is_unwrapped_and_written_anew() -> N
     assert np.ptp(part.uvs, axis=0).min() > 0.2
 
 
+def test_a_mesh_written_anew_keeps_its_encoding_and_names_all_its_mtls() -> None:
+    mesh = "mtllib Mats/A.mtl my b.mtl\n" + OBJ.replace("usemtl red", "usemtl r\xe9d").replace(
+        "f 1/1 2/2 3/3 4/4", "f 1 2 3 4"
+    )
+    files = {"t.obj": mesh.encode("latin-1"), "Mats/a.mtl": "newmtl r\xe9d\n".encode("latin-1"), "my b.mtl": b""}
+    _, out = comes_back(pack_zip(files | {"t.mtl": b""}), "t.zip")
+    written = unpack(out)["t.obj"].decode("latin-1")
+    assert written.startswith("mtllib Mats/a.mtl\nmtllib my b.mtl\nmtllib t.mtl\nusemtl r\xe9d\n")
+
+
 def test_a_bare_obj_is_grey_and_comes_back_with_its_texture() -> None:
     obj, out = comes_back(OBJ.replace("mtllib t.mtl\n", "").encode(), "t.obj")
     assert set(np.unique(next(iter(obj.textures.values())))) == {204}
@@ -262,6 +288,30 @@ def test_a_ply_comes_back_with_a_texture_it_names(encoding: str) -> None:
     assert len(corners(obj)) == len(ball().faces)
     _, again = comes_back(out, "ball.zip")  # and this one keeps its mesh byte for byte
     assert unpack(again)["ball.ply"] == after["ball.ply"]
+
+
+@pytest.mark.parametrize("files", [{}, {"foo.png": encode_png(PICTURE)}], ids=["missing", "there"])
+def test_a_ply_without_texture_coordinates_leaves_the_texture_that_it_names(files: dict[str, bytes]) -> None:
+    mesh = ply(SQUARE, "4 0 1 2 3", texture="foo.png")
+    _, out = comes_back(pack_zip({"t.ply": mesh, **files}), "t.zip")
+    after = unpack(out)
+    assert after.keys() == {"t.ply", "t_albedo.png", *files}
+    assert files.items() <= after.items()
+
+
+def test_a_ply_with_two_textures_is_refused() -> None:
+    mesh = ply("0 0 0 0 0, 1 0 0 1 0, 1 1 0 1 1", "3 0 1 2", columns="s t", texture="a.png\ncomment TextureFile b.png")
+    assert "2 textures, a.png, b.png; one is supported" in refusal(mesh, "t.ply")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [pytest.param(b"\n", end, id=repr(end)) for end in (b"\r", b"\r\n")]
+    + [pytest.param(b"end_header\n", b"end_header\n\n", id="an empty line")],
+)
+def test_lines_of_a_ply_may_end_in_any_way(old: bytes, new: bytes) -> None:
+    obj, _ = comes_back(ply(SQUARE, "4 0 1 2 3").replace(old, new), "t.ply")
+    assert corners(obj).shape == (2, 3, 3)
 
 
 def test_colours_of_a_plys_vertices_are_baked() -> None:
@@ -370,6 +420,14 @@ def test_an_stl_is_read_in_a_grey_of_its_own_and_goes_out_as_glb(file_type: str)
     assert (corners(read_object(write_glb(painted(obj)), name="t.glb").obj) == corners(obj)).all()
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_an_stl_may_be_in_capitals_or_have_bytes_after_its_triangles(packed: bool) -> None:
+    for data in (ball().export(file_type="stl") + b"\0\0", ball().export(file_type="stl_ascii").upper().encode()):
+        upload, name = (pack_zip({"b.stl": data}), "b.zip") if packed else (data, "b.STL")
+        assert len(corners(read_object(upload, name=name).obj)) == len(ball().faces)
+    assert "no triangles" in refusal(b"nonsense", "b.stl")
+
+
 def test_all_solids_of_an_stl_are_one_object() -> None:
     text = ball().export(file_type="stl_ascii").encode()
     assert len(corners(read_object(text + text, name="balls.stl").obj)) == 2 * len(ball().faces)
@@ -437,14 +495,6 @@ def test_alpha_is_cut_on_the_same_side_of_one_half_as_of_the_files_cutoff(
         return
     (mapped,) = cutout_alpha(np.array([alpha], np.uint8), factor=factor, cutoff=cutoff)
     assert (mapped / 255 >= 0.5) == (alpha / 255 * factor >= cutoff)
-
-
-def test_channels_are_made_smaller_one_by_one() -> None:
-    picture = np.zeros((64, 32, 4), np.uint8)
-    picture[..., 0] = 200  # under an alpha of zero, which would take the colour with it
-    small = shrink(picture, 16)
-    assert small.shape == (16, 8, 4)
-    assert (small[..., 0] == 200).all()
 
 
 # In a process of its own

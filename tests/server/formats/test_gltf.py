@@ -106,6 +106,7 @@ def test_a_colour_factor_is_multiplied_in_linear_light() -> None:
         pytest.param({}, 40, None, id="opaque: alpha means nothing"),
         pytest.param({"alphaMode": "MASK"}, 40, 40, id="mask"),
         pytest.param({"alphaMode": "MASK", "alphaCutoff": 0.25}, 40, 80, id="mask with another cutoff"),
+        pytest.param({"alphaMode": "MASK", "alphaCutoff": 0.0}, 0, 255, id="mask that cuts nothing"),
         pytest.param({"alphaMode": "BLEND", "factor": [1.0, 1.0, 1.0, 0.3]}, 40, 40, id="blend: its factor is apart"),
     ],
 )
@@ -417,6 +418,34 @@ def test_a_flat_colour_becomes_a_texture_and_the_mesh_gets_coordinates_if_it_has
     same_paint(read(out), new)
 
 
+def test_compressed_copies_are_moved_or_dropped_with_what_they_are_copies_of() -> None:
+    scene = Scene()
+    scene.square(scene.material(scene.texture(GRADIENT)))
+    scene.square(scene.material(), uvs=None)
+    copied = {"buffer": 0, "byteOffset": len(scene.data), "byteLength": 8}
+    scene.data += b"a copy: "
+    scene.document["bufferViews"][0]["extensions"] = {"EXT_meshopt_compression": copied, "other": {}}
+    draco = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
+    scene.document["meshes"][1]["primitives"][0]["extensions"] = draco
+    scene.document["extensionsUsed"] = ["EXT_meshopt_compression", "KHR_draco_mesh_compression"]
+    document, data = contents(painted_over(beside(scene))[1])
+    (moved, other) = document["bufferViews"][0]["extensions"].values()
+    assert data[moved["byteOffset"] :][: moved["byteLength"]] == b"a copy: "
+    assert other == {}
+    assert document["extensionsUsed"] == ["EXT_meshopt_compression"]
+    assert "extensions" not in document["meshes"][1]["primitives"][0]
+
+
+def test_weights_of_a_node_replace_those_of_its_mesh_and_colours_are_rounded() -> None:
+    scene = textured(factor=[1.0000001, 1, 1, -1e-9], extensions=None)
+    scene.document["meshes"][0]["weights"] = [0.5]
+    assert "morph targets" in refusal(scene.to_glb(), "scene.glb")
+    scene.document["nodes"][0]["weights"] = [0.0]
+    scene.document["textures"][0]["extensions"] = None
+    new, out = painted_over(scene)
+    same_paint(read(out), new)
+
+
 def test_paint_for_another_mesh_is_refused() -> None:
     data = textured().to_glb()
     other = textured()
@@ -459,6 +488,17 @@ def test_a_picture_that_was_no_png_becomes_one_and_is_named_so() -> None:
     assert json.loads(after["square.gltf"])["images"] == [{"uri": "my%20maps/skin.png"}]
     assert after["my maps/skin.png"][:4] == b"\x89PNG"
     assert "my maps/skin.jpg" not in after
+
+
+def test_a_file_with_another_use_under_another_uri_stays() -> None:
+    files = external("jpg")
+    document = json.loads(files["square.gltf"])
+    document["images"].append({"uri": "./My maps/skin.jpg"})
+    document["textures"].append({"source": 1})
+    document["materials"][0]["emissiveTexture"] = {"index": 1}
+    data = pack_zip(files | {"square.gltf": json.dumps(document).encode()})
+    after = unpack(repaint_file(data, painted(read_object(data, name="s.zip").obj), name="s.zip").data)
+    assert after["my maps/skin.jpg"] == files["my maps/skin.jpg"]
 
 
 def test_data_uris_stay_inside() -> None:
