@@ -113,5 +113,5 @@ def _verify(file: Path) -> int:
     if as_json():
         print_json({"faults": faults}, indent=2)
     elif not faults:
-        click.echo("The files are those of the manifest, and random views rendered again have the same classes.")
+        click.echo("Files, figures and findings are as it says, and random views rendered again have the same classes.")
     return int(bool(faults))

@@ -49,16 +49,15 @@ LOADERS: Final[Mapping[str, Callable[[Path, str], NetworkClassifier | OnnxClassi
 
 
 class _Zoo(NamedTuple):
-    """Networks of a library: loader by name, file of weights by name, whether other weights and classes fit in."""
+    """Networks of a library: loader by name, file of weights by name."""
 
-    load: Callable[..., NamedNetwork]
+    load: Callable[[str], NamedNetwork]
     weights: Callable[[str], Path]
-    open: bool = False
 
 
 ZOOS: Final[Mapping[str, _Zoo]] = {
-    "torchvision:": _Zoo(load_torchvision, torchvision_weights, open=True),
-    "timm:": _Zoo(load_timm, timm_weights, open=True),
+    "torchvision:": _Zoo(load_torchvision, torchvision_weights),
+    "timm:": _Zoo(load_timm, timm_weights),
     "robustbench:": _Zoo(load_robustbench, robustbench_weights),
     "hf:": _Zoo(load_huggingface, huggingface_weights),
 }
@@ -75,32 +74,29 @@ def load_classifier(
     *,
     name: str | None = None,
     classes: Sequence[str] | None = None,
-    weights: str | Path | None = None,
     device: str = "cpu",
 ) -> Classifier:
     """Load the classifier ``path_or_name`` (see the table above) on the torch device ``device``.
 
     name: name for reports; by default the file's name without its ending, or the network's.
     classes: class names in the order of the logits.
-    weights: for networks of torchvision and timm: a file with a state dict, or one of torchvision's weights by name.
 
     Raises ``ClassifierError`` for an unknown reference and for a network that breaks the contract.
     """
     _prepare_device(device)
     reference = str(path_or_name)
     if reference.startswith(LOOKED_UP):
-        return _by_name(reference, name, classes, weights, device)
+        return _by_name(reference, name, classes, device)
     if reference != "tiny" and re.fullmatch(r"[a-z]\w*", reference, re.ASCII):
         try:
-            return _by_name(f"torchvision:{reference}", name, classes, weights, device)
+            return _by_name(f"torchvision:{reference}", name, classes, device)
         except ClassifierError as error:
             raise ClassifierError(
                 f"{reference!r} was taken for a torchvision network: {error} Or give {KNOWN}."
             ) from error
-    if weights is not None:
-        raise _own_weights(reference)
     if reference == "tiny":
-        return NetworkClassifier("tiny", load_tiny().to(device), IMAGE_SIZE, len(CLASSES), tuple(CLASSES), device)
+        names = check_classes(classes or CLASSES, len(CLASSES), reference)
+        return NetworkClassifier(name or reference, load_tiny().to(device), IMAGE_SIZE, len(CLASSES), names, device)
     return _from_file(Path(path_or_name), name, classes, device)
 
 
@@ -120,22 +116,12 @@ def _zoo(reference: str) -> tuple[_Zoo, str]:
     return ZOOS[prefix], reference.removeprefix(prefix)
 
 
-def _by_name(
-    reference: str, name: str | None, classes: Sequence[str] | None, weights: str | Path | None, device: str
-) -> NetworkClassifier:
+def _by_name(reference: str, name: str | None, classes: Sequence[str] | None, device: str) -> NetworkClassifier:
     zoo, model = _zoo(reference)
-    if weights is not None and not zoo.open:
-        raise _own_weights(reference)
-    found, name = zoo.load(model, **({"classes": classes, "weights": weights} if zoo.open else {})), name or model
+    found, name = zoo.load(model), name or model
     network, n_classes = prepared(found.network, found.image_size, name, device=device)
     names = check_classes(classes or found.classes, n_classes, name)
     return NetworkClassifier(name, network, found.image_size, n_classes, names, device)
-
-
-def _own_weights(reference: str) -> ClassifierError:
-    return ClassifierError(
-        f"{reference!r} has its own weights: leave out weights, which torchvision:NAME and timm:NAME take."
-    )
 
 
 def _from_file(path: Path, name: str | None, classes: Sequence[str] | None, device: str) -> Classifier:

@@ -9,8 +9,9 @@ The steps are as large as the attack's budget. A slope over the whole budget is 
 itself, and the kinks of a network disturb it less.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import torch
 from jaxtyping import Float
@@ -20,8 +21,12 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from trompe_server.classifiers.drawing import seeded_generator
-from trompe_server.classifiers.protocol import Classifier, ScoringClassifier, Wrapper
+from trompe_server.classifiers.protocol import AT_ONCE, Classifier, ScoringClassifier, Wrapper
 from trompe_shared.errors import ClassifierError, SpecError
+
+CELLS: Final = 28
+"""Side of a pattern's grid. With as many cells as pixels the patterns are white noise, and the mean estimate of a
+linear function is exact; with fewer it is a smoothed gradient."""
 
 
 @dataclass
@@ -33,7 +38,6 @@ class ScoreBasedClassifier(Wrapper):
 
     inner: ScoringClassifier
     queries_per_gradient: int
-    cells: int
     sigma: float
     seed: int
     background: Float[Tensor, "3 #H #W"] | None = None
@@ -59,23 +63,25 @@ class ScoreBasedClassifier(Wrapper):
 
         Deterministic in image and weights, independent of time and batch.
         """
-        patterns = self._patterns(image)
-        steps = self.sigma * patterns
-        answers = self.ask(torch.cat([image + steps, image - steps]).clamp(0, 1)) @ weights
-        plus, minus = answers.chunk(2)
-        slopes = (plus - minus) / (2 * self.sigma * len(patterns))
-        return torch.einsum("p,pchw->chw", slopes, patterns)
+        estimate = torch.zeros_like(image)
+        for patterns in self._patterns(image):
+            steps = self.sigma * patterns
+            answers = self.ask(torch.cat([image + steps, image - steps]).clamp(0, 1)) @ weights
+            plus, minus = answers.chunk(2)
+            estimate += torch.einsum("p,pchw->chw", (plus - minus) / (self.sigma * self.queries_per_gradient), patterns)
+        return estimate
 
-    def _patterns(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "pairs 3 H W"]:
-        """Smooth noise on the object's pixels, seeded by the seed and the image."""
+    def _patterns(self, image: Float[Tensor, "3 H W"]) -> Iterator[Float[Tensor, "pairs 3 H W"]]:
+        """Smooth noise on the object's pixels, seeded by the seed and the image, for ``AT_ONCE`` images at a time."""
         seed = self.seed.to_bytes(8, "little", signed=True)
         generator = seeded_generator(image.detach().cpu().numpy().tobytes(), key=seed)
-        height, width = (min(self.cells, side) for side in image.shape[1:])
+        height, width = (min(CELLS, side) for side in image.shape[1:])
         coarse = torch.randn((self.queries_per_gradient // 2, 3, height, width), generator=generator)
-        smooth = F.interpolate(coarse, image.shape[1:], mode="bilinear").to(image)
-        if self.background is None:
-            return smooth
-        return smooth * ((image - self.background.to(image)).abs().amax(0) > 0.25 / 255)  # by more than rounding
+        shown: Tensor | bool = True
+        if self.background is not None:
+            shown = (image - self.background.to(image)).abs().amax(0) > 0.25 / 255  # by more than rounding
+        for few in torch.split(coarse, AT_ONCE // 2):
+            yield F.interpolate(few, image.shape[1:], mode="bilinear").to(image) * shown
 
 
 class _Asked(Function):
@@ -106,7 +112,6 @@ def score_based(
     background: Float[Tensor, "3 #H #W"] | None = None,
     queries: int = 10,
     sigma: float = 0.05,
-    cells: int = 28,
 ) -> ScoreBasedClassifier:
     """Make a score-only classifier attackable.
 
@@ -114,20 +119,18 @@ def score_based(
         only the pixels that differ from it; for a small object all others are noise.
     queries: images per gradient of one image, an even number.
     sigma: standard deviation of a pattern at the middle of a cell, sRGB in [0, 1] units, best the budget's epsilon.
-    cells: side of a pattern's grid. With as many cells as pixels the patterns are white noise, and the mean estimate of
-        a linear function is exact; with fewer it is a smoothed gradient.
 
     The draws depend on the seed and on the image only, so that a resumed attack continues identically.
     Raises ``SpecError`` for options out of range and ``ClassifierError`` for a classifier of 8-bit images only.
     """
-    if queries < 2 or queries % 2 or not 0 < sigma <= 1 or cells < 1:
+    if queries < 2 or queries % 2 or not 0 < sigma <= 1:
         raise SpecError(
-            "Gradients are estimated from an even number of queries, at least 2, with 0 < sigma <= 1 and cells >= 1; "
-            f"got queries={queries}, sigma={sigma}, cells={cells}."
+            "Gradients are estimated from an even number of queries, at least 2, with 0 < sigma <= 1; "
+            f"got queries={queries}, sigma={sigma}."
         )
     if not isinstance(classifier, ScoringClassifier):
         raise ClassifierError(
             f"{classifier.name!r} takes 8-bit images only, too coarse to estimate a gradient; "
             "expected a classifier with a method 'scores', such as an .onnx file."
         )
-    return ScoreBasedClassifier(classifier, queries, cells, sigma, seed, background)
+    return ScoreBasedClassifier(classifier, queries, sigma, seed, background)

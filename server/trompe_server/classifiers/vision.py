@@ -1,10 +1,9 @@
 """torchvision's networks by name, with the image size and normalisation of their weights.
 
-Nothing is downloaded: weights come from torch's cache or from a file and must include every tensor of the network, so
-that no layer keeps random weights.
+Nothing is downloaded: weights come from torch's cache and must include every tensor of the network, so that no layer
+keeps random weights.
 """
 
-from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import urlparse
@@ -19,11 +18,10 @@ from trompe_shared.errors import ClassifierError
 
 
 class _LocalWeights:
-    """An entry of torchvision's table of weights with tensors from a local file and other class names."""
+    """An entry of torchvision's table of weights with tensors from a local file."""
 
-    def __init__(self, entry: Any, tensors: dict[str, torch.Tensor], classes: Sequence[str]) -> None:
-        self.entry, self.tensors = entry, tensors
-        self.meta = {**entry.meta, "categories": list(classes)}
+    def __init__(self, entry: Any, tensors: dict[str, torch.Tensor]) -> None:
+        self.entry, self.meta, self.tensors = entry, entry.meta, tensors
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
@@ -35,69 +33,49 @@ class _LocalWeights:
         return self.tensors
 
 
-def load_torchvision(
-    model: str, *, classes: Sequence[str] | None = None, weights: str | Path | None = None
-) -> NamedNetwork:
-    """torchvision's classification network ``model``.
-
-    weights: name of torchvision's weights in torch's cache (``"IMAGENET1K_V1"``; by default torchvision's default), or
-        a file with a state dict.
-    classes: class names of the state dict, by default those of torchvision's weights.
+def load_torchvision(model: str) -> NamedNetwork:
+    """torchvision's classification network ``model`` with torchvision's default weights.
 
     Raises ``ClassifierError`` if torchvision, the network or the weights are missing or do not fit together.
     """
     models = import_extra("torchvision.models", extra="vision")
-    entry, path = _find_weights(models, model, weights)
-    names = tuple(classes or entry.meta["categories"])
+    entry, path = _find_weights(models, model)
     transforms = entry.transforms()
     (side,) = transforms.crop_size
-    network = _built(models, model, entry, path, names)
+    network = _built(models, model, entry, path)
     whole = Normalised(network, mean=tuple(transforms.mean), std=tuple(transforms.std))
-    return NamedNetwork(whole, (side, side), names)
+    return NamedNetwork(whole, (side, side), entry.meta["categories"])
 
 
 def torchvision_weights(model: str) -> Path:
     """The file with torchvision's default weights of ``model`` in torch's cache. Raises ``ClassifierError``."""
-    return _find_weights(import_extra("torchvision.models", extra="vision"), model, None)[1]
+    return _find_weights(import_extra("torchvision.models", extra="vision"), model)[1]
 
 
-def _find_weights(models: Any, model: str, weights: str | Path | None) -> tuple[Any, Path]:
+def _find_weights(models: Any, model: str) -> tuple[Any, Path]:
     """(entry of torchvision's table, file). Raises ``ClassifierError``."""
     check_known(model, models.list_models(module=models), "torchvision has no classification network")
-    table = models.get_model_weights(model)
-    cache = Path(torch.hub.get_dir()) / "checkpoints"
-    if weights is None or weights in table.__members__:
-        entry = table.DEFAULT if weights is None else table[weights]
-        return entry, _existing(cache / _file_of(entry), f"{model} ({entry.name}) from {entry.url}")
-    path = Path(weights)
-    entry = next((entry for entry in table if _file_of(entry) == path.name), table.DEFAULT)
-    return entry, _existing(path, f"{model}, or one of {', '.join(table.__members__)}")
+    entry = models.get_model_weights(model).DEFAULT
+    path = Path(torch.hub.get_dir()) / "checkpoints" / PurePosixPath(urlparse(entry.url).path).name
+    if not path.is_file():
+        raise ClassifierError(
+            f"There is no file {str(path)!r}, and nothing is downloaded. Put the weights of {model} ({entry.name}) "
+            f"from {entry.url} there."
+        )
+    return entry, path
 
 
-def _built(models: Any, model: str, entry: Any, path: Path, classes: Sequence[str]) -> nn.Module:
+def _built(models: Any, model: str, entry: Any, path: Path) -> nn.Module:
     """The network with the weights of a file. Raises ``ClassifierError`` if they do not fit."""
     tensors = read_weights(path)
     try:
-        network: nn.Module = models.get_model(model, weights=_LocalWeights(entry, tensors, classes))
+        network: nn.Module = models.get_model(model, weights=_LocalWeights(entry, tensors))
     except RuntimeError as error:
         raise ClassifierError(
-            f"The weights in {path.name!r} do not fit torchvision's {model!r} with {len(classes)} classes "
-            f"({str(error)[:300]}). Give the file of this network, and one class name for each of its logits."
+            f"The weights in {path.name!r} do not fit torchvision's {model!r} ({str(error)[:300]}). Put the file from "
+            f"{entry.url} there."
         ) from error
     return network
-
-
-def _file_of(entry: Any) -> str:
-    return PurePosixPath(urlparse(entry.url).path).name
-
-
-def _existing(path: Path, what: str) -> Path:
-    if not path.is_file():
-        raise ClassifierError(
-            f"There is no file {str(path)!r}, and nothing is downloaded. Put the weights of {what} there, "
-            "or give a file with a state dict as weights."
-        )
-    return path
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:

@@ -70,12 +70,13 @@ class ImagePipeline:
                     rows[number] = image
         return torch.stack(rows) if any(draw.strengths for draw in drawn) else images
 
-    def shown(self, images: Image8) -> Image8:
-        """8-bit images (N, H, W, 3) through the pipeline; an image's draws depend on its number only."""
-        parts = [images[:0]]
+    def shown(self, images: Image8, numbers: Sequence[int] | None = None) -> Image8:
+        """8-bit images (N, H, W, 3) through the pipeline; an image's draws depend on its number only: 0, 1, ... if
+        none are given."""
+        parts, numbers = [images[:0]], range(len(images)) if numbers is None else numbers
         for first in range(0, len(images), SHOWN_AT_ONCE):
             some = images[first : first + SHOWN_AT_ONCE]
-            generators = [_generator(first + number) for number in range(len(some))]
+            generators = [_generator(number) for number in numbers[first : first + SHOWN_AT_ONCE]]
             parts.append(_levels(self.apply(fit_images(some, some.shape[1:3]), generators)))
         return np.concatenate(parts)
 

@@ -4,7 +4,9 @@ Placement, a change of size and blur are linear in the image and separable: rows
 of them is one product of matrices for each axis, drawn anew for each image.
 """
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Final
 
 import torch
 from jaxtyping import Float
@@ -13,6 +15,8 @@ from torch.nn import functional as F
 
 Axis = Float[Tensor, "n n"]
 """Matrix from the pixels along an axis to as many new ones; its rows sum to 1."""
+KEPT: Final = 2**26
+"""Bytes of the matrices kept for each of two sides: all that a job draws up to 300 pixels, an eighth for 600."""
 
 
 def resampled(image: Float[Tensor, "*n H W"], rows: Axis, columns: Axis) -> Float[Tensor, "*n H W"]:
@@ -32,9 +36,17 @@ def placed(side: int, *, zoom: float = 1.0, shift: float = 0.0, mirrored: bool =
     return weights / weights.sum(1, keepdim=True)
 
 
-@lru_cache(maxsize=512)
 def resized(side: int, size: int) -> Axis:
     """Reduce to ``size`` pixels (antialiased bilinear) and enlarge again (bilinear)."""
+    return _kept(side)(size)
+
+
+@lru_cache(maxsize=2)
+def _kept(side: int) -> Callable[[int], Axis]:
+    return lru_cache(maxsize=KEPT // (4 * side**2))(partial(_resized, side))
+
+
+def _resized(side: int, size: int) -> Axis:
     small = F.interpolate(torch.eye(side)[None, None], (size, side), mode="bilinear", antialias=True)
     return F.interpolate(small, (side, side), mode="bilinear")[0, 0]
 

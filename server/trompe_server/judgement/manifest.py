@@ -19,6 +19,7 @@ from trompe_server.surrogate import behind
 from trompe_server.system.versions import versions
 from trompe_shared.api import (
     AS_RENDERED,
+    Accuracy,
     Cell,
     Finding,
     JudgedNetwork,
@@ -26,13 +27,13 @@ from trompe_shared.api import (
     JudgementSpec,
     Manifest,
     Predictions,
-    TextureChange,
     ViewRecord,
     Visibility,
     levels_within,
 )
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import Camera, Light, View
+from trompe_shared.object3d import Object3D
 
 Images = NDArray[np.uint8]
 Logits = NDArray[np.float32]
@@ -79,14 +80,7 @@ class Judged:
 def manifest_of(judged: Judged, *, seconds: float) -> Manifest:
     """The manifest. ``seconds``: wall time of the judgement."""
     spec, suite = judged.spec, judged.suite
-    changes = texture_changes(*judged.pair.textures, epsilon=spec.epsilon)
-    cells = [
-        _cell(judged, renderer, network.name, pipeline)
-        for renderer in suite.renderers
-        for network in judged.records
-        for pipeline in PIPELINES
-    ]
-    return Manifest(
+    manifest = Manifest(
         suite=spec.suite,
         label=spec.label,
         epsilon=spec.epsilon,
@@ -97,9 +91,14 @@ def manifest_of(judged: Judged, *, seconds: float) -> Manifest:
         image_size=judged.size,
         seed=suite.seed,
         views=[view_record(view) for view in judged.views],
-        findings=[*judged.pair.findings(), *_findings(judged, changes, cells)],
-        textures=changes,
-        cells=cells,
+        findings=[],
+        textures=texture_changes(*judged.pair.textures, epsilon=spec.epsilon),
+        cells=[
+            _cell(judged, renderer, network.name, pipeline)
+            for renderer in suite.renderers
+            for network in judged.records
+            for pipeline in PIPELINES
+        ],
         predictions=[
             prediction
             for renderer in judged.engines
@@ -109,6 +108,7 @@ def manifest_of(judged: Judged, *, seconds: float) -> Manifest:
         seconds=round(seconds, 1),
         versions=versions(),
     )
+    return manifest.model_copy(update={"findings": findings_of(manifest, judged.pair)})
 
 
 def view_record(view: View) -> ViewRecord:
@@ -125,23 +125,30 @@ def view_of(record: ViewRecord) -> View:
 
 def _cell(judged: Judged, renderer: str, network: str, pipeline: str) -> Cell:
     both = judged.both(renderer, network, pipeline)
-    accuracy = None if both is None else judged.judges[network].accuracy(*both)
-    if accuracy is not None and not judged.pair.is_one:
-        accuracy = accuracy.model_copy(update=dict.fromkeys(DROPS))
+    accuracy = None if both is None else of_pair(judged.judges[network].accuracy(*both), judged.pair)
     return Cell(renderer=renderer, network=network, pipeline=pipeline, accuracy=accuracy)
+
+
+def of_pair(accuracy: Accuracy, pair: ObjectPair) -> Accuracy:
+    """``accuracy`` without the figures that two different objects do not have."""
+    return accuracy if pair.is_one else accuracy.model_copy(update=dict.fromkeys(DROPS))
 
 
 def _renderer(judged: Judged, name: str) -> JudgedRenderer:
     if name not in judged.engines:
         return JudgedRenderer(name=name, missing=judged.missing[name])
-    return JudgedRenderer(name=name, engine=judged.engines[name], visibility=_visibility(judged, name))
+    visibility = visibility_in(judged.pair, judged.views, judged.images[name], epsilon=judged.spec.epsilon)
+    return JudgedRenderer(name=name, engine=judged.engines[name], visibility=visibility)
 
 
-def _visibility(judged: Judged, renderer: str) -> Visibility:
-    if not judged.pair.is_one:
+def visibility_in(
+    pair: ObjectPair, views: Sequence[View], images: Mapping[str, Images], *, epsilon: float | None
+) -> Visibility:
+    """Of the repaint in the images ``before`` and ``after`` of ``views``; null for two different objects."""
+    if not pair.is_one:
         return Visibility()
-    images, ground = judged.images[renderer], behind(judged.views, {}, judged.size)
-    return visibility_of(*judged.pair.textures, images["before"], images["after"], ground, epsilon=judged.spec.epsilon)
+    before, after = images["before"], images["after"]
+    return visibility_of(*pair.textures, before, after, behind(views, {}, before.shape[1:3]), epsilon=epsilon)
 
 
 def _predictions(judged: Judged, renderer: str, network: str) -> Predictions | None:
@@ -161,10 +168,14 @@ def _predictions(judged: Judged, renderer: str, network: str) -> Predictions | N
     )
 
 
-def _findings(judged: Judged, changes: Sequence[TextureChange], cells: Sequence[Cell]) -> Iterator[Finding]:
-    """Findings about the budget, and about what is missing or rests on little."""
-    epsilon = judged.spec.epsilon
-    for change in changes:
+def findings_of(manifest: Manifest, pair: ObjectPair) -> list[Finding]:
+    """Findings about the two objects, the budget, and what is missing or rests on little."""
+    return [*pair.findings(), *_findings(manifest, pair.before)]
+
+
+def _findings(manifest: Manifest, before: Object3D) -> Iterator[Finding]:
+    epsilon = manifest.epsilon
+    for change in manifest.textures:
         if change.texels_beyond_epsilon and epsilon is not None:
             yield Finding(
                 kind="epsilon",
@@ -172,21 +183,22 @@ def _findings(judged: Judged, changes: Sequence[TextureChange], cells: Sequence[
                 f"({levels_within(epsilon)} levels of 255): {change.texels_beyond_epsilon} of "
                 f"{change.size[0] * change.size[1]} texels change by more, one by {change.max_levels} levels.",
             )
-    for warning in faint_warnings(judged.before.obj):
+    for warning in faint_warnings(before):
         yield Finding(kind="material", text=warning)
-    for network in judged.records:
-        if network.image_size not in (None, judged.size):
-            sizes = [" x ".join(map(str, size)) for size in (network.image_size, judged.size) if size]
+    for network in manifest.networks:
+        if network.image_size not in (None, manifest.image_size):
+            sizes = [" x ".join(map(str, size)) for size in (network.image_size, manifest.image_size) if size]
             yield Finding(
                 kind="network",
                 text=f"The network {network.name!r} takes images of {sizes[0]}; those of {sizes[1]} are resized.",
             )
-    lacking = {network.name: network.missing for network in judged.records if network.missing is not None}
+    lacking = {network.name: network.missing for network in manifest.networks if network.missing is not None}
     for reason in dict.fromkeys(lacking.values()):
         names = ", ".join(repr(name) for name, why in lacking.items() if why == reason)
         yield Finding(kind="network", text=f"No figures of {names}: {reason}")
-    for name, reason in judged.missing.items():
-        yield Finding(kind="renderer", text=f"No figures in {name!r}: {reason}")
-    for cell in cells:
+    for renderer in manifest.renderers:
+        if renderer.missing is not None:
+            yield Finding(kind="renderer", text=f"No figures in {renderer.name!r}: {renderer.missing}")
+    for cell in manifest.cells:
         if cell.pipeline == AS_RENDERED and cell.accuracy is not None and (words := drop_warning(cell.accuracy)):
             yield Finding(kind="views", text=f"{cell.renderer}, {cell.network}: {words}")

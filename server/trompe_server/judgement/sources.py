@@ -152,7 +152,7 @@ def _judge(
     network: Classifier, label: Sequence[str | int], file: str, reference: str, by_name: bool
 ) -> tuple[Judge, JudgedNetwork]:
     """A network in ``file`` (or by name) as a judge, and its record."""
-    judge, names = Judge.of(network, _known(label, network)), network.classes
+    judge, names = Judge.of(network, known_labels(label, network)), network.classes
     return judge, JudgedNetwork(
         name=reference if by_name else network.name,
         reference=reference,
@@ -163,7 +163,7 @@ def _judge(
     )
 
 
-def _known(label: Sequence[str | int], network: Classifier) -> tuple[int, ...]:
+def known_labels(label: Sequence[str | int], network: Classifier) -> tuple[int, ...]:
     """The classes that ``label`` names in the network's words. Raises ``LabelError`` if it names none."""
     found, unknown = dict[int, None](), list[LabelError]()
     for each in label:

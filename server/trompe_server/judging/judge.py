@@ -6,9 +6,10 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 from trompe_server.classifiers import Classifier
-from trompe_server.judging.metrics import Logits, accuracy, softmax
+from trompe_server.judging.metrics import Logits, accuracy
 from trompe_server.pictures import Verdict
 from trompe_server.spec.labels import resolve_labels
 from trompe_server.spec.neighbours import neighbours
@@ -43,7 +44,7 @@ class Judge:
 
     def verdicts(self, logits: NDArray[np.float32]) -> list[Verdict]:
         """Predictions in words, one for each row of logits (views, classes)."""
-        best, probability = logits.argmax(axis=1), softmax(logits).max(axis=1)
+        best, probability = logits.argmax(axis=1), softmax(logits.astype(np.float64), axis=-1).max(axis=1)
         return [
             Verdict(self.class_name(int(index)), float(share), index in self.labels)
             for index, share in zip(best, probability, strict=True)

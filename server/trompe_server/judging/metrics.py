@@ -7,32 +7,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 from trompe_shared.api import FEW_RECOGNISED, Accuracy, ViewPrediction
 from trompe_shared.geometry import View
-
-__all__ = [
-    "Agreement",
-    "accuracy",
-    "agreement",
-    "camera_and_light",
-    "difference",
-    "drop_interval",
-    "drop_warning",
-    "fooled_as",
-    "margins",
-    "max_view_change",
-    "mean_texel_change",
-    "predicted_classes",
-    "reach_warning",
-    "recognised",
-    "share_beyond",
-    "softmax",
-    "texels_altered",
-    "transfer_gap",
-    "view_predictions",
-    "wilson_interval",
-]
 
 Logits = NDArray[np.float32]
 Images = NDArray[np.uint8]
@@ -51,13 +29,6 @@ LARGE_LOSS: Final = 0.2
 
 LARGE_SHARE: Final = 0.3
 """Or by more than this share of the own views'."""
-
-
-def softmax(logits: Logits) -> NDArray[np.float64]:
-    """Probabilities of logits (N, classes) along the last axis."""
-    shifted = np.exp(logits.astype(np.float64) - logits.max(axis=-1, keepdims=True))
-    probabilities: NDArray[np.float64] = shifted / shifted.sum(axis=-1, keepdims=True)
-    return probabilities
 
 
 def wilson_interval(share: float, count: int) -> tuple[float, float]:
@@ -111,7 +82,7 @@ def recognised(logits: Logits, label: Label, *, like: Logits | None = None) -> N
 
 
 def drop_interval(
-    before: Logits, after: Logits, label: Label, *, distinct: int | None = None, seed: int = 0
+    before: Logits, after: Logits, label: Label, *, distinct: int | None = None
 ) -> tuple[float, float] | None:
     """95 % bootstrap interval of ``a_drop`` over paired views; ``None`` if ``a_drop`` is n.a.
 
@@ -126,7 +97,7 @@ def drop_interval(
     seen = np.array([np.sum(right & still), np.sum(right & ~still), np.sum(~right & still), np.sum(~right & ~still)])
     own = distinct or len(right)
     weights = seen * (own / len(right)) + 0.5
-    drawn = np.random.default_rng(seed).multinomial(own, weights / weights.sum(), RESAMPLES)
+    drawn = np.random.default_rng(0).multinomial(own, weights / weights.sum(), RESAMPLES)
     both, lost, won, _ = drawn[drawn[:, :2].any(axis=1)].T
     low, high = np.quantile((lost - won) / (both + lost), [0.025, 0.975]).tolist()
     return low, high
@@ -214,7 +185,7 @@ def _verdicts(when: str, logits: Logits, label: Label) -> list[dict[str, Any]]:
             f"{when}_confidence": float(row[k]),
             f"{when}_true_confidence": float(row[np.array(label)].sum()),
         }
-        for k, row in zip(logits.argmax(axis=1), softmax(logits), strict=True)
+        for k, row in zip(logits.argmax(axis=1), softmax(logits.astype(np.float64), axis=-1), strict=True)
     ]
 
 

@@ -1,9 +1,11 @@
 """Where an object differs from what it should be a repaint of: shape, texture coordinates, materials, albedo.
 
 The two may come from files of different formats: vertices may be split or merged, triangles and textures in another
-order and under other names. So triangles are matched by their corners, and textures by the triangles that show them.
+order and under other names. So triangles are matched by their corners, those in one place by the name of their material
+too, and textures by the triangles that show them.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +22,9 @@ from trompe_shared.object3d import Material, Object3D, decode_rgb, open_image
 
 TOLERANCE: Final = 1e-4
 """Distance of equal corners, as a share of the object's radius, and of equal texture coordinates."""
+
+NAMED: Final = TOLERANCE / 10
+"""Distance of triangles in one place that differ in the name of their material."""
 
 BENT: Final = 0.02
 """Distance of normals, unit vectors, that counts as another shading: one degree."""
@@ -55,10 +60,10 @@ class _Triangles:
     def __len__(self) -> int:
         return len(self.corners)
 
-    @property
-    def mapped(self) -> Float[np.ndarray, "F 3 5"]:
-        """Corners with their texture coordinates."""
-        return np.concatenate([self.corners, self.uvs], axis=2)
+    def mapped(self, names: list[str]) -> Float[np.ndarray, "F 3 6"]:
+        """Corners with their texture coordinates, and a small step for the place of their material in ``names``."""
+        steps = np.searchsorted(names, self.materials) * (NAMED / len(names))
+        return np.concatenate([self.corners, self.uvs, np.tile(steps[:, None, None], (1, 3, 1))], axis=2)
 
 
 @dataclass(frozen=True)
@@ -79,8 +84,15 @@ class ObjectPair:
 
     @cached_property
     def textures(self) -> tuple[Textures, Textures]:
-        """Albedo textures that belong together and have one size, by the first object's name: before and after."""
-        pairs = {name: (self.before.textures[name], self.after.textures[other]) for name, other in self._albedos}
+        """Albedo textures that belong together and have one size, by the first object's name: before and after.
+
+        One with several partners comes once for each, the second object's name added to its own.
+        """
+        parts = Counter(name for name, _ in self._albedos)
+        pairs = {
+            f"{name} ({other})" if parts[name] > 1 else name: (self.before.textures[name], self.after.textures[other])
+            for name, other in self._albedos
+        }
         same = {name: pair for name, pair in pairs.items() if pair[0].shape == pair[1].shape}
         return {name: old for name, (old, _) in same.items()}, {name: new for name, (_, new) in same.items()}
 
@@ -116,7 +128,8 @@ class ObjectPair:
 
     @cached_property
     def _places(self) -> tuple[Int[np.ndarray, " F"], Int[np.ndarray, " F"]]:
-        return _matched(self._old.mapped, self._new.mapped)
+        names = sorted({*self.before.materials, *self.after.materials})
+        return _matched(self._old.mapped(names), self._new.mapped(names))
 
     def _layout(self) -> Iterator[Finding]:
         wrong = int((self._places[0] < 0).sum())
@@ -148,8 +161,8 @@ class ObjectPair:
 
     @cached_property
     def _albedos(self) -> list[tuple[str, str]]:
-        """Albedo textures of matched triangles, before and after; without those that have several partners, or that
-        triangles with other coordinates show."""
+        """Albedo textures of matched triangles, before and after; without those that triangles with other coordinates
+        show."""
         if self._shape:
             return []
         pairs = list(
@@ -161,12 +174,7 @@ class ObjectPair:
         unmatched = {
             self.after.materials[str(name)].albedo for name in np.unique(self._new.materials[self._places[0] < 0])
         }
-        partners = [sorted(names) for names in zip(*pairs, strict=True)] if pairs else [[], []]
-        return [
-            (one, other)
-            for one, other in pairs
-            if partners[0].count(one) == partners[1].count(other) == 1 and other not in unmatched
-        ]
+        return [(one, other) for one, other in pairs if other not in unmatched]
 
     def _maps(self) -> Iterator[Finding]:
         for one, other in self._materials:

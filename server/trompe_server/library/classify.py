@@ -15,10 +15,10 @@ from typing import Any, BinaryIO, Final
 
 import numpy as np
 import torch
+from scipy.special import softmax
 
 from trompe_server.classifiers import Classifier, load_classifier
 from trompe_server.image_pipelines import ImagePipeline
-from trompe_server.judging.metrics import softmax
 from trompe_shared.errors import ClassifierError, ObjectError, SpecError, TrompeError
 from trompe_shared.object3d import Texture, decode_rgb
 
@@ -77,7 +77,7 @@ def _image(data: bytes, number: int) -> Texture:
 def _classified(network: Classifier, images: Texture, labels: Sequence[int]) -> list[tuple[int, float, float]]:
     if max(labels) >= network.n_classes:
         raise ClassifierError(f"{network.name!r} has {network.n_classes} classes, and none of index {max(labels)}.")
-    rows = softmax(network.predict(images))
+    rows = softmax(network.predict(images).astype(np.float64), axis=-1)
     return [(int(row.argmax()), float(row.max()), float(row[list(labels)].sum())) for row in rows]
 
 

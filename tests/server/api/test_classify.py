@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.special import softmax
 
 from tests.server.api.conftest import Api
 from trompe_server.classifiers import load_classifier
 from trompe_server.image_pipelines import ImagePipeline
-from trompe_server.judging.metrics import softmax
 from trompe_server.library import classification
 from trompe_shared.object3d import encode_png
 
@@ -45,7 +45,7 @@ def test_images_are_classified_through_the_pipeline(api: Api, pictures: Any, str
     answer = classify(api, [encode_png(each) for each in pictures], **strengths)
 
     assert answer.status_code == 200, answer.text
-    for found, row in zip(answer.json(), softmax(tiny.predict(shown)), strict=True):
+    for found, row in zip(answer.json(), softmax(tiny.predict(shown), axis=-1), strict=True):
         assert (found["index"], found["name"]) == (row.argmax(), tiny.classes[row.argmax()])
         assert found["confidence"] == pytest.approx(row.max(), abs=1e-4)
         assert found["true_confidence"] == pytest.approx(row[mug], abs=1e-4)

@@ -30,6 +30,7 @@ from trompe_server.classifiers import (
     score_based,
 )
 from trompe_server.classifiers.archive import read_program
+from trompe_server.classifiers.contract import check_contract, sample_images
 from trompe_server.classifiers.fold import BATCH_NORM, CONVOLUTION, Formatted, fold_batch_norm
 from trompe_server.classifiers.onnx import OnnxClassifier, load_onnx
 from trompe_server.classifiers.protocol import AT_ONCE, fit_images
@@ -248,11 +249,13 @@ def test_an_exported_network_is_read_with_its_size_classes_and_name(pt2: Path) -
     assert (classifier.image_size, classifier.n_classes, classifier.name) == (SIZE, 7, "net")
     assert classifier.classes == tuple("abcdefg")
     assert load_classifier(pt2, name="mine").name == "mine"
+    tiny = load_classifier("tiny", name="mine", classes=list("abcdefgh"))
+    assert (tiny.name, tiny.classes) == ("mine", tuple("abcdefgh"))
 
 
 def test_the_number_of_class_names_must_be_that_of_the_logits(pt2: Path, tmp_path: Path) -> None:
-    for file in (pt2, write_onnx(tmp_path / "net.onnx")):
-        with pytest.raises(ClassifierError, match="7 classes, but 2 class names"):
+    for file in (pt2, write_onnx(tmp_path / "net.onnx"), "tiny"):
+        with pytest.raises(ClassifierError, match=r"[78] classes, but 2 class names"):
             load_classifier(file, classes=["a", "b"])
 
 
@@ -392,6 +395,14 @@ def test_a_network_with_two_inputs_is_refused(tmp_path: Path) -> None:
         load_classifier(tmp_path / "net.pt2")
 
 
+def test_a_network_that_raises_any_error_breaks_the_contract() -> None:
+    def refuse(_net: Any, _image: Tensor) -> Any:
+        raise ValueError("Input image size (20*24) doesn't match model (224*224).")
+
+    with pytest.raises(ClassifierError, match=r"'vit': it does not run on two images \(Input image size"):
+        check_contract(Around(refuse), sample_images(SIZE), "vit")
+
+
 class RunsCode:
     """Writes a file when it is unpickled."""
 
@@ -455,9 +466,18 @@ SUBTRACTION = "torch.ops.aten.sub.Tensor"
             id="a size that is code",
         ),
         pytest.param(replacing(SUBTRACTION, "torch.os.system"), "torch.os.system", id="an operator that is not ATen's"),
-        pytest.param(
-            replacing(SUBTRACTION, "torch.ops.aten.from_file.default"), "aten.from_file", id="an operator of files"
-        ),
+        *[
+            pytest.param(replacing(SUBTRACTION, f"torch.ops.aten.{name}.default"), f"aten.{name}", id=name)
+            for name in (
+                "from_file",
+                "save",
+                "warn",
+                "_print",
+                "manual_seed",
+                "set_grad_enabled",
+                "_cufft_clear_plan_cache",
+            )
+        ],
         pytest.param(replacing("body.0.weight", 'a\\")+exec(\\"'), "exec", id="a name that is code"),
         pytest.param(
             replacing('\\"context\\": \\"[]\\"', '\\"context\\": \\"{}\\"'),
@@ -527,7 +547,6 @@ def test_an_onnx_network_that_breaks_the_contract_is_refused(
             for name in ("weights.h5", "net.pt", "net.torchscript", "hub:owner/nets:small")
         ],
         pytest.param(Path("absent.pt2"), {}, "There is no classifier file", id="no file"),
-        pytest.param("tiny", {"weights": Path("w.pth")}, "'tiny' has its own weights", id="weights of tiny"),
         *[
             pytest.param("tiny", {"device": device}, f"The device '{device}' cannot be used here", id=device)
             for device in ("nonsense", "cuda:99")

@@ -33,6 +33,12 @@ TAGS: Final = {
     "vit_tiny_patch16_384": "vit_tiny_patch16_384.augreg_in21k_ft_in1k",
 }
 """Networks of timm and their repositories."""
+FILES: Final = {
+    "mobilenet_v2": "mobilenet_v2-7ebf99e0.pth",
+    "inception_v3": "inception_v3_google-0cc3c7bd.pth",
+    "squeezenet1_1": "squeezenet1_1-b8a52dc0.pth",
+}
+"""Networks of torchvision and their files in torch's cache."""
 IMAGENET: Final = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 """Mean and standard deviation."""
 
@@ -86,13 +92,12 @@ def real(models: Any, name: str, **options: Any) -> nn.Module:
     return network
 
 
-def saved(network: nn.Module, path: Path) -> Path:
+def saved(network: nn.Module, path: Path) -> None:
     torch.save(network.state_dict(), path)
-    return path
 
 
-def white_box(*arguments: Any, **options: Any) -> NetworkClassifier:
-    classifier = load_classifier(*arguments, **options)
+def white_box(reference: str, **options: Any) -> NetworkClassifier:
+    classifier = load_classifier(reference, **options)
     assert isinstance(classifier, NetworkClassifier)
     return classifier
 
@@ -147,10 +152,11 @@ def stored(timm: Any, hub: Callable[[str], Path]) -> Callable[..., nn.Module]:
     ],
 )
 def test_a_torchvision_network_has_its_own_size_classes_and_normalisation(
-    name: str, options: dict[str, Any], size: int, models: Any, tmp_path: Path
+    name: str, options: dict[str, Any], size: int, models: Any, cache: Path
 ) -> None:
     network = real(models, name, **options)
-    classifier = white_box(f"torchvision:{name}", weights=saved(network, tmp_path / "weights.pth"))
+    saved(network, cache / FILES[name])
+    classifier = white_box(f"torchvision:{name}")
     assert (classifier.name, classifier.image_size, classifier.n_classes) == (name, (size, size), 1000)
     assert classifier.classes is not None
     assert classifier.classes[0] == "tench"
@@ -164,39 +170,29 @@ def test_a_torchvision_network_has_its_own_size_classes_and_normalisation(
 
 def test_weights_are_found_in_torchs_cache(models: Any, cache: Path) -> None:
     network = real(models, "squeezenet1_1")
-    saved(network, cache / "squeezenet1_1-b8a52dc0.pth")
-    for classifier in (
-        white_box("squeezenet1_1"),
-        white_box("torchvision:squeezenet1_1", weights="IMAGENET1K_V1", name="mine"),
-    ):
+    saved(network, cache / FILES["squeezenet1_1"])
+    for classifier in (white_box("squeezenet1_1"), white_box("torchvision:squeezenet1_1", name="mine")):
         images = random_images(224)
         expected = of_normalised(network, images, *IMAGENET)
         torch.testing.assert_close(classifier.logits(images), expected, atol=1e-4, rtol=1e-4)
 
 
-def test_weights_that_are_nowhere_are_not_made_up(models: Any, cache: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("models", "cache")
+def test_weights_that_are_nowhere_are_not_made_up() -> None:
     with pytest.raises(ClassifierError, match=r"no file '.*mobilenet_v2-7ebf99e0.pth'.*nothing is downloaded"):
         load_classifier("mobilenet_v2")
-    with pytest.raises(ClassifierError, match="one of IMAGENET1K_V1, IMAGENET1K_V2"):
-        load_classifier("mobilenet_v2", weights=tmp_path / "absent.pth")
 
 
-def test_a_network_of_other_classes_is_read_with_their_names(models: Any, tmp_path: Path) -> None:
-    file = saved(real(models, "squeezenet1_1", num_classes=3), tmp_path / "own.pth")
-    classifier = white_box("squeezenet1_1", weights=file, classes=["mug", "ball", "lamp"])
-    assert (classifier.n_classes, classifier.classes) == (3, ("mug", "ball", "lamp"))
-    with pytest.raises(ClassifierError, match=r"'own.pth' do not fit torchvision's 'squeezenet1_1' with 1000 classes"):
-        load_classifier("squeezenet1_1", weights=file)
-
-
-def test_weights_are_read_as_tensors_alone(models: Any, tmp_path: Path) -> None:
-    file = tmp_path / "whole.pth"
-    torch.save(real(models, "squeezenet1_1"), file)
-    with pytest.raises(ClassifierError, match="expected a state dict of tensors alone"):
-        load_classifier("squeezenet1_1", weights=file)
-    torch.save({"epoch": 3}, file)
-    with pytest.raises(ClassifierError, match="contains no state dict"):
-        load_classifier("squeezenet1_1", weights=file)
+def test_weights_are_read_as_tensors_alone_and_must_fit(models: Any, cache: Path) -> None:
+    file = cache / FILES["squeezenet1_1"]
+    for content, message in (
+        (real(models, "squeezenet1_1"), "expected a state dict of tensors alone"),
+        ({"epoch": 3}, "contains no state dict"),
+        (real(models, "squeezenet1_1", num_classes=3).state_dict(), "do not fit torchvision's 'squeezenet1_1'"),
+    ):
+        torch.save(content, file)
+        with pytest.raises(ClassifierError, match=message):
+            load_classifier("squeezenet1_1")
 
 
 def test_a_name_that_torchvision_does_not_have_is_answered_with_some_that_it_has(models: Any) -> None:
@@ -262,17 +258,10 @@ def test_a_network_of_timm_has_its_own_size_and_the_classes_of_imagenet(
     assert classifier_file(f"timm:{name}").name == "model.safetensors"
 
 
-def test_a_network_of_timm_takes_a_file_and_other_classes(
-    timm: Any, stored: Callable[..., nn.Module], tmp_path: Path
-) -> None:
-    file = tmp_path / "own.pth"
-    torch.save(stored("mobilenetv3_small_050", num_classes=3).state_dict(), file)
-    classifier = load_classifier("timm:mobilenetv3_small_050", weights=file, classes=["mug", "ball", "lamp"])
-    assert (classifier.n_classes, classifier.classes) == (3, ("mug", "ball", "lamp"))
-    with pytest.raises(ClassifierError, match=r"'own.pth' do not fit timm's 'mobilenetv3_small_050'"):
-        load_classifier("timm:mobilenetv3_small_050", weights=file)
-    with pytest.raises(ClassifierError, match=r"no file '.*absent.pth'"):
-        load_classifier("timm:mobilenetv3_small_050", weights=tmp_path / "absent.pth")
+def test_weights_of_timm_must_fit(stored: Callable[..., nn.Module]) -> None:
+    stored("mobilenetv3_small_050", num_classes=3)
+    with pytest.raises(ClassifierError, match=r"model.safetensors' do not fit timm's 'mobilenetv3_small_050'"):
+        load_classifier("timm:mobilenetv3_small_050")
 
 
 def test_names_and_weights_that_are_nowhere_are_errors(timm: Any, hub: Callable[[str], Path]) -> None:
@@ -284,8 +273,6 @@ def test_names_and_weights_that_are_nowhere_are_errors(timm: Any, hub: Callable[
         load_classifier("hf:../secret")
     with pytest.raises(ClassifierError, match=r"'org/a--b' is neither in the cache.*Check the name"):
         load_classifier("hf:org/a--b")
-    with pytest.raises(ClassifierError, match="leave out weights"):
-        load_classifier("hf:org/model", weights="x.pth")
 
 
 @pytest.mark.parametrize("prefix", [prefix for prefix in ZOOS if prefix != "torchvision:"])

@@ -1,5 +1,6 @@
 """Classifiers that only answer: the estimate of their gradient is right, repeatable, and paid for by the query."""
 
+import importlib
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,10 +24,11 @@ from trompe_server.classifiers import (
     resized,
     score_based,
 )
-from trompe_server.classifiers.protocol import Wrapper
+from trompe_server.classifiers.protocol import AT_ONCE, Wrapper
 from trompe_shared.errors import ClassifierError, SpecError
 
 ASSETS = os.environ.get("TROMPE_ASSETS")
+MODULE = importlib.import_module("trompe_server.classifiers.score_based")
 SIDE = 8
 
 
@@ -92,20 +94,19 @@ def test_the_estimate_of_a_linear_function_is_exact_on_average() -> None:
     network, images, weights = linear(), greyish(1), torch.tensor([[1.0, -0.5]])
     true = gradient(network, images, weights)
     estimates = [
-        gradient(score_based(network, queries=400, seed=seed, sigma=0.01, cells=SIDE), images, weights)
-        for seed in range(40)
+        gradient(score_based(network, queries=400, seed=seed, sigma=0.01), images, weights) for seed in range(40)
     ]
     spread = true.norm() * ((true.numel() + 1) / (200 * 40)) ** 0.5  # of a mean of 40 x 200 Gaussian patterns
     assert float((torch.stack(estimates).mean(0) - true).norm()) < 1.3 * float(spread)
 
 
 def test_the_estimate_comes_nearer_to_the_true_gradient_with_every_query() -> None:
-    """For d unknowns and n pairs, the squared cosine is about n / (n + d); less, as smooth patterns overlap."""
+    """For d unknowns and n pairs, the squared cosine is about n / (n + d)."""
     network, images, weights = fake_classifier(image_size=(SIDE, SIDE)), greyish(6), drawn(6, 10)
     true = gradient(network, images, weights)
-    unknowns = 3 * 4 * 4  # the fake looks at a thumbnail of 4 x 4
+    unknowns = 3 * SIDE * SIDE
     for pairs in (8, 32, 128):
-        found = gradient(score_based(network, queries=2 * pairs, seed=0, sigma=1e-3, cells=4), images, weights)
+        found = gradient(score_based(network, queries=2 * pairs, seed=0, sigma=1e-3), images, weights)
         assert cosine(found, true) > 0.65 * (pairs / (pairs + unknowns)) ** 0.5
 
 
@@ -156,11 +157,21 @@ def test_only_what_differs_from_the_background_is_asked_about() -> None:
     assert torch.equal((on_grey[0] == 0).all(0).nonzero(), (images[0] == 0.5).all(0).nonzero())
 
 
-def test_the_coarser_the_patterns_the_smoother_the_estimate() -> None:
+def test_many_queries_are_asked_in_batches_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    inner, images, weights = Asked(linear()), greyish(1), torch.tensor([[1.0, -0.5]])
+    found = gradient(score_based(inner, queries=202, seed=0), images, weights)
+    assert [len(asked) for asked in inner.seen] == [1, *[AT_ONCE] * 5, 2]
+    monkeypatch.setattr(MODULE, "AT_ONCE", 202)
+    torch.testing.assert_close(gradient(score_based(inner, queries=202, seed=0), images, weights), found)
+    assert len(inner.seen[-1]) == 202
+
+
+def test_the_coarser_the_patterns_the_smoother_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     images, weights = greyish(1, 32), drawn(1, 10)
 
     def roughness(cells: int) -> float:
-        found = gradient(score_based(fake_classifier(), queries=20, seed=0, cells=cells), images, weights)
+        monkeypatch.setattr(MODULE, "CELLS", cells)
+        found = gradient(score_based(fake_classifier(), queries=20, seed=0), images, weights)
         return float(found.diff(dim=3).square().sum() / found.square().sum())
 
     assert roughness(4) < 0.3 * roughness(16) < 0.3 * roughness(64)
@@ -178,7 +189,7 @@ def test_an_onnx_file_can_be_attacked_by_its_scores(tmp_path: Path) -> None:
     inner = load_classifier(tmp_path / "net.onnx")
     assert isinstance(inner, ScoringClassifier)
     assert not isinstance(inner, WhiteBoxClassifier)
-    classifier = score_based(inner, queries=2000, seed=0, sigma=0.0004, cells=SIDE)
+    classifier = score_based(inner, queries=2000, seed=0, sigma=0.0004)
     found = gradient(classifier, greyish(1), torch.tensor([[0.0, 1.0]]))
     assert cosine(found, torch.from_numpy(weight[:, 1])) > 0.85
 
@@ -186,20 +197,21 @@ def test_an_onnx_file_can_be_attacked_by_its_scores(tmp_path: Path) -> None:
 def test_an_estimate_comes_back_through_a_change_of_size() -> None:
     images, weights = greyish(1, 12), torch.tensor([[1.0, 0.0]])
     true = gradient(resized(linear(), (12, 12)), images, weights)
-    found = gradient(resized(score_based(linear(), queries=2000, seed=0, cells=SIDE), (12, 12)), images, weights)
+    found = gradient(resized(score_based(linear(), queries=2000, seed=0), (12, 12)), images, weights)
     assert cosine(found, true) > 0.85
 
 
 @pytest.mark.assets
 @pytest.mark.skipif(ASSETS is None, reason="TROMPE_ASSETS is not set")
-def test_the_scores_of_a_real_network_tell_the_coarse_part_of_its_gradient() -> None:
+def test_the_scores_of_a_real_network_tell_the_coarse_part_of_its_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MODULE, "CELLS", 7)
     white, black = (
         load_classifier(Path(ASSETS or "") / "classifiers" / f"mobilenet_v2{end}") for end in (".pt2", ".onnx")
     )
     assert isinstance(white, WhiteBoxClassifier)
     images = F.interpolate(greyish(1, 8), (224, 224), mode="bilinear")
     weights = F.one_hot(white.logits(images).argmax(1), 1000).float()
-    classifier = score_based(black, seed=0, queries=300, sigma=1e-3, cells=7)
+    classifier = score_based(black, seed=0, queries=300, sigma=1e-3)
     coarse = torch.zeros((1, 3, 7, 7), requires_grad=True)
     smooth = F.interpolate(coarse, (224, 224), mode="bilinear")
     by_grid = [
@@ -210,9 +222,9 @@ def test_the_scores_of_a_real_network_tell_the_coarse_part_of_its_gradient() -> 
     assert classifier.queries == 301
 
 
-@pytest.mark.parametrize("options", [{"queries": 0}, {"queries": 5}, {"sigma": 0.0}, {"sigma": 1.5}, {"cells": 0}])
+@pytest.mark.parametrize("options", [{"queries": 0}, {"queries": 5}, {"sigma": 0.0}, {"sigma": 1.5}])
 def test_options_out_of_range_are_refused(options: dict[str, float]) -> None:
-    with pytest.raises(SpecError, match="an even number of queries, at least 2, with 0 < sigma <= 1 and cells >= 1"):
+    with pytest.raises(SpecError, match="an even number of queries, at least 2, with 0 < sigma <= 1"):
         score_based(fake_classifier(), seed=0, **options)  # type: ignore[arg-type]
 
 

@@ -1,7 +1,9 @@
 """Image pipelines: what each operation does, the matrices of resampling, what the draws depend on, the gradient."""
 
 import io
+import os
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -103,6 +105,7 @@ def test_each_pipeline_of_the_suite_changes_a_photograph_and_keeps_what_it_shows
     assert 0.5 < change.mean() < 45
     assert np.corrcoef(found.ravel(), PHOTOS.ravel())[0, 1] > 0.6
     np.testing.assert_array_equal(SUITE[name].shown(PHOTOS), found)
+    np.testing.assert_array_equal(SUITE[name].shown(PHOTOS[::-2], [2, 0]), found[::-2])
 
 
 # Draws
@@ -196,6 +199,17 @@ def test_reduced_and_enlarged_as_torch_does_it(size: int) -> None:
     found = resampled(OBLONG[:1], resized(24, size), resized(20, size))
     small = F.interpolate(OBLONG[:1], (size, size), mode="bilinear", antialias=True)
     torch.testing.assert_close(found, F.interpolate(small, (24, 20), mode="bilinear"), rtol=1e-4, atol=1e-5)
+
+
+def test_resampling_keeps_little_memory() -> None:
+    def pages() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1])
+
+    resized(600, 240)
+    before = pages()
+    for size in range(240, 601, 3):
+        resized(600, size)
+    assert (pages() - before) * os.sysconf("SC_PAGE_SIZE") < 100 * 2**20, "121 full matrices take 166 MiB"
 
 
 @given(side=SIDES)

@@ -112,3 +112,35 @@ def test_triangles_that_keep_their_layout_keep_their_figures() -> None:
     pair = ObjectPair(lamp, replace(lamp, parts=(first, replace(second, uvs=second.uvs / np.float32(2)))))
     assert [found.kind for found in pair.findings()] == ["uv"]
     assert pair.textures[0].keys() == {lamp.albedo_of(first)}
+
+
+def test_each_two_textures_of_the_same_triangles_are_compared() -> None:
+    lamp = shipped("lamp")
+    one, other = lamp.textures
+    split = lamp.with_textures({one: lamp.textures[one], other: 255 - lamp.textures[one]})
+    shared = replace(split, materials={name: replace(each, albedo=one) for name, each in split.materials.items()})
+    for pair, names in (
+        (ObjectPair(shared, split), [f"{one} ({one})", f"{one} ({other})"]),
+        (ObjectPair(split, shared), [one, other]),
+    ):
+        assert pair.findings() == []
+        changes = texture_changes(*pair.textures, epsilon=0.01)
+        assert [(each.texture, each.texels_altered > 0.9) for each in changes] == [(names[0], False), (names[1], True)]
+
+
+def test_triangles_in_one_place_are_told_apart_by_their_materials() -> None:
+    (part,), (material,) = MUG.parts, MUG.materials.values()
+    decal = encode_png(255 - MUG.textures[material.albedo])
+    covered = replace(
+        MUG,
+        parts=(part, replace(part, material="decal")),
+        materials={**MUG.materials, "decal": replace(material, name="decal", albedo="decal.png")},
+        files={**MUG.files, "decal.png": decal},
+        textures={**MUG.textures, "decal.png": 255 - MUG.textures[material.albedo]},
+    )
+    for after in (covered, replace(covered, parts=covered.parts[::-1])):
+        pair = ObjectPair(covered, after)
+        assert pair.findings() == []
+        assert {
+            each.texture: each.max_levels for each in texture_changes(*pair.textures, epsilon=None)
+        } == dict.fromkeys(covered.textures, 0)
