@@ -23,6 +23,9 @@ AWAY_ALLOWED: Final = {"aten::copy_", "aten::_to_copy"}
 INDEXING: Final = {"aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_"}
 """Operators to which a graphics card accepts indices on the CPU, but not the other way round."""
 
+PRODUCTS: Final = {"aten::mm", "aten::mv", "aten::bmm", "aten::dot"}
+"""Operators that a graphics card has not for whole numbers."""
+
 MADE_BY_HAND: Final = ("tensor", "arange", "linspace")
 """Functions that write into memory before any operator reaches the device."""
 
@@ -63,6 +66,8 @@ def _compute(func: Any, args: Any, kwargs: Any) -> Any:
     tensors = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
     here = [each for each in tensors if isinstance(each, PretendTensor)]
     _check_together(func.name().split(".")[0], tensors, bool(here))
+    if func.name().split(".")[0] in PRODUCTS and here and not here[0].is_floating_point():
+        raise RuntimeError(f"{func.name()}: not implemented for {here[0].dtype}")
     device = kwargs.get("device")
     stays = bool(here) if device is None else torch.device(device).type == NAME
     if func is torch.ops.aten.copy_.default:

@@ -15,7 +15,6 @@ docs/library.md has the whole example, with a target renderer.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -23,7 +22,7 @@ from trompe_server.attack.backgrounds import Backgrounds
 from trompe_server.attack.budget import Box, Budget
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Objective, Textures, members_of
-from trompe_server.attack.optimiser import OPTIMISERS, Iterate, Memory
+from trompe_server.attack.optimiser import OPTIMISERS, Iterate
 from trompe_server.attack.perception import perceptual_bounds
 from trompe_server.attack.search import Search, finished
 from trompe_server.attack.state import AttackState
@@ -110,7 +109,8 @@ def attack(
         backgrounds=backgrounds,
         pipeline=pipeline,
     )
-    point = Iterate(objective.join(state.deltas), _joined(objective, state))
+    momentum = objective.join(state.momentum) if state.momentum else None
+    point = Iterate(objective.join(state.deltas), state.memory, momentum)
     for step in range(state.step, state.step + steps):
         if finished(point.memory, goal):
             break
@@ -119,7 +119,8 @@ def attack(
         on_step(Step(step, found.loss, found.fooled, search.shown(point), search.least_left(point, step)))
     ended = state.step + steps == total or finished(point.memory, goal)
     delta = search.saved(point.delta) if ended else point.delta
-    return AttackState(state.step + steps, objective.split(delta), _split(objective, point.memory))
+    momenta = {} if point.momentum is None else objective.split(point.momentum)
+    return AttackState(state.step + steps, objective.split(delta), point.memory, momenta)
 
 
 def _in_blocks(
@@ -146,28 +147,3 @@ def _box(objective: Objective, deltas: Textures, budget: Budget) -> Box:
         box = budget.box(texture, halvings(size, texture.shape), bound=bound)
         low[name], high[name] = box.low, box.high
     return Box(budget, objective.join(low), objective.join(high), objective.join(bounds) if bounds else None)
-
-
-def _joined(objective: Objective, state: AttackState) -> Memory:
-    """Memory per texel of all textures (texels of all, n) as memory of the texels that may move; the rest as it is."""
-    sizes = [delta.shape[:2] for delta in state.deltas.values()]
-
-    def joined(value: Tensor) -> Tensor:
-        if value.ndim != 2:
-            return value
-        parts = torch.split(value, [height * width for height, width in sizes])
-        tables = [part.view(*size, -1) for part, size in zip(parts, sizes, strict=True)]
-        return objective.join(dict(zip(objective.textures, tables, strict=True)))
-
-    return {name: joined(value) for name, value in state.memory.items()}
-
-
-def _split(objective: Objective, memory: Memory) -> Memory:
-    """The inverse of ``_joined``; zero for fixed texels."""
-
-    def split(value: Tensor) -> Tensor:
-        if value.ndim != 2:
-            return value
-        return torch.cat([table.flatten(0, 1) for table in objective.split(value).values()])
-
-    return {name: split(value) for name, value in memory.items()}

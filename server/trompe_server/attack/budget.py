@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from trompe_server.surrogate import tensor_of
 from trompe_server.surrogate.blocks import common_change, halvings, repeated, rooms
 from trompe_shared.api import levels_within
 from trompe_shared.errors import SpecError
@@ -77,7 +78,7 @@ class Budget:
         """``obj`` with textures changed by ``deltas``, as for ``quantise``."""
         return obj.with_textures(
             {
-                name: self.quantise(delta, torch.from_numpy(obj.textures[name]).to(delta.device)).cpu().numpy()
+                name: self.quantise(delta, tensor_of(obj.textures[name]).to(delta.device)).cpu().numpy()
                 for name, delta in deltas.items()
             }
         )

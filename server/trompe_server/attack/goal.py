@@ -1,7 +1,8 @@
 """Goal of the attack: the loss to maximise, and the condition of success."""
 
+import operator
 from dataclasses import dataclass
-from typing import Final, get_args
+from typing import Final, SupportsIndex, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -28,7 +29,7 @@ class Goal:
     ``cross_entropy``. safe: margin from which a view is safely won. Raises ``SpecError`` for contradictory options.
     """
 
-    label: int | tuple[int, ...]
+    label: SupportsIndex | tuple[int, ...]
     target: int | None = None
     top_k: int = 1
     loss: Loss = "margin"
@@ -49,7 +50,7 @@ class Goal:
     @property
     def labels(self) -> tuple[int, ...]:
         """All classes that count as the object."""
-        return (self.label,) if isinstance(self.label, int) else self.label
+        return (operator.index(self.label),) if isinstance(self.label, SupportsIndex) else self.label
 
     def check(self, n_classes: int) -> None:
         """Raise ``SpecError`` for a goal that does not fit a classifier of ``n_classes`` classes."""

@@ -9,7 +9,7 @@ Textures are one flat tensor (texels or blocks of them, 3). One without gradient
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
@@ -31,10 +31,11 @@ TINY: Final = 1e-30
 
 @dataclass(frozen=True)
 class Iterate:
-    """Current point of a run: the change of the textures, and the memory of the search by name."""
+    """Current point of a run: the change of the textures, the memory of the search by name, accumulated gradients."""
 
     delta: Flat
     memory: Memory
+    momentum: Flat | None = None
 
 
 def step_factor(done: int, length: int) -> float:
@@ -62,13 +63,13 @@ class Optimiser:
 
 
 def _pgd(point: Iterate, gradient: Flat, factor: float, box: Box) -> Iterate:
-    return Iterate(box.ascend(point.delta, gradient), {})
+    return replace(point, delta=box.ascend(point.delta, gradient))
 
 
 def _nesterov(point: Iterate, gradient: Flat, factor: float, box: Box) -> Iterate:
     size = max(float(gradient.abs().sum()), TINY)
     mean = _momentum(point).mul(MOMENTUM).add_(gradient, alpha=1 / size)
-    return Iterate(box.ascend(point.delta, mean, factor), {"momentum": mean})
+    return replace(point, delta=box.ascend(point.delta, mean, factor), momentum=mean)
 
 
 def _ahead(point: Iterate, factor: float, box: Box) -> Flat:
@@ -76,7 +77,7 @@ def _ahead(point: Iterate, factor: float, box: Box) -> Flat:
 
 
 def _momentum(point: Iterate) -> Tensor:
-    return point.memory.get("momentum", torch.zeros_like(point.delta))
+    return torch.zeros_like(point.delta) if point.momentum is None else point.momentum
 
 
 OPTIMISERS: Final[Mapping[OptimiserName, Optimiser]] = {

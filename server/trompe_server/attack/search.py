@@ -51,9 +51,10 @@ def finished(memory: Memory, goal: Goal) -> bool:
     return float(memory.get(SAFE, goal.safe)) > SAFE_ENOUGH > goal.safe
 
 
-def went_on(memory: Memory, *, shown: int, added: int) -> Memory:
+def went_on(memory: Memory, goal: Goal, *, shown: int, added: int) -> Memory:
     """Memory of a search that has looked at ``shown`` further images and ``added`` views: these ask for more steps."""
-    safe = {SAFE: memory[SAFE].clamp(max=SAFE_ENOUGH / RISE**AGAIN)} if added and SAFE in memory else {}
+    sooner = added and SAFE in memory and goal.safe < SAFE_ENOUGH
+    safe = {SAFE: memory[SAFE].clamp(max=SAFE_ENOUGH / RISE**AGAIN)} if sooner else {}
     return {**memory, **safe, SHOWN: memory.get(SHOWN, torch.tensor(0)) + shown}
 
 
@@ -135,9 +136,8 @@ class Search:
         gradient = found.gradient.mul_(self.movable)
         if len(gradient) and any(gradient.aminmax()):  # gradient.any() would take four times as long
             moved = OPTIMISERS[self.optimiser].step(point, gradient, step_factor(step, self.total), self.box)
-            own = {name: value for name, value in point.memory.items() if name in {RESUME, SHOWN, SAFE}}
             delta = moved.delta if self.view_budget is None else self.view_budget.project(moved.delta)
-            point = Iterate(delta, {**own, **moved.memory})
+            point = replace(moved, delta=delta)
         masked = self.objective.masks is not None
         return self._no_worse(point) if masked and step + 1 == self.total else point
 
@@ -150,4 +150,4 @@ class Search:
         unpainted = torch.zeros_like(point.delta)
         best = max(point.delta, unpainted, key=self.objective.score)
         shown = self.shown(point) + 2 * self.objective.surrogate.n_views
-        return Iterate(best, {**point.memory, SHOWN: torch.tensor(shown)})
+        return replace(point, delta=best, memory={**point.memory, SHOWN: torch.tensor(shown)})

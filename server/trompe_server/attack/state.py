@@ -11,7 +11,7 @@ from torch import Tensor
 from trompe_server.attack.objective import Textures
 from trompe_server.storage.arrays import pack_arrays, unpack_arrays
 
-DELTA, MEMORY = "delta:", "memory:"
+DELTA, MEMORY, MOMENTUM = "delta:", "memory:", "momentum:"
 """Prefixes of array names in the file."""
 
 STEP: Final = "step"
@@ -22,17 +22,19 @@ class AttackState:
     """Input of the next step.
 
     deltas: change of each texture after ``step`` steps, in sRGB units of [0, 1], or of the means of its blocks of
-    texels (``surrogate.blocks``), which the first step chooses. memory: tensors of the search by name.
+    texels (``surrogate.blocks``), which the first step chooses. memory: tensors of the search by name. momentum:
+    accumulated gradients as ``deltas``, zero for fixed texels; empty if the optimiser has none.
     """
 
     step: int
     deltas: Textures
     memory: Mapping[str, Tensor] = field(default_factory=dict)
+    momentum: Textures = field(default_factory=dict)
 
     def to(self, device: torch.device) -> "AttackState":
         """The same state on a device; a loaded state is on the CPU."""
-        deltas, memory = ({key: value.to(device) for key, value in each.items()} for each in (self.deltas, self.memory))
-        return AttackState(self.step, deltas, memory)
+        tables = (self.deltas, self.memory, self.momentum)
+        return AttackState(self.step, *({key: value.to(device) for key, value in each.items()} for each in tables))
 
 
 def start(textures: Textures) -> AttackState:
@@ -42,7 +44,7 @@ def start(textures: Textures) -> AttackState:
 
 def save_state(state: AttackState) -> bytes:
     """A state as an .npz file; exact."""
-    tables = {DELTA: state.deltas, MEMORY: state.memory}
+    tables = {DELTA: state.deltas, MEMORY: state.memory, MOMENTUM: state.momentum}
     arrays = {prefix + name: table[name].cpu().numpy() for prefix, table in tables.items() for name in table}
     return pack_arrays({STEP: np.array(state.step)} | arrays, compressed=False)
 
@@ -57,4 +59,4 @@ def load_state(data: bytes) -> AttackState:
         names = [name for name in arrays if name.startswith(prefix)]
         return {name.removeprefix(prefix): torch.from_numpy(arrays[name]) for name in names}
 
-    return AttackState(int(arrays[STEP]), table(DELTA), table(MEMORY))
+    return AttackState(int(arrays[STEP]), table(DELTA), table(MEMORY), table(MOMENTUM))

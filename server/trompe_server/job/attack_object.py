@@ -11,7 +11,14 @@ import numpy as np
 from trompe_server.attack import Budget, Goal, ViewDistribution, attack, start
 from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
 from trompe_server.image_pipelines import PIPELINES
-from trompe_server.job.setup import HELD_OUT_STREAM, POOL_STREAM, PROBE_STREAM, SAFE_MARGINS
+from trompe_server.job.setup import (
+    HELD_OUT_STREAM,
+    POOL_STREAM,
+    PROBE_STREAM,
+    SAFE_MARGINS,
+    JobRenderer,
+    noise_numbers,
+)
 from trompe_server.judging.metrics import accuracy
 from trompe_server.renderers import TargetRenderer
 from trompe_server.spec.framing import framing_of
@@ -19,7 +26,7 @@ from trompe_server.spec.labels import resolve_labels
 from trompe_server.surrogate import textures_of
 from trompe_server.surrogate.calibration import build_surrogate, calibrate
 from trompe_shared.api import Accuracy, PipelineName, ViewOptions
-from trompe_shared.errors import ClassifierError
+from trompe_shared.errors import ClassifierError, SpecError
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
@@ -30,12 +37,12 @@ VIEWS: Final = 40
 
 @dataclass(frozen=True)
 class AttackedObject:
-    """A repainted object, and its accuracies in the surrogate, in the target and on held-out views of the target."""
+    """A repainted object, and its accuracies in the surrogate, in the target and, if any, on its held-out views."""
 
     painted: Object3D
     surrogate: Accuracy
     target: Accuracy
-    held_out: Accuracy
+    held_out: Accuracy | None = None
 
 
 def attack_object(
@@ -54,11 +61,14 @@ def attack_object(
     """Repaint ``obj`` so that ``classifier`` no longer recognises ``label`` in the images of ``target``.
 
     Each of several labels counts as the object. ``obj`` and ``classifier`` can be paths or names of shipped ones, such
-    as ``mug`` and ``tiny``. ``views`` and ``held_out`` default to random cameras and lights that frame the object.
+    as ``mug`` and ``tiny``. ``views`` and ``held_out`` (which may be empty) default to random cameras and lights that
+    frame the object.
     ``budget`` defaults to epsilon 0.05, alpha 0.01. ``image_pipeline``: random changes of the attack's images before
     the classifier, as for a job. The same arguments give the same bytes. Raises ``TrompeError`` for inputs that cannot
     be read or do not fit together.
     """
+    if views is not None and not len(views):
+        raise SpecError("There are no `views` to attack: give at least one, or leave `views` out for random ones.")
     obj = obj if isinstance(obj, Object3D) else _load(obj)
     network = load_classifier(classifier) if isinstance(classifier, str | Path) else classifier
     if not isinstance(network, WhiteBoxClassifier):
@@ -67,15 +77,22 @@ def attack_object(
     goal = Goal(labels, safe=SAFE_MARGINS[image_pipeline])
     framing = framing_of(obj, ViewOptions())
     cameras = ViewDistribution(framing.distance, framing.elevation, centre=framing.centre)
-    own, unseen = (
+    first, others = (
         cameras.sample(VIEWS, generator=np.random.default_rng([seed, stream])) if given is None else given
         for given, stream in ((views, POOL_STREAM), (held_out, HELD_OUT_STREAM))
     )
+    renderer = JobRenderer(target, target.engine, attacked=True, noise=noise_numbers(target.engine, seed))
+    own, unseen = renderer.shown(first), renderer.shown(others, held_out=True)
     budget = budget or Budget(epsilon=0.05, alpha=0.01)
 
     ask = partial(target.render, size=network.image_size)
     clean = ask(obj, own)
-    calibration = calibrate(obj, own, clean, ask, wanted="auto", generator=np.random.default_rng([seed, PROBE_STREAM]))
+    calibration = calibrate(
+        *(obj, own, clean, ask),
+        wanted="auto",
+        generator=np.random.default_rng([seed, PROBE_STREAM]),
+        deterministic=renderer.engine.deterministic,
+    )
     surrogate, textures = build_surrogate(calibration, obj, own, clean), textures_of(obj)
     state = attack(
         start(textures),
@@ -93,8 +110,9 @@ def attack_object(
     images = [
         [surrogate.images(each) for each in (obj, painted)],
         [clean, ask(painted, own)],
-        [ask(each, unseen) for each in (obj, painted)],
     ]
+    if unseen:
+        images.append([ask(each, unseen) for each in (obj, painted)])
     judged = [accuracy(network.predict(before), network.predict(after), goal.labels) for before, after in images]
     return AttackedObject(painted, *judged)
 

@@ -9,13 +9,12 @@ from functools import partial
 from typing import Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from trompe_server.job.files import JobFiles
 from trompe_server.job.setup import PROBE_STREAM, JobSetup
 from trompe_server.storage.arrays import pack_arrays, unpack_arrays
 from trompe_server.storage.folders import Folder
-from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry
+from trompe_server.surrogate import Geometry, Image8, SamplingModel, Surrogate, prepare_geometry
 from trompe_server.surrogate.calibration import Calibration, build_surrogate, calibrate
 from trompe_server.surrogate.calibration_file import calibration_key, pack_calibration, unpack_calibration
 from trompe_server.surrogate.tone import Ask, ToneMap, measure_tone_map
@@ -27,7 +26,6 @@ logger = logging.getLogger(__name__)
 TONE_VERSION: Final = 1
 """To be raised whenever the same images can give another tone curve."""
 
-Image8 = NDArray[np.uint8]
 T = TypeVar("T")
 
 

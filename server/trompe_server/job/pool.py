@@ -20,7 +20,7 @@ from trompe_server.attack.goal import SAFE_MARGIN
 from trompe_server.attack.search import finished, went_on
 from trompe_server.job.files import JobFiles
 from trompe_server.job.setup import JobSetup
-from trompe_server.surrogate import Geometry, Surrogate, prepare_geometry
+from trompe_server.surrogate import Geometry, Image8, Surrogate, prepare_geometry
 from trompe_server.surrogate.calibration import Calibration, build_surrogate, painted_grey
 from trompe_server.surrogate.tone import Ask
 from trompe_shared.geometry import View
@@ -34,8 +34,6 @@ FEW_LOST: Final = 0.02
 
 LEAST_KNOWN: Final = 0.25
 """Share of recognised views below which no more views are looked at."""
-
-Image8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -99,7 +97,7 @@ class GrowingPool:
         renders = len(further) + len(views) * (1 + len(self._calibration.greys))
         self._files.save_look(chunk, arrays, views=len(views), renders=renders)
         self._looks[chunk] = self._opened(arrays, geometry)
-        return replace(state, memory=went_on(state.memory, shown=len(further), added=len(views)))
+        return replace(state, memory=went_on(state.memory, setup.goal, shown=len(further), added=len(views)))
 
     @property
     def _seen(self) -> int:

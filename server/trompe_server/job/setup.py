@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from trompe_server.attack import (
     Backgrounds,
@@ -34,6 +33,7 @@ from trompe_server.renderers import BackdropTarget, TargetRenderer, fitted
 from trompe_server.spec.checks import check_gradients, check_keep, check_members
 from trompe_server.spec.framing import Framing, framing_of
 from trompe_server.spec.labels import resolve_label, resolve_labels
+from trompe_server.surrogate import Image8
 from trompe_shared.api import JobSpec, PipelineName
 from trompe_shared.colours import colour_of
 from trompe_shared.engine import EngineInfo
@@ -55,7 +55,6 @@ KEPT_NETWORKS: Final = 2
 """Classifiers that stay loaded for the next job: loading one takes seconds."""
 
 SAILENV: Final = "sailenv"
-Image8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

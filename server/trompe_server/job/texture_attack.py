@@ -45,7 +45,7 @@ from trompe_server.library import Library
 from trompe_server.pictures import heat_textures
 from trompe_server.renderers import TargetRenderer
 from trompe_server.storage.folders import Folder
-from trompe_server.surrogate import AnySurrogate, Painted, Surrogate, joined, textures_of
+from trompe_server.surrogate import AnySurrogate, Image8, Painted, Surrogate, joined, textures_of
 from trompe_server.surrogate.calibration import Calibration
 from trompe_shared.api import JobSpec, JobState, Progress
 from trompe_shared.geometry import View
@@ -71,7 +71,6 @@ RECENT: Final = 10
 AS_PREPARED: Final = 1.5
 """The last phase takes this many times as long as the first; measured: 0.8 to 1.9."""
 
-Image8 = NDArray[np.uint8]
 Ask = Callable[[JobRenderer, Object3D, Sequence[View]], Image8]
 
 
@@ -219,10 +218,11 @@ class TextureAttack:
             self.files.save_state(chunk + 1, after)
         if taken:
             self._preview(after)
-            queries = (self.setup.queries or 0) - asked
-            self._counts["attack_steps"] += len(taken)
-            self._counts["classifier_images"] += taken[-1].evaluations - int(before.memory.get(SHOWN, 0))
-            self.files.note_spent(chunk, steps=len(taken), evaluations=taken[-1].evaluations, queries=queries)
+        shown_before, shown = (int(each.memory.get(SHOWN, 0)) for each in (before, after))
+        self._counts["attack_steps"] += len(taken)
+        self._counts["classifier_images"] += shown - shown_before
+        queries = (self.setup.queries or 0) - asked
+        self.files.note_spent(chunk, steps=len(taken), evaluations=shown, queries=queries)
         return PhaseReport(last, then="judge" if ended else None)
 
     def _ended(self, state: AttackState) -> bool:

@@ -7,16 +7,8 @@ from typing import Final
 from PIL import Image
 
 from trompe_server.judgement.manifest import Judged
-from trompe_server.pictures import (
-    contact_sheet,
-    difference_strip,
-    hardest_and_easiest,
-    representative,
-    texture_sheet,
-)
+from trompe_server.pictures import difference_strip, texture_sheet, views_sheet
 
-SHEET_VIEWS: Final = 12
-DIFFERENCE_VIEWS: Final = 4
 QUALITY: Final = 88
 """Of JPEG: half a megabyte a sheet."""
 
@@ -28,9 +20,8 @@ def judgement_pictures(judged: Judged) -> Mapping[str, bytes]:
         if judged.judges:
             sheets[f"Views in {renderer}"] = _views(judged, renderer, next(iter(judged.judges)))
         if judged.pair.is_one:
-            few = representative(len(judged.views), DIFFERENCE_VIEWS)
             title = f"Change in {renderer}"
-            sheets[title] = difference_strip(images["before"][few], images["after"][few], title=title)
+            sheets[title] = difference_strip(images["before"], images["after"], title=title)
     before, after = judged.pair.textures
     if before:
         sheets["Textures"] = texture_sheet(before, after, title="Textures")
@@ -40,19 +31,11 @@ def judgement_pictures(judged: Judged) -> Mapping[str, bytes]:
 def _views(judged: Judged, renderer: str, network: str) -> Image.Image:
     judge, both, images = judged.judges[network], judged.both(renderer, network), judged.images[renderer]
     assert both is not None  # the renderer has images, and the network was loaded
-    old, new = map(judge.verdicts, both)
-    recognised = [index for index, verdict in enumerate(old) if verdict.correct]
-    cameras = [view.camera for view in judged.views]
-    shown = (
-        hardest_and_easiest(recognised, new, cameras, SHEET_VIEWS)
-        if recognised
-        else representative(len(old), SHEET_VIEWS)
-    )
-    fooled = sum(not new[index].correct for index in recognised)
-    return contact_sheet(
-        [(images["before"][k], images["after"][k], old[k], new[k]) for k in shown],
+    return views_sheet(
+        (images["before"], images["after"]),
+        (judge.verdicts(both[0]), judge.verdicts(both[1])),
+        [view.camera for view in judged.views],
         title=f"{network} in {renderer}",
-        facts=f"Recognised before in {len(recognised)} of {len(old)} views; {fooled} of these are fooled.",
     )
 
 

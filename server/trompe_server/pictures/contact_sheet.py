@@ -23,6 +23,8 @@ from trompe_server.pictures.layout import (
 )
 from trompe_shared.geometry import Camera, spherical
 
+VIEWS: Final = 12
+"""Most views on a sheet."""
 TILE: Final = 168
 """Width of an image on the sheet, without its frame."""
 FRAME: Final = 4
@@ -83,15 +85,38 @@ def _spread(ranked: NDArray[np.int64], directions: Float[np.ndarray, "n 3"], k: 
     return chosen
 
 
-def contact_sheet(
-    views: Sequence[tuple[Images, Images, Verdict, Verdict]], *, title: str, facts: str, columns: int = 3
+def views_sheet(
+    images: tuple[Images, Images],
+    verdicts: tuple[Sequence[Verdict], Sequence[Verdict]],
+    cameras: Sequence[Camera],
+    *,
+    title: str,
+    distinct: Sequence[int] | None = None,
 ) -> Image.Image:
+    """The contact sheet of the views recognised before, or of representative ones if none is.
+
+    images (N, H, W, 3), verdicts: of all views, before and after. distinct: indices of the distinct views, by default
+    all.
+    """
+    (before, after), (old, new) = images, verdicts
+    own = range(len(old)) if distinct is None else distinct
+    recognised = [k for k in own if old[k].correct]
+    shown = hardest_and_easiest(recognised, new, cameras, VIEWS) or [own[k] for k in representative(len(own), VIEWS)]
+    fooled, which = sum(not new[k].correct for k in recognised), "" if len(own) == len(old) else "distinct "
+    facts = f"Recognised before in {len(recognised)} of {len(own)} {which}views; {fooled} of these are fooled."
+    if recognised:
+        some = "all" if len(shown) == len(recognised) else len(shown)
+        facts += f" Below: {some} of the recognised ones, from the hardest to fool to the easiest."
+    return contact_sheet([(before[k], after[k], old[k], new[k]) for k in shown], title=title, facts=facts)
+
+
+def contact_sheet(views: Sequence[tuple[Images, Images, Verdict, Verdict]], *, title: str, facts: str) -> Image.Image:
     """Images (H, W, 3) of each view before and after, framed green if classified as the object and red if not.
 
     views: with the verdicts on both images. facts: a line below the title. Raises ``ValueError`` if there is no view.
     """
     cards = [beside([_judged(old, was), _judged(new, now)], gap=2) for old, new, was, now in views]
-    return sheet(cards, columns=columns, title=f"{title} - left before, right after", legend=line(facts))
+    return sheet(cards, columns=3, title=f"{title} - left before, right after", legend=line(facts))
 
 
 def _judged(image: Images, verdict: Verdict) -> Image.Image:
@@ -99,4 +124,4 @@ def _judged(image: Images, verdict: Verdict) -> Image.Image:
     colour = GREEN if verdict.correct else RED
     picture = ImageOps.expand(tile(image, TILE), FRAME, colour)
     name = shortened(verdict.label.split(",")[0], TILE - CONFIDENCE, size=CAPTION)
-    return captioned(picture, f"{name} {verdict.confidence:.0%}", colour=colour)
+    return captioned(picture, f"{name} {verdict.confidence:.0%}", colour=colour, width=TILE + 2 * FRAME)

@@ -26,29 +26,27 @@ NAMES: Final = 260
 BARS: Final = 520
 COUNTS: Final = 90
 LETTERS: Final = 12
+TOP: Final = 10
+"""Most classes with a bar of their own, beside the object's."""
 
 
 def prediction_histogram(
-    before: Mapping[str, int], after: Mapping[str, int], *, labels: Sequence[str], title: str, top: int = 10
+    before: Mapping[str, int], after: Mapping[str, int], *, labels: Sequence[str], title: str
 ) -> Image.Image:
     """Bars with the number of views predicted as each class (by name) before and after.
 
-    The object's classes ``labels`` come first, even with no view; then the ``top`` most frequent others; then one bar
+    The object's classes ``labels`` come first, even with no view; then the ``TOP`` most frequent others; then one bar
     for the rest. Raises ``ValueError`` if ``before`` has no view.
     """
     if not sum(before.values()):
         raise ValueError("a histogram of predictions needs at least one view")
     others = sorted({*before, *after} - {*labels}, key=lambda name: (-before.get(name, 0) - after.get(name, 0), name))
-    named = {name: f"{_short(name)} (the object)" for name in labels} | {name: _short(name) for name in others[:top]}
+    named = {name: f"{name} (the object)" for name in labels} | {name: name for name in others[:TOP]}
     rows = [_row(said, (before.get(name, 0), after.get(name, 0)), before, after) for name, said in named.items()]
-    if rest := others[top:]:
+    if rest := others[TOP:]:
         counts = sum(before.get(name, 0) for name in rest), sum(after.get(name, 0) for name in rest)
         rows.append(_row(f"{len(rest)} other classes", counts, before, after))
     return sheet([stacked(rows, gap=GAP)], columns=1, title=title, legend=_legend(before, after))
-
-
-def _short(name: str) -> str:
-    return name.split(",")[0]
 
 
 def _row(name: str, counts: tuple[int, int], before: Mapping[str, int], after: Mapping[str, int]) -> Image.Image:

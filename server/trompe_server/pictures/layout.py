@@ -79,26 +79,27 @@ def swatch(ground: Colour, *, outline: Colour | None = None) -> Image.Image:
 
 
 def tile(image: Images, width: int) -> Image.Image:
-    """An (H, W, 3) image scaled to ``width``: filtered down, but enlarged in visible pixels."""
+    """An (H, W, 3) image scaled to fit a square of ``width``: filtered down, but enlarged in visible pixels."""
     picture = Image.fromarray(np.ascontiguousarray(image))
-    height = max(1, round(width * picture.height / picture.width))
-    return picture.resize(
-        (width, height), Image.Resampling.LANCZOS if width < picture.width else Image.Resampling.NEAREST
-    )
+    longest = max(picture.size)
+    columns, rows = (max(1, round(width * side / longest)) for side in picture.size)
+    return picture.resize((columns, rows), Image.Resampling.LANCZOS if width < longest else Image.Resampling.NEAREST)
 
 
-def captioned(picture: Image.Image, text: str, *, colour: Colour = INK) -> Image.Image:
-    """The picture with one centred line of text below, shortened to its width."""
+def captioned(picture: Image.Image, text: str, *, colour: Colour = INK, width: int = 0) -> Image.Image:
+    """The picture, centred in ``width`` if narrower, with one centred line of text below, shortened to fit."""
+    spare = max(0, width - picture.width)
+    picture = ImageOps.expand(picture, (spare // 2, 0, spare - spare // 2, 0), PAPER)
     return stacked([picture, line(text, picture.width, colour=colour, align="centre")], gap=0)
 
 
 def framed(pictures: Mapping[str, Images], width: int) -> Image.Image:
-    """(H, W, 3) images side by side, scaled to ``width`` and framed, each above its caption."""
-    return beside([captioned(frame(image, width), text) for text, image in pictures.items()])
+    """(H, W, 3) images side by side, scaled to fit squares of ``width`` and framed, each above its caption."""
+    return beside([captioned(frame(image, width), text, width=width + 2) for text, image in pictures.items()])
 
 
 def frame(image: Images, width: int) -> Image.Image:
-    """An (H, W, 3) image scaled to ``width``, in a thin frame."""
+    """An (H, W, 3) image scaled to fit a square of ``width``, in a thin frame."""
     return ImageOps.expand(tile(image, width), 1, INK)
 
 

@@ -106,12 +106,12 @@ def saliency_sheet(
 def _card(image: Images, saliency: Float[np.ndarray, "H W"], tau: float | None) -> Image.Image:
     painted = tile(heat_over(image, saliency), TILE)
     if tau is None:
-        return captioned(painted, f"largest {saliency.max():.2f}")
+        return captioned(painted, f"largest {saliency.max():.2f}", width=TILE)
     mask = saliency >= tau
     large = np.array(Image.fromarray(mask).resize(painted.size, Image.Resampling.NEAREST))
     outlined = np.array(painted)
     outlined[large & ~binary_erosion(large)] = OUTLINE  # its pixels with a neighbour outside
-    return captioned(Image.fromarray(outlined), f"{mask.mean():.1%} of pixels at or above {tau:g}")
+    return captioned(Image.fromarray(outlined), f"{mask.mean():.1%} of pixels at or above {tau:g}", width=TILE)
 
 
 def heat_textures(textures: Textures, scores: Scores) -> dict[str, Images]:
@@ -134,11 +134,11 @@ def _row(name: str, texture: Images, painted: Images, scores: Scores) -> Image.I
     texels = scores[name].size
     half = _texels_with_half(scores[name])
     facts = f"{name}: half of its saliency is on {half / texels:.1%} of its texels" if half else f"{name}: never seen"
-    return captioned(beside([frame(texture, TILE), frame(painted, TILE)]), facts)
+    return captioned(beside([frame(texture, TILE), frame(painted, TILE)]), facts, width=2 * TILE + GAP)
 
 
 def saliency_object_sheet(
-    images: Images, saliency: Float[np.ndarray, "n H W"], rendered: Images, *, title: str, columns: int = 2
+    images: Images, saliency: Float[np.ndarray, "n H W"], rendered: Images, *, title: str
 ) -> Image.Image:
     """For each view: the target's image (N, H, W, 3), the saliency of the view over it, and the object in its heat.
 
@@ -146,7 +146,7 @@ def saliency_object_sheet(
     """
     cards = [_triple(*view) for view in zip(images, saliency, rendered, strict=True)]
     legend = heat_legend(f"saliency, 1 is that of the top {TOP:.1%} of a view's pixels, or of the texels")
-    return sheet(cards, columns=columns, title=title, legend=legend)
+    return sheet(cards, columns=2, title=title, legend=legend)
 
 
 def _triple(image: Images, saliency: Float[np.ndarray, "H W"], rendered: Images) -> Image.Image:

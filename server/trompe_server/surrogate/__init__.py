@@ -5,12 +5,14 @@ from trompe_server.surrogate.joint import AnyCanvas, AnySurrogate, JointSurrogat
 from trompe_server.surrogate.sampling import SamplingModel
 from trompe_server.surrogate.surrogate import (
     Geometry,
+    Image8,
     Painted,
     Surrogate,
     behind,
     curve_surrogate,
     diffuse_surrogate,
     prepare_geometry,
+    tensor_of,
     textures_of,
 )
 
@@ -19,6 +21,7 @@ __all__ = [
     "AnySurrogate",
     "Canvas",
     "Geometry",
+    "Image8",
     "JointSurrogate",
     "Painted",
     "SamplingModel",
@@ -28,5 +31,6 @@ __all__ = [
     "diffuse_surrogate",
     "joined",
     "prepare_geometry",
+    "tensor_of",
     "textures_of",
 ]

@@ -6,13 +6,12 @@ its prediction of the change that the noise makes in the target's images.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property, lru_cache, partial
 from itertools import product
 from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from trompe_server.surrogate.fidelity import Fidelity, measure_fidelity
 from trompe_server.surrogate.rasterize import Visibility
@@ -20,6 +19,7 @@ from trompe_server.surrogate.sampling import SamplingModel
 from trompe_server.surrogate.surrogate import (
     NO_BACKDROPS,
     Geometry,
+    Image8,
     Painted,
     Surrogate,
     curve_surrogate,
@@ -48,7 +48,6 @@ KEPT_BYTES: Final = 2**29
 KEPT_RASTERS: Final = 2
 """The best hypothesis and the one that is tried."""
 
-Image8 = NDArray[np.uint8]
 MeasureToneMap = Callable[[Ask, tuple[int, int]], ToneMap]
 
 
@@ -225,18 +224,17 @@ def _biased(model: SamplingModel, by: float) -> SamplingModel:
     return model.but(bias=round(model.bias + by, 4))
 
 
-def _shifted_right(model: SamplingModel, by: float) -> SamplingModel:
-    return model.but(shift=(round(min(1.0, max(-1.0, model.shift[0] + by)), 4), model.shift[1]))
-
-
-def _shifted_down(model: SamplingModel, by: float) -> SamplingModel:
-    return model.but(shift=(model.shift[0], round(min(1.0, max(-1.0, model.shift[1] + by)), 4)))
+def _shifted(model: SamplingModel, by: float, *, axis: int) -> SamplingModel:
+    shift = list(model.shift)
+    shift[axis] = round(min(1.0, max(-1.0, shift[axis] + by)), 4)
+    return model.but(shift=tuple(shift))
 
 
 def _centred(best: SamplingModel, score: Score) -> SamplingModel:
     """``best`` with its pixel shift, if any, refined by parabolas of decreasing step."""
     for step in SHIFT_STEPS if any(best.shift) else ():
-        best = _peaked(_peaked(best, _shifted_right, step, score), _shifted_down, step, score)
+        for axis in range(2):
+            best = _peaked(best, partial(_shifted, axis=axis), step, score)
     return best
 
 

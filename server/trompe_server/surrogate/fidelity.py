@@ -5,10 +5,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from trompe_server.surrogate.surrogate import Painted, Surrogate, ViewBatch, painted
+from trompe_server.surrogate.surrogate import Image8, Painted, Surrogate, ViewBatch, painted
 from trompe_shared.object3d import Object3D
 
 MAX_ERROR: Final = 1.5 / 255
@@ -16,8 +15,6 @@ MAX_ERROR: Final = 1.5 / 255
 
 MIN_EXPLAINED: Final = 0.8
 """Smallest share of the variance of a random repaint's effect that a model within tolerance explains."""
-
-Image8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

@@ -139,7 +139,7 @@ class Painted:
     def _chains(self, geometry: Geometry, filtered: str, rounded: bool) -> tuple[StoredChain, ...]:
         table = torch.arange(256, device=self.device) / 255
         table = decode(table) if filtered == "linear" else table
-        textures = [torch.from_numpy(self.obj.textures[name]).to(self.device) for name in geometry.textures]
+        textures = [tensor_of(self.obj.textures[name]).to(self.device) for name in geometry.textures]
         return tuple(StoredChain.of(texture, table, rounded=rounded) for texture in textures)
 
 
@@ -408,11 +408,9 @@ class Surrogate:
         images: Tensor = _RenderViews.apply(texels, self, batch, masks)  # type: ignore[no-untyped-call]
         return images
 
-    def render_all(
-        self, texels: Float[Tensor, "texels 3"], *, masks: Bool[Tensor, "views H W"] | None = None
-    ) -> Float[Tensor, "views 3 H W"]:
+    def render_all(self, texels: Float[Tensor, "texels 3"]) -> Float[Tensor, "views 3 H W"]:
         """The images of all views at once."""
-        return torch.cat([self.render(texels, batch, masks=masks) for batch in range(len(self.batches))])
+        return torch.cat([self.render(texels, batch) for batch in range(len(self.batches))])
 
     @torch.no_grad()
     def images(self, obj: Object3D) -> UInt8[np.ndarray, "views H W 3"]:
@@ -542,6 +540,7 @@ def curve_surrogate(
     shown = [torch.from_numpy(probe).to(base.device) for probe in probes]
     uncovered = _behind(geometry, views, backdrops)
     texels = painted(obj, geometry.device).texels(geometry)
+    tone = tone if tone is None else tone.to(geometry.device)
     by_chord, encoding = geometry.sampling.slope == "chord" and len(greys) == 2, geometry.sampling.encoding
     levels = torch.tensor(list(greys), dtype=torch.uint8, device=base.device)
     shadings: list[Shading] = []
@@ -594,4 +593,9 @@ def painted(obj: Object3D | Painted, device: torch.device) -> Painted:
 
 def textures_of(obj: Object3D, *, device: torch.device | str = "cpu") -> dict[str, Float[Tensor, "H W 3"]]:
     """The albedo textures of ``obj`` as sRGB floats in [0, 1], row 0 on top."""
-    return {name: torch.from_numpy(image).to(device).float() / 255 for name, image in obj.textures.items()}
+    return {name: tensor_of(image).to(device).float() / 255 for name, image in obj.textures.items()}
+
+
+def tensor_of(texture: Image8) -> UInt8[Tensor, "H W 3"]:
+    """A texture as a tensor, a flipped one too: torch takes no negative strides."""
+    return torch.from_numpy(np.ascontiguousarray(texture))

@@ -5,6 +5,7 @@ its colour and couple the channels. A chart of flat, matt patches shows the targ
 light: a curve for each channel through greys, and a table of residuals for the coupling.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trompe_server.surrogate.shading import GAIN, GAMMA, Chord, decode, decode_with_slope, encode, own_colours
+from trompe_shared.errors import SpecError
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View
 from trompe_shared.object3d import Object3D, encode_png, object_from_files
 
@@ -74,6 +76,10 @@ class ToneMap:
         """The fields by name."""
         return {field.name: getattr(self, field.name).numpy() for field in fields(self)}
 
+    def to(self, device: torch.device) -> "ToneMap":
+        """The same curve on a device."""
+        return ToneMap(*(getattr(self, field.name).to(device) for field in fields(self)))
+
     def with_slope(
         self, light: Float[Tensor, "pixels 3"]
     ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3 3"]]:
@@ -129,7 +135,8 @@ class ToneMap:
         count = len(self.residuals)
         step = place * (count - 1)
         low = step.floor().clamp_(max=count - 2)
-        first = low.long() @ torch.tensor([count * count, count, 1], device=place.device)
+        red, green, blue = low.long().unbind(1)  # CUDA multiplies no integer matrices
+        first = (red * count + green) * count + blue
         table = self.residuals.view(-1, 3)
         corners = torch.stack(
             [table[first + (r * count + g) * count + b] for r in (0, 1) for g in (0, 1) for b in (0, 1)]
@@ -192,12 +199,19 @@ def fit_tone(
 def measure_tone_map(ask: Ask, size: tuple[int, int]) -> ToneMap:
     """Measure the target's tone curve with a few images of a colour chart in front of the camera: 4 of 224 x 224.
 
-    size: (H, W) of the images. Raises ``ValueError`` if they are too small for a chart.
+    size: (H, W) of the images. Raises ``SpecError`` if they are too small for a chart.
     """
     if (rows := min(ROWS, int(FILLED * min(size) / PITCH))) < 2:
-        raise ValueError(f"a tone curve is measured on images of {3 * PITCH} pixels or more, not {size}")
+        least = math.ceil(2 * PITCH / FILLED)
+        raise SpecError(
+            f"A tone curve is measured on images of at least {least} x {least} pixels, and the network's are {size[0]} "
+            f"x {size[1]}: choose `surrogate: curve`, which needs none, or a network of larger images."
+        )
+    camera = Camera(DISTANCE * max(1.0, size[0] / size[1]), 0.0, 0.0)
     colours, dim = _colours()
-    shown, shown_dim = (_seen(ask, each, view, rows) for each, view in ((colours, VIEW), (dim, DIM_VIEW)))
+    shown, shown_dim = (
+        _seen(ask, each, View(camera, light), rows) for each, light in ((colours, LIGHT), (dim, DIM_LIGHT))
+    )
     greys, cube = shown[:GREYS], shown[GREYS:].reshape(LEVELS, LEVELS, LEVELS, 3)
     light, light_dim = (BRIGHTEST * _linear(each[:, 0]) for each in (colours[:GREYS], dim))
     black = min(GLOSS, key=lambda black: _mismatch(light + black, greys, DIM * (light_dim + black), shown_dim))
@@ -263,16 +277,16 @@ TEXELS: Final = 16
 SIDE: Final = 1.0
 """Side of the chart, metres."""
 FILLED: Final = 0.8
-"""Share of the picture's height that the chart fills."""
+"""Share of the picture's smaller side that the chart fills."""
 
-DISTANCE: Final = SIDE / 2 / FILLED / np.tan(np.radians(FIELD_OF_VIEW / 2))
+DISTANCE: Final = float(SIDE / 2 / FILLED / np.tan(np.radians(FIELD_OF_VIEW / 2)))
+"""Of the camera, for pictures as high as wide, or wider."""
 
 LIGHT: Final = Light(
     azimuth=0.0, elevation=45.0, intensity=float((BRIGHTEST - 128 / 255) * np.sqrt(2)), ambient=128 / 255
 )
 """Its reflection passes far below the camera. Ambient light is told to renderers in 8 bits."""
-VIEW: Final = View(Camera(float(DISTANCE), 0.0, 0.0), LIGHT)
-DIM_VIEW: Final = replace(VIEW, light=replace(LIGHT, intensity=DIM * LIGHT.intensity, ambient=DIM * LIGHT.ambient))
+DIM_LIGHT: Final = replace(LIGHT, intensity=DIM * LIGHT.intensity, ambient=DIM * LIGHT.ambient)
 
 
 def _chart(colours: NDArray[np.uint8]) -> Object3D:
@@ -295,7 +309,7 @@ def _chart(colours: NDArray[np.uint8]) -> Object3D:
 def _read(image: NDArray[np.uint8], rows: int) -> NDArray[np.float64]:
     """Mean colours (rows * rows, 3) of the patches' middles, in [0, 1]."""
     height, width = image.shape[:2]
-    pitch = FILLED * height / rows
+    pitch = FILLED * min(height, width) / rows
     centres = (np.arange(rows) + 0.5 - rows / 2) * pitch
     offsets = np.arange(-round(pitch / 5), round(pitch / 5) + 1)
     down, right = (np.round(side / 2 - 0.5 + centres)[:, None].astype(int) + offsets for side in (height, width))

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.attack_runs import EPS, SMALL, SQUARE, SURROGATE, random_state, run, surrogate_of
+from tests.attack_runs import EPS, SMALL, SQUARE, SURROGATE, random_state, run, same, surrogate_of
 from tests.surfaces import object_of, quad
-from trompe_server.attack import Budget
+from trompe_server.attack import Budget, start
 from trompe_server.attack.budget import HUE
 from trompe_server.attack.perception import perceptual_bounds
 from trompe_server.judging.visibility import perceived_change
@@ -94,6 +94,17 @@ def test_the_texture_that_is_saved_keeps_the_budget_in_whole_levels(epsilon: flo
     assert saved.dtype == torch.uint8
     assert change.max() <= np.floor(epsilon * 255 + 1e-6)
     assert (saved - (texture.float() + delta * 255)).abs().max() <= 1 + 1e-3
+
+
+def test_a_flipped_texture_is_a_texture() -> None:
+    flipped, copied = (
+        SQUARE.with_textures({name: make(image[::-1]) for name, image in SQUARE.textures.items()})
+        for make in (np.asarray, np.array)
+    )
+    change = {name: torch.full(image.shape, 0.02) for name, image in SQUARE.textures.items()}
+    assert same(start(textures_of(flipped)), start(textures_of(copied)))
+    assert (SURROGATE.images(flipped) == SURROGATE.images(copied)).all()
+    assert Budget(0.1, 0.1).repaint(flipped, change).files == Budget(0.1, 0.1).repaint(copied, change).files
 
 
 def test_a_change_of_nothing_saves_the_texture_as_it_is() -> None:

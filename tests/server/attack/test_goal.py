@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -180,6 +181,11 @@ def test_a_goal_that_contradicts_itself_is_refused(options: dict[str, Any], mess
 def test_a_goal_that_the_classifier_cannot_have_is_refused(goal: Goal, n_classes: int, message: str) -> None:
     with pytest.raises(SpecError, match=message):
         goal.check(n_classes)
+
+
+def test_a_class_may_be_a_number_of_numpy() -> None:
+    assert Goal(np.int64(3)) == Goal(3)
+    assert torch.equal(Goal(np.int64(3)).margins(torch.eye(5)), Goal(3).margins(torch.eye(5)))
 
 
 def test_a_goal_that_the_classifier_can_have_is_accepted() -> None:

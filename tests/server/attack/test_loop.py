@@ -39,7 +39,7 @@ from trompe_server.attack import (
     start,
 )
 from trompe_server.attack.goal import SAFE_MARGIN
-from trompe_server.attack.search import RISE, SAFE_ENOUGH
+from trompe_server.attack.search import RISE, SAFE_ENOUGH, went_on
 from trompe_server.classifiers import NetworkClassifier, load_classifier
 from trompe_server.judging.metrics import accuracy, texels_altered
 from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
@@ -430,6 +430,15 @@ def test_a_goal_with_an_unreachable_margin_runs_all_steps() -> None:
     assert all(90 < step.loss < 110 and step.fooled == 1 for step in seen)
     assert [step.least_left for step in seen] == list(range(40))[::-1]
     assert float(state.memory["search.safe"]) == 1000.0
+
+
+@pytest.mark.parametrize(
+    ("safe", "added", "after"), [(SAFE_MARGIN, 3, SAFE_ENOUGH / RISE**2), (SAFE_MARGIN, 0, 90.0), (90.0, 3, 90.0)]
+)
+def test_added_views_ask_for_more_steps_unless_the_goal_asks_for_all(safe: float, added: int, after: float) -> None:
+    memory = went_on({"search.safe": torch.tensor(90.0)}, Goal(LABEL, safe=safe), shown=7, added=added)
+    assert float(memory["search.safe"]) == pytest.approx(after)
+    assert int(memory["search.shown"]) == 7
 
 
 @pytest.mark.parametrize(

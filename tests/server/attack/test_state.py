@@ -20,10 +20,11 @@ def test_a_state_comes_back_exactly(seed: int, name: str) -> None:
     generator = torch.Generator().manual_seed(seed)
     deltas = {name: torch.randn(4, 5, 3, generator=generator), "other.png": torch.zeros(1, 1, 3)}
     memory = {name: torch.randn(20, 3, generator=generator), "count": torch.tensor(seed)}
-    state = AttackState(seed, deltas, memory)
+    state = AttackState(seed, deltas, memory, {name: torch.randn(4, 5, 3, generator=generator)})
     again = load_state(save_state(state))
     assert list(again.deltas) == list(state.deltas)
     assert same(again, state)
+    assert same(AttackState(seed, again.momentum), AttackState(seed, state.momentum))
 
 
 def test_arrays_come_back_exactly() -> None:

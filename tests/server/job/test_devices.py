@@ -24,6 +24,7 @@ MUG_VIEWS = [View(Camera(0.25, 60.0 * k, 20), Light(0, 60), (255, 255, 255)) for
 
 KINDS: dict[str, dict[str, Any]] = {
     "calibrated": {"surrogate": "calibrated"},
+    "measured tone": {"surrogate": "calibrated"},
     "curve, saliency": {"surrogate": "curve", "tau": 0.05},
     "few texels": {"keep": 0.2},
     "view budget": {"epsilon_view": 0.05, "optimiser": "pgd", "loss": "cross_entropy"},
@@ -38,6 +39,9 @@ def done(kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *, device: st
     if "queries" in KINDS[kind]:
         hidden = "trompe_server.job.setup._stored_classifier"
         monkeypatch.setattr(hidden, lambda _, *, device, **__: Scores(load_classifier("tiny", device=device)))
+    if kind == "measured tone":
+        measured = SamplingModel(encoding="measured")
+        monkeypatch.setattr("trompe_server.surrogate.calibration.find_physics", lambda *_: measured)
     spec = spec_of(steps=CHUNK + 1, **KINDS[kind])
     return run_job(spec, Library(folder), target=FakeTarget(2000), device=device).artifacts
 

@@ -69,14 +69,19 @@ def test_an_attack_that_loses_views_adds_those_it_has_not_safely_won(
     assert result.further_renders == seen + 3 * (result.attacked_views - 4)
 
 
+@pytest.mark.parametrize(("nearly_all", "steps"), [(0.99, 5), (0.0, 0)], ids=["steps follow", "no step follows"])
 def test_an_attack_that_loses_few_of_the_further_views_adds_none(
-    library: Library, monkeypatch: pytest.MonkeyPatch
+    library: Library, monkeypatch: pytest.MonkeyPatch, nearly_all: float, steps: int
 ) -> None:
+    monkeypatch.setattr("trompe_server.attack.search.NEARLY_ALL", nearly_all)
     monkeypatch.setattr("trompe_server.job.pool.LOOKS", (10,))
     monkeypatch.setattr("trompe_server.job.pool.FEW_LOST", 1.0)
     run = run_job(spec_of(**HARD), library)
     assert run.result.attacked_views == 4
     assert run.result.further_renders == 4
+    assert run.result.evaluations == run.counts("attack")["classifier_images"]
+    *_, last, _ = run.reports
+    assert run.reports[last].counts["attack_steps"] == steps
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,10 @@ from tests.fakes import FakeTarget
 from tests.job_runs import CHAIR, DarkTarget, run_job, setup_of, spec_of
 from trompe_server.classifiers import NetworkClassifier, load_classifier
 from trompe_server.formats import read_object, repaint_file, write_glb
+from trompe_server.image_pipelines import SUITE
 from trompe_server.job import texture_attack
 from trompe_server.job.files import Spent
-from trompe_server.job.report import ReportData, pictures
+from trompe_server.job.report import ReportData
 from trompe_server.job.report.models import model_files
 from trompe_server.job.report.warnings import _stronger, _wider
 from trompe_server.library import Library
@@ -168,6 +169,13 @@ class Turned(nn.Module):
         return logits.flip(1)
 
 
+def test_views_that_are_all_the_same_count_once(library: Library) -> None:
+    fixed = {"azimuth": (20, 20), "distance_factor": (1, 1), "light_azimuth": (0, 0), "light_elevation": (60, 60)}
+    result = run_job(spec_of(elevation=(20, 20), ranges=fixed, held_out=6, judges=["tiny"]), library).result
+    judged = [result.held_out, result.judges[0].held_out, *(each.held_out for each in result.image_pipelines)]
+    assert [(each.views, each.distinct) for each in judged if each] == [(6, 1), (6, 1), *[(3, 1)] * len(SUITE)]
+
+
 def test_an_attack_of_little_effect_says_so_with_a_remedy(library: Library) -> None:
     result = run_job(spec_of(epsilon=1 / 255, alpha=1 / 255, steps=1), library).result
     assert result.target.a_drop == 0
@@ -252,7 +260,7 @@ def test_the_contact_sheet_shows_recognised_views_alone_and_tells_their_number(
         sheets.append((views, facts))
         return Image.new("RGB", (8, 8))
 
-    monkeypatch.setattr(pictures, "contact_sheet", drawn)
+    monkeypatch.setattr("trompe_server.pictures.contact_sheet.contact_sheet", drawn)
     result = run_job(spec_of(pool=40, elevation=(-89, 89), held_out=0), library).result
     ((views, facts),) = sheets
     _, _, before, after = zip(*views, strict=True)

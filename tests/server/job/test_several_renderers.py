@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.fakes import FakeTarget
-from tests.job_runs import DarkTarget, Run, opened, run_job, spec_of
+from tests.job_runs import CHAIR, DarkTarget, Run, opened, run_job, setup_of, spec_of
 from trompe_server.library import Library
 from trompe_server.surrogate.calibration_file import calibration_key
 from trompe_shared.engine import EngineInfo
@@ -100,6 +100,24 @@ def test_no_attack_needs_one_renderer_that_recognises_the_object(library: Librar
     alone = run_job(spec_of(), library, target=blank, judge_targets=[FakeTarget()])
     assert alone.reports["prepare"].state == "n.a."
     assert [each.target.a_after for each in alone.result.renderers] == [None, None]
+
+
+@pytest.mark.usefixtures("pictures")
+def test_a_headline_that_recognises_nothing_in_its_own_views_has_pictures(library: Library) -> None:
+    own = setup_of(library).views
+
+    class Unmoved(FakeTarget):
+        """Shows nothing in the own views, and the same chair in all others."""
+
+        def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> Image8:
+            images = super().render(CHAIR, views, **options)
+            return images * np.array([view not in own for view in views], np.uint8)[:, None, None, None]
+
+    run = run_job(spec_of(epsilon=0.3, alpha=0.1, steps=6), library, more_targets=[Unmoved(engine=DARK)])
+    assert (run.result.renderer, run.result.target.a_before) == (DARK, 0)
+    assert run.result.held_out is not None
+    assert run.result.held_out.a_drop == 0
+    assert "contact_sheet.png" in run.artifacts.files
 
 
 def test_the_same_images_by_another_engine_are_another_calibration(library: Library) -> None:

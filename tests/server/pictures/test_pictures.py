@@ -8,7 +8,6 @@ from PIL import Image
 
 from trompe_server.pictures import (
     Verdict,
-    contact_sheet,
     difference_strip,
     heat_colours,
     heat_textures,
@@ -18,10 +17,11 @@ from trompe_server.pictures import (
     saliency_sheet,
     saliency_texture_sheet,
     texture_sheet,
+    views_sheet,
 )
-from trompe_server.pictures.contact_sheet import FRAME, TILE, extremes
+from trompe_server.pictures.contact_sheet import FRAME, TILE, contact_sheet, extremes
 from trompe_server.pictures.difference import amplified_difference
-from trompe_server.pictures.histogram import AFTER, BARS, BEFORE
+from trompe_server.pictures.histogram import AFTER, BARS, BEFORE, TOP
 from trompe_server.pictures.layout import (
     CAPTION,
     GREEN,
@@ -35,9 +35,11 @@ from trompe_server.pictures.layout import (
     shortened,
     stacked,
     text_width,
+    tile,
 )
 from trompe_server.pictures.saliency import BAR, GREY, OUTLINE, TICKS, heat_legend, heat_over
 from trompe_server.pictures.saliency import TILE as SALIENCY_TILE
+from trompe_shared.geometry import Camera
 
 BLUE = (40, 80, 160)
 BELOW_LEGEND = 120
@@ -48,12 +50,10 @@ def images(count: int, size: tuple[int, int] = (32, 32)) -> np.ndarray:
     return np.full((count, *size, 3), BLUE, np.uint8)
 
 
-def sheet_of(
-    correct: list[tuple[bool, bool]], *, columns: int = 3, label: str = "mug", title: str = "t"
-) -> Image.Image:
+def sheet_of(correct: list[tuple[bool, bool]], *, label: str = "mug", title: str = "t") -> Image.Image:
     (image,) = images(1)
     views = [(image, image, *(Verdict(label, 0.5, right) for right in both)) for both in correct]
-    return contact_sheet(views, title=title, facts="facts", columns=columns)
+    return contact_sheet(views, title=title, facts="facts")
 
 
 def frames(sheet: Image.Image) -> list[tuple[int, int, int]]:
@@ -69,15 +69,15 @@ def frames(sheet: Image.Image) -> list[tuple[int, int, int]]:
 
 
 def test_frames_are_green_where_the_class_is_the_objects_and_red_where_not() -> None:
-    sheet = sheet_of([(True, False), (True, True), (False, False)], columns=2)
-    assert frames(sheet) == [GREEN, RED, GREEN, GREEN, RED, RED]
+    sheet = sheet_of([(True, False), (True, True), (False, False), (False, True)])
+    assert frames(sheet) == [GREEN, RED, GREEN, GREEN, RED, RED, RED, GREEN]
 
 
-@pytest.mark.parametrize(("count", "columns", "rows"), [(1, 3, 1), (3, 3, 1), (5, 2, 3), (7, 3, 3)])
-def test_a_sheet_has_as_many_pairs_as_views_in_rows_of_columns(count: int, columns: int, rows: int) -> None:
-    sheet = sheet_of([(True, False)] * count, columns=columns)
+@pytest.mark.parametrize(("count", "rows"), [(1, 1), (3, 1), (7, 3)])
+def test_a_sheet_has_as_many_pairs_as_views_in_rows_of_three(count: int, rows: int) -> None:
+    sheet = sheet_of([(True, False)] * count)
     assert len(frames(sheet)) == 2 * count
-    one_row, two_rows = (sheet_of([(True, False)] * columns * n, columns=columns).height for n in (1, 2))
+    one_row, two_rows = (sheet_of([(True, False)] * 3 * n).height for n in (1, 2))
     assert sheet.height == one_row + (rows - 1) * (two_rows - one_row)
 
 
@@ -101,6 +101,12 @@ def test_the_same_arguments_give_the_same_bytes_and_only_the_first_name_of_a_cla
 def test_a_contact_sheet_needs_at_least_one_view() -> None:
     with pytest.raises(ValueError, match="at least one"):
         contact_sheet([], title="t", facts="")
+
+
+def test_a_sheet_of_views_of_which_none_was_recognised_shows_representative_ones() -> None:
+    verdicts = [Verdict("mug", 0.5, False)] * 30
+    sheet = views_sheet((images(30), images(30)), (verdicts, verdicts), [Camera(1, 0, 0)] * 30, title="t")
+    assert frames(sheet) == [RED] * 24
 
 
 @given(st.integers(1, 200), st.integers(1, 40))
@@ -180,10 +186,19 @@ def rows_of(sheet: Image.Image) -> int:
     return int(np.count_nonzero(np.diff(rows.astype(int)) == 1))
 
 
-def test_a_difference_strip_has_a_row_for_each_view() -> None:
-    one, three = (difference_strip(images(n), images(n), title="t") for n in (1, 3))
-    assert three.width == one.width
-    assert (rows_of(one), rows_of(three)) == (1, 3)
+def test_a_difference_strip_has_a_row_for_each_of_a_few_views() -> None:
+    strips = [difference_strip(images(n), images(n), title="t") for n in (1, 3, 9)]
+    assert len({strip.width for strip in strips}) == 1
+    assert [rows_of(strip) for strip in strips] == [1, 3, 4]
+
+
+@pytest.mark.parametrize("size", [(1024, 1), (1, 1024), (300, 200), (2, 3)])
+def test_a_tile_fits_its_square_whatever_the_form_of_the_image(size: tuple[int, int]) -> None:
+    (image,) = images(1, size)
+    assert max(tile(image, 224).size) == 224
+    sheet, square = (texture_sheet({"a.png": each}, {"a.png": each}, title="t") for each in (image, images(1)[0]))
+    assert sheet.width == square.width
+    assert sheet.height <= square.height
 
 
 def test_a_texture_sheet_shows_every_texture_whatever_its_form() -> None:
@@ -308,7 +323,7 @@ def test_the_object_is_shown_as_it_is_with_its_views_saliency_and_in_its_heat() 
     maps = np.zeros((2, 32, 32), np.float32)
     maps[:, :16] = 1e-3
     worn = np.full((2, 32, 32, 3), RED, np.uint8)
-    sheet = np.array(saliency_object_sheet(images(2), maps, worn, title="t", columns=1))
+    sheet = np.array(saliency_object_sheet(images(2), maps, worn, title="t"))
     hottest = heat_colours(np.array(1.0)).astype(np.uint8)
     order = [np.flatnonzero((sheet == colour).all(axis=2).any(axis=0)).min() for colour in (BLUE, hottest, RED)]
     assert order[0] < order[2]
@@ -338,14 +353,14 @@ def test_the_objects_own_class_comes_first_even_if_it_was_never_given() -> None:
     assert bars(sheet, BEFORE) == [BARS]
     one_class = prediction_histogram({"mug": 4}, {"mug": 4}, labels=["mug"], title="t")
     assert sheet.height > one_class.height
-    both = prediction_histogram({"mug": 1, "cup": 2, "vase": 1}, {"vase": 4}, labels=["mug", "cup"], title="t", top=1)
+    both = prediction_histogram({"mug": 1, "cup": 2, "vase": 1}, {"vase": 4}, labels=["mug", "cup"], title="t")
     assert bars(both, BEFORE) == [BARS // 4, BARS // 2, BARS // 4]
 
 
 def test_rare_classes_are_counted_together() -> None:
     many = {f"class {k}": 1 for k in range(20)}
-    sheet = prediction_histogram({"mug": 20}, many, labels=["mug"], title="t", top=4)
-    assert bars(sheet, AFTER) == [round(BARS / 20)] * 4 + [round(BARS * 16 / 20)]
+    sheet = prediction_histogram({"mug": 20}, many, labels=["mug"], title="t")
+    assert bars(sheet, AFTER) == [round(BARS / 20)] * TOP + [round(BARS * (20 - TOP) / 20)]
 
 
 def test_predictions_need_a_view() -> None:

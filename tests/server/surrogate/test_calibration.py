@@ -35,6 +35,7 @@ from trompe_server.surrogate.rasterize import Planes, Samples, Visibility, raste
 from trompe_server.surrogate.shading import ENCODERS, decode, encode
 from trompe_server.surrogate.tone import ToneMap, measure_tone_map
 from trompe_shared.api import SurrogateModel
+from trompe_shared.errors import SpecError
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D, encode_png, object_from_files
 from trompe_shared.opacity import opacity_of
@@ -69,7 +70,7 @@ class KnownTarget:
     renderer does, or (not ``affine``) as the paper's surrogate does.
 
     film: its tone curve. bounce: light that all surfaces get from each other, as a share of their mean albedo.
-    noise: standard deviation, numbered by the views, in 1/255.
+    noise: standard deviation, numbered by the views, in 1/255. size: (H, W) of its images.
     """
 
     sampling: SamplingModel
@@ -77,17 +78,18 @@ class KnownTarget:
     film: Callable[[Tensor], Tensor] | None = None
     bounce: float = 0.0
     noise: float = 0.0
+    size: tuple[int, int] = SIZE
     known: dict[object, Surrogate] = field(default_factory=dict)
 
     def __call__(self, obj: Object3D, views: Sequence[View]) -> Image8:
         key = (tuple(views), *(texture.shape for texture in obj.textures.values()))
         if key not in self.known:
-            self.known[key] = surrogate_of(obj, views, size=SIZE, sampling=self.sampling)
+            self.known[key] = surrogate_of(obj, views, size=self.size, sampling=self.sampling)
         if not self.affine:
             return self.known[key].images(obj)
         images = self._affine_images(self.known[key], obj, views[0].light.intensity / Light().intensity)
         seeds = [[view.noise, round(view.camera.azimuth) % 360, round(view.camera.elevation) + 90] for view in views]
-        grain = np.stack([np.random.default_rng(seed).normal(0, self.noise, (*SIZE, 3)) for seed in seeds])
+        grain = np.stack([np.random.default_rng(seed).normal(0, self.noise, (*self.size, 3)) for seed in seeds])
         return np.clip(np.round(images + grain * (images < 255)), 0, 255).astype(np.uint8)
 
     def _affine_images(self, surrogate: Surrogate, obj: Object3D, intensity: float) -> NDArray[np.float64]:
@@ -342,6 +344,19 @@ def test_what_path_tracers_and_films_do_is_recovered(
     assert (calibration.tone is not None) == (calibration.sampling.encoding == "measured")
     assert calibration.fidelity.mean()["explained"] > 0.9
     assert calibration.fidelity.mean()["slope"] == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("size", [(128, 64), (64, 100)])
+def test_a_tone_curve_is_the_same_in_upright_and_in_wide_pictures(size: tuple[int, int]) -> None:
+    square, found = (
+        measure_tone_map(KnownTarget(SamplingModel(), film=aces, size=each), each) for each in (SIZE, size)
+    )
+    torch.testing.assert_close(found.curves, square.curves, atol=0.01, rtol=0)
+
+
+def test_pictures_too_small_for_a_tone_curve_are_refused() -> None:
+    with pytest.raises(SpecError, match="at least 15 x 15 pixels, and the network's are 64 x 14"):
+        measure_tone_map(USUAL, (64, 14))
 
 
 def test_edges_averaged_in_light_are_predicted_better_as_such() -> None:

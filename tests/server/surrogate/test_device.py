@@ -15,8 +15,9 @@ from trompe_server.surrogate import (
     prepare_geometry,
     textures_of,
 )
-from trompe_server.surrogate.calibration import CURVE_GREYS, painted_grey, painted_noise
+from trompe_server.surrogate.calibration import CALIBRATED_GREYS, CURVE_GREYS, painted_grey, painted_noise
 from trompe_server.surrogate.fidelity import measure_fidelity
+from trompe_server.surrogate.tone import ToneMap
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D
 
@@ -28,17 +29,21 @@ MODELS = [
     pytest.param(SamplingModel(), id="encoded"),
     pytest.param(SamplingModel(filtered="linear", lod="area", shade_at="centroid", bias=0.3), id="linear"),
     pytest.param(SamplingModel(mips="rounded", encoding="power"), id="rounded"),
+    pytest.param(SamplingModel(encoding="measured"), id="measured"),
 ]
+TONE = ToneMap(
+    torch.linspace(0, 1, 1025).expand(3, -1), torch.linspace(-0.1, 0.1, 2187).view(9, 9, 9, 3), torch.tensor(0.01)
+)
 
 
 def surrogates(obj: Object3D, model: SamplingModel, device: str) -> list[Surrogate]:
     """The diffuse one, and one measured on the fake target."""
-    target = FakeTarget(2000)
+    target, greys = FakeTarget(2000), CALIBRATED_GREYS if model.encoding == "measured" else CURVE_GREYS
     clean = target.render(obj, VIEWS, size=SIZE)
-    probes = np.stack([target.render(painted_grey(obj, grey), VIEWS, size=SIZE) for grey in CURVE_GREYS])
+    probes = np.stack([target.render(painted_grey(obj, grey), VIEWS, size=SIZE) for grey in greys])
     geometry = prepare_geometry(obj, VIEWS, size=SIZE, sampling=model, device=device)
     assert geometry.device.type == device
-    curve = curve_surrogate(geometry, obj, VIEWS, clean, CURVE_GREYS, probes)
+    curve = curve_surrogate(geometry, obj, VIEWS, clean, greys, probes, tone=TONE)
     noise = painted_noise(obj, np.random.default_rng(0))
     measure_fidelity(curve, obj, clean, noise, target.render(noise, VIEWS, size=SIZE))
     return [diffuse_surrogate(geometry, VIEWS), curve]
@@ -49,7 +54,8 @@ def everything(surrogate: Surrogate, obj: Object3D, device: str) -> list[Tensor]
     leaves = {name: t.requires_grad_() for name, t in textures_of(obj, device=device).items()}
     random = np.random.default_rng(0)
     weights, masks = random.normal(size=(len(VIEWS), 3, *SIZE)), random.random((len(VIEWS), *SIZE)) < 0.5
-    images = surrogate.render_all(surrogate.texels(leaves), masks=torch.from_numpy(masks).to(device))
+    texels, pixels = surrogate.texels(leaves), torch.from_numpy(masks).to(device)
+    images = torch.cat([surrogate.render(texels, k, masks=pixels) for k in range(len(surrogate.batches))])
     total = (images * torch.from_numpy(weights).float().to(device)).sum()
     gradients = torch.autograd.grad(total, list(leaves.values()))
     return [images.detach(), *gradients, *surrogate.influence().values()]

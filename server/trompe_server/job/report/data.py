@@ -87,9 +87,9 @@ class ReportData:
         after = None if self.logits_after is None else self.logits_after[views]
         return self.setup.judge.accuracy(self.logits_before[views], after, distinct=self.distinct(views))
 
-    def distinct(self, views: str) -> int | None:
-        """Number of distinct views; ``None`` if all are."""
-        return len(distinct_views(self.setup)) if views == "own" else None
+    def distinct(self, views: str) -> int:
+        """Number of distinct views."""
+        return len(distinct_views(self.setup.views if views == "own" else self.setup.held_out))
 
     @cached_property
     def logits_before(self) -> Mapping[str, NDArray[np.float32]]:
@@ -111,9 +111,9 @@ class ReportData:
         return compare_views(self.surrogate, self.setup.obj, self.before["own"], self.painted, self.after["own"])
 
 
-def distinct_views(setup: JobSetup) -> NDArray[np.int64]:
-    """Indices of the distinct own views: the paper's grid has azimuth 0 twice, as 0 and as 360."""
+def distinct_views(views: Sequence[View]) -> NDArray[np.int64]:
+    """Indices of the distinct views: the paper's grid has azimuth 0 twice, as 0 and as 360."""
     seen: dict[View, int] = {}
-    for index, view in enumerate(setup.views):
+    for index, view in enumerate(views):
         seen.setdefault(replace(view, camera=replace(view.camera, azimuth=view.camera.azimuth % 360)), index)
     return np.array(list(seen.values()))

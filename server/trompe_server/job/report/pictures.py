@@ -1,7 +1,6 @@
 """Pictures of the report."""
 
 from collections import Counter
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -13,23 +12,20 @@ from trompe_server.job.report.data import Images, ReportData, distinct_views
 from trompe_server.job.setup import JobSetup
 from trompe_server.judging.metrics import predicted_classes
 from trompe_server.pictures import (
-    contact_sheet,
     difference_strip,
-    hardest_and_easiest,
     prediction_histogram,
     representative,
     saliency_object_sheet,
     saliency_sheet,
     saliency_texture_sheet,
     texture_sheet,
+    views_sheet,
 )
 from trompe_server.system.threads import in_threads
 from trompe_shared.engine import DEFAULT_ENGINE
 from trompe_shared.object3d import encode_png
 
-SHEET_VIEWS: Final = 12
 SALIENCY_VIEWS: Final = 6
-DIFFERENCE_VIEWS: Final = 4
 THUMBNAIL_HEIGHT: Final = 112
 """Pixels."""
 
@@ -49,7 +45,7 @@ def picture_files(data: ReportData) -> dict[str, bytes]:
 
 def saliency_views(setup: JobSetup) -> NDArray[np.int64]:
     """The views of the saliency sheets."""
-    distinct = distinct_views(setup)
+    distinct = distinct_views(setup.views)
     return distinct[representative(len(distinct), SALIENCY_VIEWS)]
 
 
@@ -67,21 +63,17 @@ def _saliency(data: ReportData, title: str) -> dict[str, Image.Image]:
 
 
 def _before_and_after(data: ReportData, after: Images, title: str) -> dict[str, Image.Image]:
-    setup, own = data.setup, data.before["own"]
+    setup, own, distinct = data.setup, data.before["own"], distinct_views(data.setup.views)
     logits_before, logits_after = data.logits_before["own"], (data.logits_after or {})["own"]
-    distinct = distinct_views(setup)
-    verdicts_before, verdicts_after = map(setup.judge.verdicts, (logits_before, logits_after))
-    recognised = [index for index in distinct if verdicts_before[index].correct]
-    cameras = [view.camera for view in setup.views]
-    shown = hardest_and_easiest(recognised, verdicts_after, cameras, SHEET_VIEWS)
-    few = distinct[representative(len(distinct), DIFFERENCE_VIEWS)]
     sheets = {
-        "contact_sheet.png": contact_sheet(
-            [(own[k], after["own"][k], verdicts_before[k], verdicts_after[k]) for k in shown],
+        "contact_sheet.png": views_sheet(
+            (own, after["own"]),
+            (setup.judge.verdicts(logits_before), setup.judge.verdicts(logits_after)),
+            [view.camera for view in setup.views],
             title=f"{title}, epsilon {data.spec.paint.epsilon:g}",
-            facts=_facts([verdicts_after[index].correct for index in recognised], setup),
+            distinct=distinct.tolist(),
         ),
-        "difference.png": difference_strip(own[few], after["own"][few], title=title),
+        "difference.png": difference_strip(own[distinct], after["own"][distinct], title=title),
         "predictions.png": prediction_histogram(
             _counts(logits_before, setup),
             _counts(logits_after, setup),
@@ -105,17 +97,6 @@ def _thumbnail(data: ReportData, after: Images) -> Image.Image:
     pair = np.concatenate([data.before[kind][view], after[kind][view]], axis=1)
     height, width = pair.shape[:2]
     return Image.fromarray(pair).resize((round(THUMBNAIL_HEIGHT * width / height), THUMBNAIL_HEIGHT))
-
-
-def _facts(kept: Sequence[bool], setup: JobSetup) -> str:
-    """Counts for the contact sheet. kept: whether each view that was recognised before still is."""
-    number = len(distinct_views(setup))
-    views = f"{number} views" if number == len(setup.views) else f"{number} distinct views"
-    some = "all" if len(kept) <= SHEET_VIEWS else f"{SHEET_VIEWS}"
-    return (
-        f"Recognised before in {len(kept)} of {views}; {len(kept) - sum(kept)} of these are fooled. "
-        f"Below: {some} of the recognised ones, from the hardest to fool to the easiest."
-    )
 
 
 def _counts(logits: NDArray[np.float32], setup: JobSetup) -> Counter[str]:

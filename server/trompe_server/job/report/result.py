@@ -11,7 +11,7 @@ import torch
 
 from trompe_server.classifiers import Classifier
 from trompe_server.image_pipelines import SUITE
-from trompe_server.job.report.data import ReportData
+from trompe_server.job.report.data import ReportData, distinct_views
 from trompe_server.job.report.warnings import neighbour_warning, warnings_of
 from trompe_server.judging.judge import Judge
 from trompe_server.judging.metrics import fooled_as, transfer_gap, view_predictions
@@ -165,10 +165,10 @@ def _through_suite(data: ReportData) -> list[PipelineJudgement]:
     """
     if data.after is None or not data.setup.held_out:
         return []
-    seen = [images["held_out"][::2] for images in (data.before, data.after)]
+    views, seen = data.setup.held_out[::2], [images["held_out"][::2] for images in (data.before, data.after)]
     shown = _ahead(lambda pipeline: [pipeline.shown(images) for images in seen], SUITE.values())
-    predict, judge = data.setup.classifier.predict, data.setup.judge
-    judged = (judge.accuracy(*map(predict, images)) for images in shown)
+    predict, judge, distinct = data.setup.classifier.predict, data.setup.judge, len(distinct_views(views))
+    judged = (judge.accuracy(*map(predict, images), distinct=distinct) for images in shown)
     return [PipelineJudgement(pipeline=name, held_out=found) for name, found in zip(SUITE, judged, strict=True)]
 
 
