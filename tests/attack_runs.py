@@ -88,7 +88,7 @@ def steps_of(surrogate: AnySurrogate = SURROGATE, **options: Any) -> list[Step]:
 
 
 def same(one: AttackState, other: AttackState) -> bool:
-    tables = ((one.deltas, other.deltas), (one.memory, other.memory))
+    tables = ((one.deltas, other.deltas), (one.memory, other.memory), (one.momentum, other.momentum))
     return one.step == other.step and all(
         mine.keys() == theirs.keys() and all(torch.equal(mine[name], theirs[name]) for name in mine)
         for mine, theirs in tables

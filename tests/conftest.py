@@ -68,6 +68,12 @@ def share_the_cores(processes: int) -> None:
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
 
 
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip a test marked ``assets`` without them."""
+    if item.get_closest_marker("assets") and "TROMPE_ASSETS" not in os.environ:
+        pytest.skip("TROMPE_ASSETS names no folder of real objects and classifiers")
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]

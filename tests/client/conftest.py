@@ -2,12 +2,10 @@
 
 import asyncio
 import hashlib
-import io
 import json
 import re
 import threading
 import time
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
 from email import message_from_bytes
@@ -54,6 +52,7 @@ from trompe_shared.api import (
     WorkerInfo,
 )
 from trompe_shared.faults import faults_of
+from trompe_shared.object3d import pack_zip
 
 NOW = datetime(2025, 1, 2, 3, 4, tzinfo=UTC)
 SPEC = JobSpec.of("mug", label="mug")
@@ -136,14 +135,7 @@ def zipped(source: Path) -> bytes:
     return upload.content
 
 
-def adversarial_zip() -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        archive.writestr("mug.obj", "o mug")
-        archive.writestr("a.png", b"repainted")
-    return buffer.getvalue()
-
-
+ADVERSARIAL = pack_zip({"mug.obj": b"o mug", "a.png": b"repainted"})
 JUDGED = [MANIFEST, MANIFEST_PAGE]
 """Files of a judgement."""
 
@@ -243,7 +235,7 @@ class FakeServer:
         if name == MANIFEST:
             return manifest_of(self.jobs[job_id]).model_dump_json().encode()
         if name.endswith("-adversarial.zip"):
-            return adversarial_zip()
+            return ADVERSARIAL
         return b"<html>" if name.endswith(".html") else self.result(job_id).model_dump_json().encode()
 
     def name_of(self, job_id: str) -> str:
@@ -321,7 +313,7 @@ class Handler(BaseHTTPRequestHandler):
         if what == "artifacts":
             return self.file(self.fake.artifact(job_id, unquote(name)))
         if what == "archive":
-            return self.reply(adversarial_zip(), kind="application/zip")
+            return self.reply(ADVERSARIAL, kind="application/zip")
         job = self.fake.jobs[job_id]
         if what in {"result", "manifest"} and not job.artifacts:
             return self.problem(409, "No result", detail=f"The job is {job.state.value}")

@@ -430,37 +430,33 @@ def test_watch_report_and_cancel_take_up_a_job_by_its_id(server: FakeServer, cli
     assert server.jobs["job-2"].state is JobState.cancelled
 
 
+@pytest.mark.parametrize(
+    "words", [["watch", "job-1"], ["attack", "mug", "--label", "mug", "--out", "out"]], ids=["watch", "attack"]
+)
+def test_ctrl_c_in_a_terminal_ends_the_command_and_not_the_job(
+    server: FakeServer, client: Client, tmp_path: Path, words: list[str]
+) -> None:
+    server.stalls = True
+    client.submit(SPEC)
+    command, pipe = [sys.executable, "-m", "trompe_client.cli", *words, "--server", server.url], subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, cwd=tmp_path) as process:
+        while not server.resumed_after:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    job = [*server.jobs][-1]
+    assert f"Job {job} continues. Follow it: trompe watch {job} --server {server.url}" in said
+    assert "Traceback" not in said
+    assert server.jobs[job].state is JobState.queued
+
+
 @pytest.fixture
 def ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(self: JobHandle, *_args: object, **_options: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(JobHandle, "wait", interrupted)
-
-
-@pytest.mark.usefixtures("ctrl_c")
-def test_ctrl_c_leaves_the_job_on_a_server_running_and_says_how_to_come_back(
-    attack_mug: Attack, server: FakeServer
-) -> None:
-    done = attack_mug()
-    assert done.exit_code == 130
-    assert f"trompe watch job-1 --server {server.url}" in done.stderr
-    assert server.jobs["job-1"].state is JobState.queued
-
-
-def test_ctrl_c_in_a_terminal_ends_the_command_and_not_the_job(server: FakeServer, client: Client) -> None:
-    server.stalls = True
-    job = client.submit(SPEC)
-    command = [sys.executable, "-m", "trompe_client.cli", "watch", job.id, "--server", server.url]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        while not server.resumed_after:
-            time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
-        _, words = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert f"Job {job.id} continues. Follow it: trompe watch {job.id} --server {server.url}" in words
-    assert "Traceback" not in words
-    assert client.job(job.id).state is JobState.queued
 
 
 @pytest.fixture

@@ -31,22 +31,34 @@ def loaded(code: str) -> set[str]:
     return set(done.stderr.strip().split(","))
 
 
-def test_importing_the_sdk_loads_little_more_than_pydantic() -> None:
-    found = loaded("import trompe_client")
-    assert "trompe_client" in found
-    assert not found & (HEAVY | LATER)
+COMMANDS = (["--help"], ["attack", "--help"], ["jobs", "--help"], ["completion", "bash"])
+LOADS = [
+    pytest.param("import trompe_client", HEAVY | LATER, id="the SDK"),
+    pytest.param(
+        "\n".join(
+            ["from trompe_client.cli import main", *(f"main({words}, standalone_mode=False)" for words in COMMANDS)]
+        ),
+        HEAVY,
+        id="the command line",
+    ),
+    pytest.param(
+        "import trompe_client.cli.group as g; g.main.get_command(None, 'nothing')",
+        HEAVY | {"httpx", "rich"},
+        id="completion of a word",
+    ),
+    pytest.param(
+        "import trompe_server.service.serve, trompe_server.service.dispatch, trompe_server.executor.attempts",
+        {"ray"},
+        id="a service on one machine",
+    ),
+]
 
 
-@pytest.mark.parametrize("words", [["--help"], ["attack", "--help"], ["jobs", "--help"], ["completion", "bash"]])
-def test_the_command_line_loads_nothing_heavy(words: list[str]) -> None:
-    found = loaded(f"from trompe_client.cli import main; main({words!r}, standalone_mode=False)")
-    assert "trompe_client" in found
-    assert not found & HEAVY
-
-
-def test_completing_a_word_loads_no_command() -> None:
-    found = loaded("import trompe_client.cli.group as g; g.main.get_command(None, 'nothing')")
-    assert not found & (HEAVY | {"httpx", "rich"})
+@pytest.mark.parametrize(("code", "without"), LOADS)
+def test_nothing_is_loaded_that_is_not_needed(code: str, without: set[str]) -> None:
+    found = loaded(code)
+    assert "trompe_shared" in found
+    assert not found & without
 
 
 def test_httpx_is_imported_in_one_module_only() -> None:

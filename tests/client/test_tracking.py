@@ -2,8 +2,8 @@
 
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import Mock, call
 
 import pytest
 
@@ -11,71 +11,43 @@ from tests.client.conftest import FakeServer, trompe
 from trompe_client.tracking import MlflowRun
 from trompe_shared.api import JobSpec, JobState, Progress
 
-
-class FakeMlflow(ModuleType):
-    """MLflow's client over lists."""
-
-    def __init__(self) -> None:
-        super().__init__("mlflow")
-        self.params, self.files, self.status = dict[str, str](), list[str](), ""
-        self.points: list[tuple[str, float, int | None]] = []
-        self.MlflowClient = lambda: self
-
-    def get_experiment_by_name(self, name: str) -> Any:
-        return None
-
-    def create_experiment(self, name: str) -> str:
-        self.experiment = name
-        return "1"
-
-    def create_run(self, experiment: str, run_name: str) -> Any:
-        self.run_name = run_name
-        return SimpleNamespace(info=SimpleNamespace(run_id="r"))
-
-    def log_param(self, run: str, key: str, value: str) -> None:
-        self.params[key] = value
-
-    def log_metric(self, run: str, key: str, value: float, step: int | None = None) -> None:
-        self.points.append((key, value, step))
-
-    def log_artifacts(self, run: str, folder: str) -> None:
-        self.files = sorted(file.name for file in Path(folder).iterdir())
-
-    def set_terminated(self, run: str, status: str) -> None:
-        self.status = status
+CALLS = ("get_experiment_by_name", "create_experiment", "create_run", "log_param", "log_metric", "log_artifacts")
 
 
 @pytest.fixture
-def mlflow(monkeypatch: pytest.MonkeyPatch) -> FakeMlflow:
-    fake = FakeMlflow()
-    monkeypatch.setitem(sys.modules, "mlflow", fake)
-    return fake
+def mlflow(monkeypatch: pytest.MonkeyPatch) -> Mock:
+    """MLflow's client, which knows no experiment."""
+    client = Mock(spec_set=[*CALLS, "set_terminated"])
+    client.get_experiment_by_name.return_value = None
+    monkeypatch.setitem(sys.modules, "mlflow", Mock(MlflowClient=lambda: client))
+    return client
 
 
 def attacked(server: FakeServer, out: Path, *words: str) -> Any:
     return trompe("attack", "mug", "--label", "mug", "--track", "mlflow", *words, "--server", server.url, "--out", out)
 
 
-def test_an_attack_logs_parameters_curves_result_and_files(
-    mlflow: FakeMlflow, server: FakeServer, tmp_path: Path
-) -> None:
+def test_an_attack_logs_parameters_curves_result_and_files(mlflow: Mock, server: FakeServer, tmp_path: Path) -> None:
     done = attacked(server, tmp_path / "out", "--epsilon", "0.1")
     assert done.exit_code == 0, done.output
-    assert (mlflow.experiment, mlflow.status) == ("trompe", "FINISHED")
-    assert mlflow.run_name.startswith("mug job-")
-    assert mlflow.params["paint.epsilon"] == "0.1"
-    figures = {key: value for key, value, step in mlflow.points if step is None}
-    assert figures["target.a_before"] == 0.9
-    steps = [step or 0 for key, _, step in mlflow.points if key == "loss"]
+    run = mlflow.create_run.return_value.info.run_id
+    mlflow.create_experiment.assert_called_once_with("trompe")
+    mlflow.set_terminated.assert_called_once_with(run, "FINISHED")
+    assert mlflow.create_run.call_args.kwargs["run_name"].startswith("mug job-")
+    assert call(run, "paint.epsilon", "0.1") in mlflow.log_param.call_args_list
+    assert call(run, "target.a_before", 0.9) in mlflow.log_metric.call_args_list
+    steps = [each.kwargs["step"] for each in mlflow.log_metric.call_args_list if each.args[1] == "loss"]
     assert steps
     assert steps == sorted(set(steps))
-    assert "result.json" in mlflow.files
+    mlflow.log_artifacts.assert_called_once_with(run, str(tmp_path / "out"))
+    assert (tmp_path / "out" / "result.json").exists()
 
 
-def test_a_failed_job_is_a_failed_run(mlflow: FakeMlflow, server: FakeServer, tmp_path: Path) -> None:
+def test_a_failed_job_is_a_failed_run(mlflow: Mock, server: FakeServer, tmp_path: Path) -> None:
     server.ending = JobState.failed
     assert attacked(server, tmp_path / "out").exit_code == 6
-    assert (mlflow.status, mlflow.files) == ("FAILED", [])
+    mlflow.set_terminated.assert_called_once_with(mlflow.create_run.return_value.info.run_id, "FAILED")
+    mlflow.log_artifacts.assert_not_called()
 
 
 def test_without_mlflow_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, server: FakeServer, tmp_path: Path) -> None:

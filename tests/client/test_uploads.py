@@ -13,8 +13,8 @@ from trompe_client import AsyncClient, Client
 from trompe_client._plan import background_upload
 from trompe_shared.api import BackgroundInfo
 
-LARGE = 48 * 2**20
-LITTLE_MEMORY = 4 * 2**20
+LARGE = 8 * 2**20
+LITTLE_MEMORY = 2 * 2**20
 STORED = BackgroundInfo(id="b1", name="room").model_dump_json()
 
 

@@ -11,9 +11,7 @@ import os
 import re
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -33,8 +31,6 @@ VERSION: Final = "test"
 
 logger = logging.getLogger(__name__)
 logging.getLogger("httpx").setLevel(logging.WARNING)
-figures: list[str] = []
-"""What was measured, for the end of the log."""
 
 
 def docker(*arguments: str, timeout: float = 240, check: bool = True, **options: Any) -> str:
@@ -53,17 +49,6 @@ def answers(*arguments: str) -> bool:
     except (AssertionError, OSError, subprocess.TimeoutExpired):
         return False
     return True
-
-
-@contextmanager
-def timed(what: str) -> Iterator[None]:
-    """Log how long the block took."""
-    started = time.monotonic()
-    logger.info("%s ...", what)
-    yield
-    seconds = time.monotonic() - started
-    logger.info("%s: %.1f s", what, seconds)
-    figures.append(f"{what}: {seconds:.1f} s")
 
 
 @dataclass
@@ -109,13 +94,6 @@ class Stack:
         """An image of ours, by the name of its target."""
         return f"trompe-{name}:{VERSION}"
 
-    docker = staticmethod(docker)
-    timed = staticmethod(timed)
-
-    def note(self, figure: str) -> None:
-        """Keep what was measured for the end of the log."""
-        figures.append(figure)
-
     def inspect(self, container: str) -> dict[str, Any]:
         """What the engine knows of a container."""
         found: dict[str, Any] = json.loads(docker("inspect", container))[0]
@@ -148,28 +126,19 @@ def _variables_of_the_build() -> dict[str, str]:
 
 
 @pytest.fixture(scope="session")
-def engine() -> str:
-    """The engine's version. Skips where none answers."""
+def built() -> Stack:
+    """The project with its images built, nothing of it running. Skips where no engine answers."""
     if not answers("info"):
         pytest.skip("NO DOCKER ENGINE ANSWERS (DOCKER_HOST): the compose stack is not tested")
     if not answers("compose", "version"):
         pytest.skip("docker has no compose plugin: the compose stack is not tested")
-    return docker("version", "--format", "{{.Server.Version}}") + ", compose " + docker("compose", "version", "--short")
-
-
-@pytest.fixture(scope="session")
-def built(engine: str) -> Stack:
-    """The project with its images built, nothing of it running."""
     files = [ROOT / "docker-compose.yml", THREADS]
-    figures.append(f"engine {engine}, {os.cpu_count()} cores")
     if _official_images_missing():
         logger.warning("the official images can't be pulled: Debian's PostgreSQL and moto stand in for them")
-        figures.append("stand-ins: Debian's PostgreSQL for postgres, moto for MinIO")
         files.append(STAND_INS / "compose.yml")
     fixed = {"TROMPE_VERSION": VERSION, "TROMPE_PORT": str(free_port()), "TROMPE_SILENCE": "15"}
     stack = Stack(files, fixed | _variables_of_the_build())
-    with timed("building the images"):
-        stack.compose(*PROFILES, "build", "--quiet", timeout=1800)
+    stack.compose(*PROFILES, "build", "--quiet", timeout=1800)
     return stack
 
 
@@ -177,18 +146,9 @@ def built(engine: str) -> Stack:
 def stack(built: Stack, request: pytest.FixtureRequest) -> Iterator[Stack]:
     """The stack, up with one container of each service. It is taken down with its volumes at the end."""
     try:
-        with timed("from nothing to a healthy stack"):
-            built.up()
+        built.up()
         yield built
     finally:
         if request.session.testsfailed or sys.exc_info()[0]:
             logger.error("%s", built.compose("logs", "--no-color", "--timestamps", "--tail", "200"))
         built.compose(*PROFILES, "down", "--volumes", "--timeout", "5")
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say what was measured."""
-    if figures:
-        terminalreporter.section("compose")
-        for figure in figures:
-            terminalreporter.line(figure)

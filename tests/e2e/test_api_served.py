@@ -3,7 +3,6 @@
 The jobs are fake.
 """
 
-import re
 import shutil
 import signal
 import subprocess
@@ -22,6 +21,7 @@ import pytest
 from tests.documentation import blocks, readers_environment
 from tests.fake_job import PHASES, trace
 from tests.served import FAKE, Served, wait_until
+from tests.worker_process import memory
 from trompe_server.api.guard import FRESH
 from trompe_server.service.dispatch import prepare_data
 from trompe_server.storage.tokens import Right, Tokens
@@ -152,17 +152,11 @@ def test_a_large_upload_does_not_fill_the_memory_of_the_server(serve: Serve) -> 
         yield b"\r\n--b--\r\n"
 
     Path(f"/proc/{serve.process.pid}/clear_refs").write_text("5")  # what was the peak so far is forgotten
-    before = peak_memory(serve)
+    before = memory(serve.process.pid, "VmHWM")
     headers = {"Content-Type": "multipart/form-data; boundary=b"}
     answer = serve.http.post("/v1/classifiers", content=parts(), headers=headers)
     assert answer.status_code == 422, answer.text
-    assert peak_memory(serve) - before < 50 * 2**20
-
-
-def peak_memory(serve: Serve) -> int:
-    """The most memory that the server has had so far, bytes."""
-    status = Path(f"/proc/{serve.process.pid}/status").read_text()
-    return 1024 * int(re.search(r"VmHWM:\s+(\d+) kB", status)[1])  # type: ignore[index]
+    assert memory(serve.process.pid, "VmHWM") - before < 50 * 2**20
 
 
 @pytest.mark.thorough

@@ -14,30 +14,23 @@ from trompe_server.renderers import SailenvTarget
 from trompe_shared.api import JobSpec, Result
 from trompe_shared.object3d import load_object
 
-ASSETS = os.environ.get("TROMPE_ASSETS")
-pytestmark = [
-    pytest.mark.assets,
-    pytest.mark.timeout(900),
-    pytest.mark.usefixtures("no_pictures"),
-    pytest.mark.skipif(ASSETS is None, reason="TROMPE_ASSETS names no folder of real objects and classifiers"),
-]
+ASSETS = Path(os.environ.get("TROMPE_ASSETS", ""))
+pytestmark = [pytest.mark.assets, pytest.mark.timeout(900), pytest.mark.usefixtures("no_pictures")]
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> Library:
-    assert ASSETS is not None
-    library, folder = Library(tmp_path_factory.mktemp("library")), Path(ASSETS)
-    names = json.loads((folder / "classifiers" / "imagenet_classes.json").read_text())
-    with (folder / "classifiers" / "mobilenet_v2.pt2").open("rb") as file:
+    library, folder = Library(tmp_path_factory.mktemp("library")), ASSETS / "classifiers"
+    names = json.loads((folder / "imagenet_classes.json").read_text())
+    with (folder / "mobilenet_v2.pt2").open("rb") as file:
         library.add_classifier(file, "mobilenet_v2.pt2", classes=names)
     return library
 
 
 def run(name: str, library: Library, target: SailenvTarget, **options: Any) -> Result:
     """One whole job by the paper's protocol: 6 azimuths x 10 elevations, epsilon 0.05, alpha 0.01."""
-    assert ASSETS is not None
-    paper = json.loads((Path(ASSETS) / "objects" / "objects.json").read_text())[name]
-    stored = library.add_object(io.BytesIO(load_object(Path(ASSETS) / "objects" / name).to_zip()), name)
+    paper = json.loads((ASSETS / "objects" / "objects.json").read_text())[name]
+    stored = library.add_object(io.BytesIO(load_object(ASSETS / "objects" / name).to_zip()), name)
     protocol = {
         "label": paper["imagenet_class"],
         "classifier": "mobilenet_v2",

@@ -75,7 +75,10 @@ def test_a_second_serve_on_the_same_data_is_refused(serve: Served) -> None:
     assert serve.get("/readyz") == {"status": "ready"}
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGKILL, *(pytest.param(each, marks=pytest.mark.thorough) for each in (signal.SIGTERM, signal.SIGINT))],
+)
 def test_nothing_is_left_running_when_serve_ends_and_its_job_outlives_it(serve: Served, number: signal.Signals) -> None:
     job = serve.submit("gate")
     wait_until(lambda: serve.in_gate(job))

@@ -4,14 +4,12 @@ import base64
 import io
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from fastapi import FastAPI
 from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import (
@@ -28,14 +26,6 @@ from playwright.sync_api import (
 
 from tests.served import Served
 from trompe_client import Client
-from trompe_server.api.services import Services
-from trompe_server.library import Library
-from trompe_server.queue.store import JobStore
-from trompe_server.service.app import create_app
-from trompe_server.service.dispatch import prepare_data
-from trompe_server.settings import Settings
-from trompe_server.storage.folders import open_folder
-from trompe_server.storage.tokens import Tokens
 
 FLAGS = [
     "--no-sandbox",
@@ -128,17 +118,6 @@ def held_back(page: Page, address: str) -> list[Route]:
     held: list[Route] = []
     page.route(address, lambda route: held.append(route))
     return held
-
-
-@contextmanager
-def app_on(folder: Path, **settings: Any) -> Iterator[tuple[FastAPI, JobStore]]:
-    """The application on a folder of its own, without a process, and its record of jobs."""
-    chosen = Settings(data=folder, **settings)
-    prepare_data(chosen)
-    store, files = JobStore(chosen.database_url), open_folder(chosen.store_url)
-    library = Library(files.within("library"))
-    yield create_app(Services(chosen, library, store, files, Tokens(store.engine), list, list)), store
-    store.close()
 
 
 def slowed(context: BrowserContext, page: Page, *, bytes_per_second: int) -> None:

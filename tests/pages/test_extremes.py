@@ -12,10 +12,12 @@ from bench.pages import served
 from PIL import Image
 from playwright.sync_api import BrowserContext, Page, expect
 
-from tests.pages.conftest import REPORTED, Service, app_on, slowed, turntables, width
+from tests.pages.conftest import REPORTED, Service, slowed, turntables, width
 from tests.pages.test_orbit import opened, pixels, turned
+from tests.server.api.conftest import running
 from trompe_server.formats import write_glb
 from trompe_server.job.protocol import VIEWS_AFTER, VIEWS_BEFORE
+from trompe_server.settings import Settings
 from trompe_server.storage.arrays import pack_arrays, unpack_arrays
 from trompe_shared.api import Result
 from trompe_shared.object3d import load_object
@@ -33,9 +35,9 @@ LARGE = 30_000_000
 @pytest.fixture
 def many(tmp_path: Path) -> Iterator[str]:
     """Address of a server with ten thousand jobs."""
-    with app_on(tmp_path, rate_limit=1e6) as (app, store):
-        fill(store, MANY)
-        with served(app) as client:
+    with running(Settings(data=tmp_path, rate_limit=1e6)) as api:
+        fill(api.services.store, MANY)
+        with served(api.app) as client:
             yield str(client.base_url).rstrip("/")
 
 

@@ -7,15 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
-from fastapi import FastAPI
 
-from tests.pages.conftest import app_on
+from tests.server.api.conftest import Api, running
 from trompe_server.api.examples import RESULT
+from trompe_server.api.services import Services
 from trompe_server.pages.present import _accuracies
 from trompe_server.pages.routes import follow_list
 from trompe_server.pages.serving import _code
+from trompe_server.settings import Settings
 from trompe_shared.api import JobRequest, JudgementRequest, Result
 
 JOBS = 120
@@ -25,36 +25,22 @@ MUG = 5
 """The mug's class in the shipped classifier."""
 
 
-class Browserless:
-    """Asks the application itself, with no browser and no socket between."""
-
-    def __init__(self, app: FastAPI) -> None:
-        self._app = app
-
-    def get(self, path: str, **options: Any) -> httpx.Response:
-        return asyncio.run(self._get(path, options))
-
-    async def _get(self, path: str, options: dict[str, Any]) -> httpx.Response:
-        transport = httpx.ASGITransport(self._app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
-            return await client.get(path, **options)
-
-
 @pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browserless]:
-    with app_on(tmp_path_factory.mktemp("list")) as (app, store):
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
+    with running(Settings(data=tmp_path_factory.mktemp("list"))) as api:
         for seed in range(JOBS):
             labels = {"sweep": "even" if seed % 2 == 0 else "odd"} | ({"experiment": "few"} if seed < len(TAUS) else {})
             tau = TAUS[seed] if seed < len(TAUS) else None
-            store.create(JobRequest.of("mug", label=MUG if seed % 2 == 0 else "mug", tau=tau, seed=seed, labels=labels))
-        yield Browserless(app)
+            chosen = JobRequest.of("mug", label=MUG if seed % 2 == 0 else "mug", tau=tau, seed=seed, labels=labels)
+            api.services.store.create(chosen)
+        yield api
 
 
 def jobs_on(page: str) -> list[str]:
     return re.findall(r'<tr id="job-([0-9a-f]+)"', page)
 
 
-def test_pages_follow_each_other_until_all_jobs_were_shown(client: Browserless) -> None:
+def test_pages_follow_each_other_until_all_jobs_were_shown(client: Api) -> None:
     path, seen = "/jobs", []
     while path:
         page = client.get(path).text
@@ -66,18 +52,18 @@ def test_pages_follow_each_other_until_all_jobs_were_shown(client: Browserless) 
     assert len(seen) == len(set(seen)) == JOBS
 
 
-def test_filters_go_along_to_the_next_page(client: Browserless) -> None:
+def test_filters_go_along_to_the_next_page(client: Api) -> None:
     page = client.get("/jobs", params={"label": "sweep:odd"}).text
     (older,) = re.findall(r'href="([^"]+)">Older</a>', page)
     rest = client.get(older.replace("&amp;", "&")).text
     assert len(jobs_on(page)) + len(jobs_on(rest)) == JOBS / 2
 
 
-def test_a_class_that_was_asked_for_by_its_number_has_its_name(client: Browserless) -> None:
+def test_a_class_that_was_asked_for_by_its_number_has_its_name(client: Api) -> None:
     assert set(re.findall(r'<span class="quiet"> as ([^<]+)<', client.get("/jobs").text)) == {"mug"}
 
 
-def test_an_experiment_shows_of_jobs_that_wait_the_options_in_which_they_differ(client: Browserless) -> None:
+def test_an_experiment_shows_of_jobs_that_wait_the_options_in_which_they_differ(client: Api) -> None:
     page = client.get("/experiments/few").text
     columns = re.findall(r'<th scope="col"[^>]*>([^<]+)', page)
     assert columns == ["Job", "epsilon", "tau", "seed", "A_drop", "held-out A_drop", "seconds", "State"]
@@ -100,7 +86,7 @@ def test_an_experiment_shows_of_jobs_that_wait_the_options_in_which_they_differ(
     ],
 )
 def test_what_cannot_be_shown_is_told_on_a_page_with_the_headers_of_its_answer(
-    client: Browserless, path: str, status: int, words: str
+    client: Api, path: str, status: int, words: str
 ) -> None:
     answer = client.get(f"/jobs{path}", headers={"Accept": "text/html"})
     assert answer.status_code == status
@@ -113,10 +99,9 @@ def test_what_cannot_be_shown_is_told_on_a_page_with_the_headers_of_its_answer(
 
 
 def test_a_judgement_alone_is_an_experiment_without_attacks_and_has_no_models(tmp_path: Path) -> None:
-    with app_on(tmp_path) as (app, store):
+    with running(Settings(data=tmp_path)) as client:
         request = JudgementRequest.of("mug", "mug", label="mug", labels={"experiment": "only"})
-        job, _ = store.create(request)
-        client = Browserless(app)
+        job, _ = client.services.store.create(request)
         experiment = client.get("/experiments/only")
         assert experiment.status_code == 200
         assert 'No attacks here yet. <a href="/jobs?label=experiment%3Aonly">' in experiment.text
@@ -126,15 +111,16 @@ def test_a_judgement_alone_is_an_experiment_without_attacks_and_has_no_models(tm
 
 
 def test_the_live_list_tells_which_jobs_have_left_it_and_where_it_goes_on(tmp_path: Path) -> None:
-    async def told(app: FastAPI) -> list[Any]:
-        stream: Any = follow_list(app.state.services, state="queued", label="a:b", limit=2).body_iterator
+    async def told(services: Services) -> list[Any]:
+        stream: Any = follow_list(services, state="queued", label="a:b", limit=2).body_iterator
         events = [json.loads((await anext(stream)).data)]
-        store.request_cancel(made[2])
+        services.store.request_cancel(made[2])
         return [*events, json.loads((await anext(stream)).data)]
 
-    with app_on(tmp_path) as (app, store):
-        made = [store.create(JobRequest.of("mug", label="mug", seed=k, labels={"a": "b"}))[0].id for k in range(3)]
-        first, second = asyncio.run(told(app))
+    with running(Settings(data=tmp_path)) as api:
+        create = api.services.store.create
+        made = [create(JobRequest.of("mug", label="mug", seed=k, labels={"a": "b"}))[0].id for k in range(3)]
+        first, second = asyncio.run(told(api.services))
     assert [first["ids"], second["ids"]] == [[made[2], made[1]], [made[1], made[0]]]
     assert [jobs_on(each["html"]) for each in (first, second)] == [first["ids"], made[:1]]
     assert [each["older"] for each in (first, second)] == ["/jobs?state=queued&label=a%3Ab&cursor=2", None]
@@ -150,6 +136,6 @@ def test_names_of_options_are_shown_as_code() -> None:
     assert _code("<b>: leave out `grid`") == "&lt;b&gt;: leave out <code>grid</code>"
 
 
-def test_names_from_users_are_shown_as_text(client: Browserless) -> None:
+def test_names_from_users_are_shown_as_text(client: Api) -> None:
     page = client.get("/jobs", params={"label": "a:<script>alert(1)</script>"}).text
     assert "<script>alert" not in page

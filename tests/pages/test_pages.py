@@ -5,7 +5,6 @@ import json
 import re
 import subprocess
 import sys
-import time
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from PIL import Image
 from playwright.sync_api import Browser, BrowserContext, Page, Response, expect
 
 from tests.pages.conftest import LIMIT, REPORTED, Service, drop, held_back, inaccessible, slowed, turntables, width
+from tests.served import wait_until
 from trompe_shared.api import OPTIONS
 
 pytestmark = pytest.mark.timeout(1200)
@@ -281,6 +281,15 @@ def test_a_judgement_without_an_object_after_is_refused_beside_its_field(
     faults.clear()  # browsers report answers of 422 on the console
 
 
+NEXT_PICTURE = """() => {
+    window.decoded = new Promise((done) => {
+        const decode = window.createImageBitmap;
+        window.createImageBitmap = async (file) => decode(file).finally(() => setTimeout(done));
+    });
+}"""
+"""Promises in ``decoded`` that the next picture was fetched and shown, or not."""
+
+
 def test_the_picture_of_an_object_that_is_no_longer_chosen_is_not_shown(service: Service, page: Page) -> None:
     page.goto(f"{service.url}/jobs/new")
     drawn = page.get_by_text("In the target renderer", exact=True)
@@ -290,9 +299,9 @@ def test_the_picture_of_an_object_that_is_no_longer_chosen_is_not_shown(service:
     page.select_option("[name=object]", "mug")
     expect(drawn).to_be_visible()
     (shown,) = turntables(page)
-    with page.expect_response("**/turntable/ball.png*"):
-        held[0].continue_()
-    page.wait_for_timeout(1000)
+    page.evaluate(NEXT_PICTURE)
+    held[0].continue_()
+    page.evaluate("window.decoded")
     (kept,) = turntables(page)
     assert (kept == shown).all()
 
@@ -345,12 +354,11 @@ def test_every_page_is_accessible_and_none_is_too_wide_cut_off_half_empty_or_mov
         "/docs",
     ):
         page.goto(service.url + path)
-        page.wait_for_timeout(500)
+        assert inaccessible(page) == {}, path  # takes half a second, in which the page may move
         assert page.evaluate("document.documentElement.scrollWidth") <= wide, path
         assert page.evaluate(TOO_WIDE) == [], path
         assert page.evaluate("window.shifted") < 0.02, path
         assert inked(page) > 0.005, path
-        assert inaccessible(page) == {}, path
     context.close()
 
 
@@ -414,7 +422,7 @@ def guarded(new_service: Callable[[], Service]) -> Iterator[Service]:
         command = [sys.executable, "-m", "trompe_client.cli", "token", "create", "me", "--right", "read", "--json"]
         made = subprocess.run([*command, "--data", str(service.data)], capture_output=True, text=True, check=True)
         service.token = json.loads(made.stdout)["secret"]
-        time.sleep(2)  # the server looks for new tokens every second
+        wait_until(lambda: service.http.get("/v1/jobs").status_code == 401)  # it looks for new tokens every second
         yield service
 
 

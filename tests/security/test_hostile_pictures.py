@@ -80,14 +80,6 @@ def smuggled(**pictures: bytes) -> Object3D:
     return replace(object_from_files(archive()), files=archive(**pictures))
 
 
-def from_gltf(data: bytes) -> None:
-    read_object(pack_zip(gltf_files(data)), name="t.zip")
-
-
-def from_mtl(data: bytes) -> None:
-    read_object(pack_zip({"t.obj": OBJ, "t.mtl": MTL, "albedo.png": data}), name="t.zip")
-
-
 @cache
 def fbx() -> Tree:
     """The triangle as assimp writes it, without its picture. Written anew, for assimp cannot read its own file."""
@@ -101,22 +93,18 @@ def fbx() -> Tree:
         return parse_tree(Path(folder, "t.fbx").read_bytes())
 
 
-def from_fbx(data: bytes) -> None:
-    read_object(pack_zip({"t.fbx": fbx().to_bytes(), "albedo.png": data}), name="t.zip")
-
-
-def from_within_fbx(data: bytes) -> None:
-    read_object(with_picture_inside(fbx(), data), name="t.fbx")
+def read(files: dict[str, bytes]) -> None:
+    read_object(pack_zip(files), name="t.zip")
 
 
 DOORS: dict[str, tuple[type[TrompeError], Callable[[bytes], object]]] = {
     "an albedo map": (ObjectError, lambda data: load_object(pack_zip(archive(albedo=data)))),
     "a normal map": (ObjectError, lambda data: load_object(pack_zip(archive(normal=data)))),
     "a metallic map": (ObjectError, lambda data: load_object(pack_zip(archive(metallic=data)))),
-    "a texture of an MTL": (ObjectError, from_mtl),
-    "a texture of a glTF": (ObjectError, from_gltf),
-    "a texture beside an FBX": (ObjectError, from_fbx),
-    "a texture inside an FBX": (ObjectError, from_within_fbx),
+    "a texture of an MTL": (ObjectError, lambda data: read({"t.obj": OBJ, "t.mtl": MTL, "albedo.png": data})),
+    "a texture of a glTF": (ObjectError, lambda data: read(gltf_files(data))),
+    "a texture beside an FBX": (ObjectError, lambda data: read({"t.fbx": fbx().to_bytes(), "albedo.png": data})),
+    "a texture inside an FBX": (ObjectError, lambda data: read_object(with_picture_inside(fbx(), data), name="t.fbx")),
     "what alpha is read from": (ObjectError, opacity_of),
     "what is painted over": (
         ObjectError,

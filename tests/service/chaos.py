@@ -16,9 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
-from tests.fake_job import PHASES, trace
 from tests.served import CHILD, FAKE, ancestry, command_line, command_of, process_table, reserved_port, wait_until
 from tests.service.ray_nodes import ACCESS, RayNodes
 from trompe_client import Client, Retries
@@ -174,10 +173,6 @@ class Site:
         with self.client() as client:
             client.workers()
 
-    def folder_of(self, job: Job) -> Path:
-        """Folder of a job."""
-        return Path(self.settings.store_url) / "jobs" / job.id
-
     def kill_node(self, place: float) -> bool:
         """Kill one of the nodes that run jobs, and start another in its place. Returns whether there was one."""
         if self.nodes is None:
@@ -189,10 +184,6 @@ class Site:
     def log(self) -> str:
         """The end of all logs."""
         return "\n".join(f"--- {file.name}\n{file.read_text()[-2500:]}" for file in sorted(self.folder.glob("*.log")))
-
-    def said(self, words: str) -> int:
-        """Number of occurrences in all logs."""
-        return sum(file.read_text().count(words) for file in self.folder.glob("*.log"))
 
     def __enter__(self) -> Self:
         try:
@@ -302,28 +293,6 @@ class Run:
     jobs: Mapping[int, Job]
     events: Mapping[int, Sequence[Event]]
     digests: Digests
-    seconds: float
-    repeated: int
-    """Phases of fake jobs started more than once."""
-    left: int
-    """Files left in the store besides the artifacts."""
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """Summary of the run."""
-        moved = [job for job in self.jobs.values() if job.attempts > 1]
-        most = max(job.attempts for job in self.jobs.values())
-        return {
-            "jobs": len(self.jobs),
-            "seconds": round(self.seconds, 1),
-            "ended": dict(Counter(job.state.value for job in self.jobs.values())),
-            "jobs taken up again": len(moved),
-            "attacks among them": sum(is_real(job.attack.search.seed) for job in moved),
-            "attempts beyond the first": sum(job.attempts - 1 for job in moved),
-            "most attempts": most,
-            "phases begun again": self.repeated,
-            "files left": self.left,
-        }
 
 
 class Submission:
@@ -331,7 +300,6 @@ class Submission:
 
     def __init__(self, site: Site, count: int, *, pause: float) -> None:
         self._site, self._count, self._pause = site, count, pause
-        self._started = time.monotonic()
         self._ids: list[str] = []
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._submit, daemon=True)
@@ -359,7 +327,6 @@ class Submission:
         """Wait until all are submitted and have ended."""
         wait_until(lambda: self.ended() >= self._count, seconds=seconds, story=story)
         self._thread.join()
-        self.seconds = time.monotonic() - self._started
 
     def run(self) -> Run:
         """The jobs as reported by the API."""
@@ -371,20 +338,11 @@ class Submission:
             jobs = {handle.status.attack.search.seed: handle.status for handle in handles}
             digests = {handle.status.attack.search.seed: self._digests(handle) for handle in handles}
         events = {number: self._site.store.events(job.id) for number, job in jobs.items()}  # a client stops early
-        repeated = sum(self._repeated(job) for job in jobs.values())
-        return Run(jobs, events, digests, self.seconds, repeated, sum(self._left(job) for job in jobs.values()))
+        return Run(jobs, events, digests)
 
     def _digests(self, handle: JobHandle) -> dict[str, str]:
         files = handle.download(self._site.folder / "downloads" / handle.id)
         return {file.name: hashlib.sha256(without_times(file)).hexdigest() for file in files}
-
-    def _repeated(self, job: Job) -> int:
-        notes = trace(self._site.folder_of(job))
-        return sum(notes.count(f"begin {phase}") > 1 for phase in PHASES)
-
-    def _left(self, job: Job) -> int:
-        files = [file for file in self._site.folder_of(job).glob("*/*") if file.is_file()]
-        return sum(file.name not in job.artifacts for file in files)
 
 
 def without_times(file: Path) -> bytes:

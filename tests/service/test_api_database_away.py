@@ -6,35 +6,27 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
+from tests.server.api.conftest import Api, running
 from trompe_server.api import following, guard
-from trompe_server.api.services import Services
-from trompe_server.library import Library
-from trompe_server.queue.store import JobStore
-from trompe_server.service.app import create_app
 from trompe_server.settings import Settings
-from trompe_server.storage.folders import open_folder
-from trompe_server.storage.tokens import Right, Tokens
+from trompe_server.storage.tokens import Right
 
 JOB = {"object": "mug", "goal": {"label": "mug"}}
 
 
 @pytest.fixture
-def services(postgres: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Services]:
-    """The API's side of a service on a PostgreSQL of its own. Tokens are never older than the request."""
+def api(postgres: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Api]:
+    """The API on a PostgreSQL of its own. Tokens are never older than the request."""
     monkeypatch.setattr(guard, "FRESH", -1.0)
-    settings = Settings(data=tmp_path, database=postgres.database())
-    store, files = JobStore(settings.database_url), open_folder(settings.store_url)
-    store.migrate()
-    library, tokens = Library(tmp_path / "library"), Tokens(store.engine)
-    yield Services(settings, library, store, files, tokens, list, list)
-    store.close()
+    with running(Settings(data=tmp_path, database=postgres.database())) as api:
+        api.headers = api.token("ci", Right.write)
+        yield api
 
 
 def test_a_database_that_stops_is_answered_with_503_until_it_is_back(
-    services: Services, postgres: Any, monkeypatch: pytest.MonkeyPatch
+    api: Api, postgres: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     look, followed = following._look, threading.Event()
 
@@ -43,13 +35,11 @@ def test_a_database_that_stops_is_answered_with_503_until_it_is_back(
         return look(*arguments)
 
     monkeypatch.setattr(following, "_look", noticed)
-    asyncio.run(_stop_and_start(services, postgres, followed))
+    asyncio.run(_stop_and_start(api, postgres, followed))
 
 
-async def _stop_and_start(services: Services, postgres: Any, followed: threading.Event) -> None:
-    headers = {"Authorization": f"Bearer {services.tokens.create('ci', Right.write)}"}
-    transport = httpx.ASGITransport(create_app(services), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://trompe", headers=headers) as client:
+async def _stop_and_start(api: Api, postgres: Any, followed: threading.Event) -> None:
+    async with api.connect() as client:
         job = (await client.post("/v1/jobs", json=JOB)).json()["id"]
         stream = asyncio.create_task(client.get(f"/v1/jobs/{job}/events"))
         assert await asyncio.to_thread(followed.wait, 120)

@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -185,11 +183,3 @@ def test_a_data_folder_keeps_its_dispatcher_s_name_and_lends_it_to_one(tmp_path:
         assert first != second
     with dispatcher_name(tmp_path) as again:
         assert again == first
-
-
-def test_a_service_on_one_machine_imports_no_ray() -> None:
-    code = (
-        "import sys, trompe_server.service.serve, trompe_server.service.dispatch, trompe_server.executor.attempts;"
-        "sys.exit('ray' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

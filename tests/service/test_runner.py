@@ -21,7 +21,6 @@ from trompe_server.queue.store import JobStore
 from trompe_server.storage.database import DatabaseDownError
 from trompe_server.storage.folders import LocalArtifacts
 from trompe_shared.api import JobState, Progress
-from trompe_shared.errors import RendererError
 
 pytestmark = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 
@@ -154,18 +153,6 @@ def test_damage_that_does_not_go_away_fails_the_job_with_its_words(store: JobSto
     assert run(store, Scripted(a=nothing, b=hopeless)) is JobState.failed
     (job,) = store.page().jobs
     assert job.error == "the disk is broken"
-
-
-def test_a_phase_that_loses_the_renderer_is_run_once_more(store: JobStore) -> None:
-    lost = iter([True, False])
-
-    def fragile(_: OnProgress) -> None:
-        if next(lost):
-            raise RendererError("it went away")
-
-    pipeline = Scripted(a=fragile)
-    assert run(store, pipeline) is JobState.succeeded
-    assert pipeline.ran == ["a", "a"]
 
 
 def test_a_full_disk_is_told_in_words(store: JobStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

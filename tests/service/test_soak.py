@@ -3,7 +3,6 @@
 TROMPE_SOAK_MINUTES (120) is the duration, TROMPE_SOAK_CSV the file of samples. ``--log-cli-level=INFO`` prints figures.
 """
 
-import io
 import itertools
 import logging
 import os
@@ -18,14 +17,15 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from PIL import Image
 
+from tests.security.test_hostile_uploads import ARCHIVES, obj_files
 from tests.served import wait_until
 from tests.service.soak import LEAST_SAMPLES, Soaked, Watch, summary, trend, trends
+from tests.small_models import large_png, zipped
 from trompe_client import BadRequest, Client, JobCancelled
 from trompe_client._job import JobHandle
 from trompe_server.formats.gltf_write import write_glb
-from trompe_shared.object3d import load_object, pack_zip
+from trompe_shared.object3d import load_object
 from trompe_shared.shipped import ShippedObject, shipped_objects
 
 logger = logging.getLogger(__name__)
@@ -39,15 +39,11 @@ POOL = {"pool": 12, "views_per_step": 6, "held_out": 4, "steps": 10}
 
 def hostile_files() -> dict[str, bytes]:
     """Files to be refused, by name."""
-    picture = io.BytesIO()
-    Image.new("1", (20_000, 20_000)).save(picture, "PNG")
-    mesh = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
-    table = b'{"m": {"albedo": "t.png"}}'
     return {
-        "bomb.zip": pack_zip({"t.obj": mesh, "t.bin": bytes(80 * 2**20)}),
-        "picture.zip": pack_zip({"t.obj": mesh, "t_mat_def.json": table, "t.png": picture.getvalue()}),
+        "bomb.zip": ARCHIVES["a zip bomb"][0](),
+        "picture.zip": zipped(obj_files(t__png=large_png(20_000, 20_000))),
         "noise.glb": b"glTF" + random.Random(0).randbytes(100_000),
-        "path.zip": pack_zip({"t.obj": mesh, "../../t.png": b""}),
+        "path.zip": ARCHIVES["a path out of the folder"][0](),
     }
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.service.records import DONE, claim, claims_of, create
+from tests.surfaces import object_of, quad
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.library import Library
 from trompe_server.queue.retention import Retention, delete_job
@@ -180,10 +181,8 @@ def _inspect(_: str) -> dict[str, object]:
     return {"white_box": True, "n_classes": 3, "image_size": [8, 8]}
 
 
-def test_the_library_is_the_same_wherever_it_is(
-    folder: Folder, tmp_path: Path, make_object: Any, make_quad: Any
-) -> None:
-    archive = pack_zip(dict(make_object(make_quad(np.zeros((8, 8, 3), np.uint8))).files))
+def test_the_library_is_the_same_wherever_it_is(folder: Folder, tmp_path: Path) -> None:
+    archive = pack_zip(dict(object_of(quad(np.zeros((8, 8, 3), np.uint8))).files))
     library = Library(folder, cache=tmp_path / "cache", inspect=_inspect)
     info = library.add_object(io.BytesIO(archive), "square.zip")
     assert library.add_object(io.BytesIO(archive), "again.zip").id == info.id

@@ -1,6 +1,6 @@
 """Degenerate scenes: the surrogate and an attack step give finite numbers and do not change a square in the scene."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tests.fakes import FakeTarget, fake_classifier
+from tests.surfaces import object_of, quad
 from trompe_server.attack import Budget, Goal, attack, saliency, start
 from trompe_server.surrogate import SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate.blocks import repeated
@@ -20,7 +21,6 @@ from trompe_shared.errors import ObjectError, SpecError
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
 
-Make = Callable[..., Any]
 SIZE = (32, 32)
 SAMPLING = [
     pytest.param(SamplingModel(), id="msaa"),
@@ -118,10 +118,10 @@ AWKWARD = {
 @pytest.mark.parametrize("model", SAMPLING)
 @pytest.mark.parametrize("awkward", AWKWARD.values(), ids=AWKWARD)
 def test_awkward_surfaces_harm_neither_themselves_nor_the_square_beside_them(
-    awkward: Any, model: SamplingModel, make_object: Make, make_quad: Make
+    awkward: Any, model: SamplingModel
 ) -> None:
-    square = make_quad(noise(16, 16))
-    both, alone = make_object(square, awkward), make_object(square)
+    square = quad(noise(16, 16))
+    both, alone = object_of(square, awkward), object_of(square)
     check(both, FRONT, model)
     with_it, without = (diffuse(obj, FRONT, model) for obj in (both, alone))
     rows = np.s_[..., 20:28, 8:24]  # below the middle, where only the square is
@@ -129,25 +129,25 @@ def test_awkward_surfaces_harm_neither_themselves_nor_the_square_beside_them(
 
 
 @pytest.mark.parametrize("awkward", AWKWARD.values(), ids=AWKWARD)
-def test_awkward_surfaces_on_their_own_do_no_harm(awkward: Any, make_object: Make) -> None:
+def test_awkward_surfaces_on_their_own_do_no_harm(awkward: Any) -> None:
     if awkward is AWKWARD["a point"]:
         with pytest.raises(ObjectError, match="no extent"):
-            make_object(awkward)
+            object_of(awkward)
         return
-    obj = make_object(awkward)
+    obj = object_of(awkward)
     surrogate = diffuse(obj, FRONT)
     assert torch.isfinite(images_of(surrogate, obj)).all()
     assert all(torch.isfinite(delta).all() for delta in step_from(surrogate, obj).values())
 
 
-def test_a_seam_between_uv_islands_reads_no_texel_of_the_other_side(make_object: Make, make_quad: Make) -> None:
+def test_a_seam_between_uv_islands_reads_no_texel_of_the_other_side() -> None:
     """Two halves of a square have texels far apart: only pixels on the seam may show a mixture."""
     texture = np.zeros((64, 64, 3), np.uint8)
     texture[:, :24], texture[:, 40:] = 40, 200
     texture[:, 24:40] = 255
-    corners, uvs, _ = make_quad(texture)
+    corners, uvs, _ = quad(texture)
     uvs[0], uvs[1] = [[0.02, 0], [0.3, 0], [0.3, 1]], [[0.7, 0], [0.98, 1], [0.7, 1]]
-    obj = make_object((corners, uvs, texture))
+    obj = object_of((corners, uvs, texture))
     surrogate = diffuse(obj, FRONT[:1], size=(64, 64))
     values = surrogate.geometry.batches[0].gather.forward(surrogate.texels(textures_of(obj)))[:, 0] * 255
     pure = ((values - 40).abs() < 2) | ((values - 200).abs() < 2)
@@ -164,9 +164,9 @@ def test_cameras_inside_the_object_or_on_its_surface_do_no_harm(mug: Object3D, m
 
 @pytest.mark.parametrize("model", SAMPLING)
 def test_an_empty_view_shows_its_background_and_changes_neither_other_views_nor_the_attack(
-    model: SamplingModel, make_object: Make, make_quad: Make
+    model: SamplingModel,
 ) -> None:
-    obj, model = make_object(make_quad(noise(16, 16))), model.but(cull=True)
+    obj, model = object_of(quad(noise(16, 16))), model.but(cull=True)
     mixed = [FRONT[0], EMPTY, FRONT[1]]
     check(obj, mixed, model)
     check(obj, [EMPTY, EMPTY], model)
@@ -180,8 +180,8 @@ def test_an_empty_view_shows_its_background_and_changes_neither_other_views_nor_
     assert (steps[1] != 0).any()
 
 
-def test_calibration_survives_an_empty_view(make_object: Make, make_quad: Make) -> None:
-    obj, views = make_object(make_quad(noise(16, 16))), [FRONT[0], EMPTY, FRONT[1]]
+def test_calibration_survives_an_empty_view() -> None:
+    obj, views = object_of(quad(noise(16, 16))), [FRONT[0], EMPTY, FRONT[1]]
     target = FakeTarget(2000)
     for wanted in ("diffuse", "curve"):
         clean = target.render(obj, views, size=SIZE)
@@ -190,8 +190,8 @@ def test_calibration_survives_an_empty_view(make_object: Make, make_quad: Make) 
         assert all(np.isfinite(value) for value in found.fidelity.mean().values())
 
 
-def test_a_black_object_on_black_is_black_and_can_be_attacked(make_object: Make, make_quad: Make) -> None:
-    obj = make_object(make_quad(np.zeros((8, 8, 3), np.uint8)))
+def test_a_black_object_on_black_is_black_and_can_be_attacked() -> None:
+    obj = object_of(quad(np.zeros((8, 8, 3), np.uint8)))
     views = [View(view.camera, view.light, (0, 0, 0)) for view in FRONT]
     check(obj, views, DEFAULT)
     for surrogate in surrogates(obj, views, DEFAULT):
@@ -203,29 +203,9 @@ def test_a_black_object_on_black_is_black_and_can_be_attacked(make_object: Make,
     assert torch.isfinite(maps).all()
 
 
-def test_the_texture_of_a_hidden_part_stays_unchanged(make_object: Make, make_quad: Make) -> None:
-    obj = make_object(make_quad(noise(8, 8)), make_quad(noise(4, 4), z=3.0))
-    check(obj, FRONT, DEFAULT)
-    for surrogate in surrogates(obj, FRONT, DEFAULT):
-        deltas = step_from(surrogate, obj)
-        assert (deltas["m1.png"] == 0).all()
-        assert (deltas["m0.png"] != 0).any()
-
-
-@pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf"), 1e39])
-@pytest.mark.parametrize("where", ["corner", "uv"])
-def test_coordinates_that_are_not_finite_are_refused(number: float, where: str, make_object: Make) -> None:
-    corners, uvs, texture = triangle([0, 0, 0], [1, 0, 0], [0, 1, 0], uvs=UNIT_UVS.copy())
-    (corners if where == "corner" else uvs)[0, 1, 0] = number
-    with pytest.raises(ObjectError, match="not finite"):
-        make_object((corners, uvs, texture))
-
-
 @pytest.mark.parametrize("size", [(1, 1), (1, 41), (41, 1)])
-def test_images_of_a_single_row_column_or_pixel_are_drawn(
-    size: tuple[int, int], make_object: Make, make_quad: Make
-) -> None:
-    obj = make_object(make_quad(noise(16, 16)))
+def test_images_of_a_single_row_column_or_pixel_are_drawn(size: tuple[int, int]) -> None:
+    obj = object_of(quad(noise(16, 16)))
     images = images_of(diffuse(obj, FRONT, SamplingModel(samples="centre"), size), obj)
     assert images.shape == (2, 3, *size)
     assert torch.isfinite(images).all()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.surfaces import object_of, quad
 from trompe_server.renderers import SailenvTarget
 from trompe_server.surrogate import SamplingModel, curve_surrogate, prepare_geometry
 from trompe_server.surrogate.calibration import CURVE_GREYS, calibrate, painted_grey, painted_noise
@@ -20,7 +21,6 @@ from trompe_shared.shipped import shipped_objects
 
 Image8 = NDArray[np.uint8]
 Running = Callable[..., AbstractContextManager[tuple[str, int]]]
-Make = Callable[..., object]
 Ask = Callable[[Object3D, Sequence[View]], Image8]
 SIZE = (96, 96)
 MUG = shipped_objects()["mug"]
@@ -53,11 +53,9 @@ def anisotropic(running_worker: Running) -> Iterator[Ask]:
 
 
 @pytest.mark.parametrize("shown", ["plane", pytest.param("mug", marks=pytest.mark.thorough)])
-def test_an_anisotropic_filter_is_found(
-    shown: str, anisotropic: Ask, mug: Object3D, make_object: Callable[..., Object3D], make_quad: Make
-) -> None:
+def test_an_anisotropic_filter_is_found(shown: str, anisotropic: Ask, mug: Object3D) -> None:
     texture = np.random.default_rng(0).integers(40, 216, (160, 160, 3), dtype=np.uint8)
-    plane = make_object(make_quad(texture, half=0.12))
+    plane = object_of(quad(texture, half=0.12))
     obj, views = (plane, ASLANT) if shown == "plane" else (mug, AROUND)
     sampling, fidelity, usual = found(obj, views, anisotropic)
     assert sampling.anisotropy > 1

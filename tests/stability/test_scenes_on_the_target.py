@@ -4,13 +4,13 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from tests.surfaces import Surface, object_of, quad
 from trompe_server.job.report.warnings import POOR_VIEW
 from trompe_server.renderers import SailenvTarget
 from trompe_server.surrogate import SamplingModel, Surrogate, curve_surrogate, prepare_geometry
@@ -21,9 +21,7 @@ from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, object_from_files
 
 Image8 = NDArray[np.uint8]
-Surface = tuple[Any, Any, Image8]
-Make = Callable[..., Any]
-MakeObject = Callable[..., Object3D]
+Make = Callable[[], Object3D]
 SIZE = (128, 128)
 MAGENTA = (255, 0, 255)
 AROUND = [
@@ -78,9 +76,9 @@ def check_places(shown: Shown) -> None:
     assert (where != true).sum() <= 0.01 * true.sum() + 3
 
 
-def quads(make_quad: Make, *places: tuple[float, float, int]) -> list[Surface]:
+def quads(*places: tuple[float, float, int]) -> list[Surface]:
     """Squares of half a side at a depth, with a texture of noise each: (half, z, texels a side)."""
-    return [make_quad(noise(n, n, seed=k), half=half, z=z) for k, (half, z, n) in enumerate(places)]
+    return [quad(noise(n, n, seed=k), half=half, z=z) for k, (half, z, n) in enumerate(places)]
 
 
 def turned(surface: Surface, degrees: float) -> Surface:
@@ -96,14 +94,10 @@ def reverse(surface: Surface, texture: Image8) -> Surface:
     return np.asarray(corners)[:, ::-1], np.asarray(uvs)[:, ::-1], texture
 
 
-def overlapping(make_object: MakeObject, make_quad: Make) -> Object3D:
-    first, second = quads(make_quad, (0.1, 0.0, 64), (0.08, 0.0, 64))
+def overlapping() -> Object3D:
+    first, second = quads((0.1, 0.0, 64), (0.08, 0.0, 64))
     sides = [reverse(first, noise(32, 32, seed=7)), reverse(second, noise(32, 32, seed=8))]
-    return make_object(turned(first, 30), turned(second, -40), turned(sides[0], 30), turned(sides[1], -40))
-
-
-def coplanar(make_object: MakeObject, make_quad: Make) -> Object3D:
-    return make_object(*quads(make_quad, (0.1, 0.0, 64), (0.1, 0.0, 48)))
+    return object_of(turned(first, 30), turned(second, -40), turned(sides[0], 30), turned(sides[1], -40))
 
 
 def cut_otherwise(surface: Surface) -> Surface:
@@ -112,45 +106,49 @@ def cut_otherwise(surface: Surface) -> Surface:
     return corners, uvs, surface[2]
 
 
-def flickering(make_object: MakeObject, make_quad: Make) -> Object3D:
-    first, second = quads(make_quad, (0.1, 0.0, 64), (0.1, 0.0, 48))
-    return make_object(turned(first, 33.3), cut_otherwise(turned(second, 33.3)))
+def flickering() -> Object3D:
+    first, second = quads((0.1, 0.0, 64), (0.1, 0.0, 48))
+    return object_of(turned(first, 33.3), cut_otherwise(turned(second, 33.3)))
 
 
-def sticker(make_object: MakeObject, make_quad: Make) -> Object3D:
-    return make_object(*quads(make_quad, (0.1, 0.0, 64), (0.07, 0.0, 48)))
+def coplanar() -> Object3D:
+    return object_of(*quads((0.1, 0.0, 64), (0.1, 0.0, 48)))
 
 
-def two_sided(make_object: MakeObject, make_quad: Make) -> Object3D:
-    (front,) = quads(make_quad, (0.1, 0.0, 64))
-    return make_object(front, reverse(front, noise(24, 24, seed=5)))
+def sticker() -> Object3D:
+    return object_of(*quads((0.1, 0.0, 64), (0.07, 0.0, 48)))
 
 
-def outside_uvs(make_object: MakeObject, make_quad: Make) -> Object3D:
-    corners, uvs, texture = make_quad(noise(32, 32), repeat=2.5)
+def two_sided() -> Object3D:
+    (front,) = quads((0.1, 0.0, 64))
+    return object_of(front, reverse(front, noise(24, 24, seed=5)))
+
+
+def outside_uvs() -> Object3D:
+    corners, uvs, texture = quad(noise(32, 32), repeat=2.5)
     behind = reverse((corners, -3.25 * np.asarray(uvs), texture), noise(16, 16))
-    return make_object((corners, np.asarray(uvs) - [7.3, -4.1], texture), behind)
+    return object_of((corners, np.asarray(uvs) - [7.3, -4.1], texture), behind)
 
 
-def several_materials(make_object: MakeObject, make_quad: Make) -> Object3D:
-    front = quads(make_quad, (0.05, 0.06, 64), (0.08, 0.03, 32), (0.1, 0.0, 128))
-    return make_object(*front, reverse(front[2], noise(8, 8)), make_quad(noise(1, 1), half=0.03, z=0.09))
+def several_materials() -> Object3D:
+    front = quads((0.05, 0.06, 64), (0.08, 0.03, 32), (0.1, 0.0, 128))
+    return object_of(*front, reverse(front[2], noise(8, 8)), quad(noise(1, 1), half=0.03, z=0.09))
 
 
-def shared_texture(make_object: MakeObject, make_quad: Make) -> Object3D:
-    obj = make_object(*quads(make_quad, (0.06, 0.05, 64), (0.1, 0.0, 64)))
+def shared_texture() -> Object3D:
+    obj = object_of(*quads((0.06, 0.05, 64), (0.1, 0.0, 64)))
     table = {name: {"albedo": "m0.png"} for name in ("m0", "m1")}
     files = {name: data for name, data in obj.files.items() if name != "m1.png"}
     return object_from_files({**files, "made_mat_def.json": json.dumps(table).encode()})
 
 
-def thin_textures(make_object: MakeObject, make_quad: Make) -> Object3D:
+def thin_textures() -> Object3D:
     textures = (noise(1, 1), noise(1, 37), noise(41, 1))
-    front = [make_quad(texture, half=0.04 + 0.03 * k, z=0.1 - 0.05 * k) for k, texture in enumerate(textures)]
-    return make_object(*front, reverse(front[2], noise(1, 5)))
+    front = [quad(texture, half=0.04 + 0.03 * k, z=0.1 - 0.05 * k) for k, texture in enumerate(textures)]
+    return object_of(*front, reverse(front[2], noise(1, 5)))
 
 
-def awkward(make_object: MakeObject, make_quad: Make) -> Object3D:
+def awkward() -> Object3D:
     points = [
         [[-0.2, 0.11, 0.01], [0.2, 0.11, 0.01], [0.2, 0.11 + 1e-6, 0.01]],  # a needle
         [[0, 0, 0.05]] * 3,
@@ -159,12 +157,12 @@ def awkward(make_object: MakeObject, make_quad: Make) -> Object3D:
         [[-9, -9, 5], [9, -9, 5], [0, 9, 5]],  # behind the cameras in front
     ]
     uvs = [[[0, 0], [1, 0], [0, 1]]] * 3 + [[[0.3, 0.3]] * 3] * 2
-    return make_object(*quads(make_quad, (0.1, 0.0, 64)), (np.array(points, float), np.array(uvs), noise(8, 8)))
+    return object_of(*quads((0.1, 0.0, 64)), (np.array(points, float), np.array(uvs), noise(8, 8)))
 
 
-def cut_out(make_object: MakeObject, make_quad: Make) -> Object3D:
-    front, back = quads(make_quad, (0.1, 0.04, 128), (0.12, -0.02, 64))
-    return with_opacity(make_object(front, back, reverse(back, noise(16, 16))), "m0.png", holes(128))
+def cut_out() -> Object3D:
+    front, back = quads((0.1, 0.04, 128), (0.12, -0.02, 64))
+    return with_opacity(object_of(front, back, reverse(back, noise(16, 16))), "m0.png", holes(128))
 
 
 def blended(obj: Object3D, **opacity: float) -> Object3D:
@@ -175,21 +173,21 @@ def blended(obj: Object3D, **opacity: float) -> Object3D:
     return object_from_files({**obj.files, "made_mat_def.json": json.dumps(table).encode()})
 
 
-def glazed(make_object: MakeObject, make_quad: Make) -> Object3D:
-    front, back = quads(make_quad, (0.1, 0.04, 128), (0.12, -0.02, 64))
-    obj = make_object(front, back, reverse(back, noise(16, 16)))
+def glazed() -> Object3D:
+    front, back = quads((0.1, 0.04, 128), (0.12, -0.02, 64))
+    obj = object_of(front, back, reverse(back, noise(16, 16)))
     return blended(with_opacity(obj, "m0.png", holes(128)), m0=0.8)
 
 
-def vase(make_object: MakeObject, make_quad: Make) -> Object3D:
+def vase() -> Object3D:
     """Four panes of glass, seen from outside and, through each other, from inside."""
-    sides = [turned(make_quad(noise(32, 32, seed=k), half=0.1, z=0.1), 90 * k) for k in range(4)]
-    obj = make_object(*sides, *(reverse(side, side[2]) for side in sides))
+    sides = [turned(quad(noise(32, 32, seed=k), half=0.1, z=0.1), 90 * k) for k in range(4)]
+    obj = object_of(*sides, *(reverse(side, side[2]) for side in sides))
     return blended(obj, **{f"m{k}": 0.4 for k in range(8)})
 
 
-def room(make_object: MakeObject, make_quad: Make) -> Object3D:
-    return make_object(*(turned(make_quad(noise(64, 64, seed=k), half=0.1, z=-0.1), 90 * k) for k in range(4)))
+def room() -> Object3D:
+    return object_of(*(turned(quad(noise(64, 64, seed=k), half=0.1, z=-0.1), 90 * k) for k in range(4)))
 
 
 INSIDE = [View(Camera(*place), background=MAGENTA) for place in ((0.02, 10, 5), (0.06, 100, -20), (0.09, 250, 0))]
@@ -211,29 +209,27 @@ SCENES = [
 
 @pytest.mark.parametrize(("scene", "views", "least"), SCENES)
 def test_the_surrogate_predicts_the_targets_images(
-    scene: Make, views: list[View], least: float, target: SailenvTarget, make_object: MakeObject, make_quad: Make
+    scene: Make, views: list[View], least: float, target: SailenvTarget
 ) -> None:
-    shown = show(scene(make_object, make_quad), target, views)
+    shown = show(scene(), target, views)
     check_places(shown)
     assert min(shown.fidelity.correlation) >= least
     assert shown.fidelity.mean()["slope"] == pytest.approx(1, abs=0.05)
     assert shown.fidelity.mean()["error"] <= 2 / 255
 
 
-def test_a_black_object_on_black_is_black_and_its_repaint_is_predicted(
-    target: SailenvTarget, make_object: MakeObject, make_quad: Make
-) -> None:
+def test_a_black_object_on_black_is_black_and_its_repaint_is_predicted(target: SailenvTarget) -> None:
     views = [replace(view, background=(0, 0, 0)) for view in AROUND[:3]]
-    shown = show(make_object(make_quad(np.zeros((32, 32, 3), np.uint8))), target, views)
+    shown = show(object_of(quad(np.zeros((32, 32, 3), np.uint8))), target, views)
     assert shown.clean.max() <= 40  # its gloss
     assert min(shown.fidelity.correlation) >= 0.95
 
 
 @pytest.mark.parametrize("scene", [flickering, pytest.param(sticker, marks=pytest.mark.thorough)])
 def test_a_calibration_warns_of_parts_in_one_plane_that_only_rounding_orders(
-    scene: Make, target: SailenvTarget, make_object: MakeObject, make_quad: Make
+    scene: Make, target: SailenvTarget
 ) -> None:
-    obj, views = scene(make_object, make_quad), AROUND[:4]
+    obj, views = scene(), AROUND[:4]
     unlit = {name: np.full_like(obj.textures[name], level) for name, level in (("m0.png", 0), ("m1.png", 200))}
     seen = target.render(obj.with_textures(unlit), views, size=SIZE)
     inside = seen[(seen != MAGENTA).any(axis=-1)].max(axis=1) > 100
@@ -249,10 +245,8 @@ def test_a_calibration_warns_of_parts_in_one_plane_that_only_rounding_orders(
     assert poor or not calibration.fidelity.good_enough or worst < 0.9
 
 
-def test_a_sheet_shows_the_scene_behind_its_holes_and_a_repaint_keeps_them(
-    target: SailenvTarget, make_object: MakeObject, make_quad: Make
-) -> None:
-    obj, view = cut_out(make_object, make_quad), AROUND[:1]
+def test_a_sheet_shows_the_scene_behind_its_holes_and_a_repaint_keeps_them(target: SailenvTarget) -> None:
+    obj, view = cut_out(), AROUND[:1]
     green, white = (
         obj.with_textures({name: np.full_like(obj.textures[name], colour)})
         for name, colour in (("m1.png", (0, 255, 0)), ("m0.png", 255))
@@ -270,10 +264,8 @@ def test_a_sheet_shows_the_scene_behind_its_holes_and_a_repaint_keeps_them(
     assert (first.gather.index == second.gather.index).all()
 
 
-def test_an_alpha_channel_that_cuts_nothing_out_changes_no_image_and_no_operator(
-    worker: tuple[str, int], make_object: MakeObject, make_quad: Make
-) -> None:
-    plain = overlapping(make_object, make_quad)
+def test_an_alpha_channel_that_cuts_nothing_out_changes_no_image_and_no_operator(worker: tuple[str, int]) -> None:
+    plain = overlapping()
     faint = with_opacity(plain, "m0.png", np.full((64, 64), 128, np.uint8))
     images = []
     for obj in (plain, faint):
@@ -286,10 +278,8 @@ def test_an_alpha_channel_that_cuts_nothing_out_changes_no_image_and_no_operator
         assert all((a == b).all() for a, b in zip(*(vars(x.gather).values() for x in (one, other)), strict=True))
 
 
-def test_hidden_parts_and_empty_views_change_nothing(
-    target: SailenvTarget, make_object: MakeObject, make_quad: Make
-) -> None:
-    obj = make_object(*quads(make_quad, (0.1, 0.0, 64), (0.05, 3.0, 16)))
+def test_hidden_parts_and_empty_views_change_nothing(target: SailenvTarget) -> None:
+    obj = object_of(*quads((0.1, 0.0, 64), (0.05, 3.0, 16)))
     shown = show(obj, target, [AROUND[0], AROUND[4]])
     (batch,) = shown.surrogate.geometry.batches
     assert batch.counts[1] == 0

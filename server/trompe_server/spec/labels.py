@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from difflib import get_close_matches
-from typing import Final
+from typing import Final, SupportsIndex
 
 from trompe_server.spec.checks import check_labels
 from trompe_shared.errors import LabelError
@@ -12,26 +12,29 @@ MOST_DIGITS: Final = 18
 
 
 def resolve_labels(
-    label: str | int | Sequence[str | int], classes: Sequence[str] | None, n_classes: int, classifier: str
+    label: str | SupportsIndex | Sequence[str | SupportsIndex],
+    classes: Sequence[str] | None,
+    n_classes: int,
+    classifier: str,
 ) -> tuple[int, ...]:
     """Indices of the classes that count as the object, from one label or several.
 
     Raises ``LabelError`` as ``resolve_label`` does, and ``SpecError`` as ``check_labels`` does.
     """
-    given = [label] if isinstance(label, str | int) else label
+    given = [label] if isinstance(label, str | SupportsIndex) else label
     found = tuple(resolve_label(each, classes, n_classes, classifier) for each in given)
     check_labels(found, n_classes, given=given)
     return found
 
 
-def resolve_label(label: str | int, classes: Sequence[str] | None, n_classes: int, classifier: str) -> int:
+def resolve_label(label: str | SupportsIndex, classes: Sequence[str] | None, n_classes: int, classifier: str) -> int:
     """Index in [0, n_classes) of the class called ``label``; ``classifier`` is the network's name.
 
     ``label`` is an index, its digits, the full name of a class, or one of the name's comma-separated synonyms ("toilet
     tissue" for "toilet tissue, toilet paper, bathroom tissue"), in any case. Raises ``LabelError`` for an index out of
     range, and for a name of no class or of several.
     """
-    if isinstance(label, int) or label.strip().isdecimal():
+    if isinstance(label, SupportsIndex) or label.strip().isdecimal():
         digits = str(label).strip()
         if len(digits) > MOST_DIGITS or not 0 <= int(digits) < n_classes:
             raise LabelError(

@@ -3,7 +3,7 @@
 import asyncio
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from trompe_server.library import Library
 from trompe_server.queue.store import JobStore
 from trompe_server.queue.tables import update_job
 from trompe_server.service.app import create_app
+from trompe_server.service.dispatch import prepare_data
 from trompe_server.settings import Settings
 from trompe_server.storage.database import clock, write
 from trompe_server.storage.folders import job_artifacts, open_folder
@@ -117,8 +118,7 @@ def settings(tmp_path: Path) -> Settings:
 def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A service's data with an object and a classifier with class names, for copies: to make it takes seconds."""
     settings = Settings(data=tmp_path_factory.mktemp("template"))
-    JobStore(settings.database_url).migrate()
-    with _running(settings, []) as api:
+    with running(settings) as api:
         assert api.upload_object(triangle_zip()).status_code == 201
         assert api.upload_classifier(b"W", classes=json.dumps(CLASSES)).status_code == 201
     return settings.data
@@ -133,16 +133,17 @@ def api(settings: Settings, missing: list[str], monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setattr(guard, "FRESH", -1.0)
     for file in template.glob("*.sqlite*"):
         shutil.copy(file, settings.data)
-    with _running(settings, missing) as api:
+    with running(settings, missing, [RendererInfo(address="127.0.0.1:8085", alive=True)]) as api:
         yield api
 
 
 @contextmanager
-def _running(settings: Settings, missing: list[str]) -> Iterator[Api]:
+def running(settings: Settings, missing: Sequence[str] = (), renderers: Sequence[RendererInfo] = ()) -> Iterator[Api]:
+    """The application on these settings, without a process."""
+    prepare_data(settings)
     store, files = JobStore(settings.database_url), open_folder(settings.store_url)
-    renderers = [RendererInfo(address="127.0.0.1:8085", alive=True)]
-    library = Library(files.within("library"), inspect=_inspect)
-    yield Api(Services(settings, library, store, files, Tokens(store.engine), lambda: renderers, lambda: missing))
+    library, tokens = Library(files.within("library"), inspect=_inspect), Tokens(store.engine)
+    yield Api(Services(settings, library, store, files, tokens, lambda: list(renderers), lambda: list(missing)))
     store.close()
 
 

@@ -145,9 +145,11 @@ def test_many_followers_of_waiting_jobs_ask_the_database_seldom(stocked: Api, mo
     job = stocked.job()
     look = Mock(side_effect=following._look)
     monkeypatch.setattr(following, "_look", look)
+    monkeypatch.setattr(following, "INTERVAL", 0.02)
+    monkeypatch.setattr(following, "PATIENCE", 0.5)
 
     def wait() -> None:
-        time.sleep(2.5)
+        time.sleep(0.5)
         stocked.end(job)
 
     began = time.monotonic()

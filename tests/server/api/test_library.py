@@ -32,13 +32,6 @@ def test_an_object_is_found_by_its_id_its_beginning_and_its_name(api: Api) -> No
     assert uploaded in api.get("/v1/objects").json()
 
 
-def test_the_same_object_is_stored_once(api: Api) -> None:
-    first = api.upload_object(triangle_zip()).json()
-    again = api.upload_object(triangle_zip(), "other.zip").json()
-    assert again["id"] == first["id"]
-    assert [each["name"] for each in api.get("/v1/objects").json() if not each["shipped"]] == ["other"]
-
-
 def test_a_broken_archive_is_refused_and_nothing_is_kept(api: Api) -> None:
     refusal = api.problem(api.upload_object(triangle_zip()[:-40]), 422)
     assert refusal["type"] == "urn:trompe:invalid-object"

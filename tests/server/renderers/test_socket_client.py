@@ -5,13 +5,13 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import closing, suppress
 
 import numpy as np
 import pytest
 
-from tests.served import reserved_port, wait_until
+from tests.served import answering_once, reserved_port, saying, wait_until
 from tests.small_models import triangle_zip
 from trompe_server.renderers import SailenvTarget, local_renderer
 from trompe_shared.errors import RendererError, RendererLostError
@@ -25,22 +25,6 @@ VIEW = View(Camera(1.0, 0.0, 0.0))
 
 def triangle() -> Object3D:
     return load_object(triangle_zip())
-
-
-@contextmanager
-def listening(answer: Callable[[socket.socket], None]) -> Iterator[tuple[str, int]]:
-    """A server whose one connection is handled by ``answer`` in a thread."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-
-        def serve() -> None:
-            connection, _ = listener.accept()
-            with connection:
-                answer(connection)
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        yield listener.getsockname()[:2]
-        thread.join(timeout=240)
 
 
 def render(address: tuple[str, int], *, timeout: float = 240.0) -> str:
@@ -94,7 +78,7 @@ def test_an_aborted_target_renders_no_more_even_if_it_connects_just_then(monkeyp
         return connect(address, timeout)
 
     monkeypatch.setattr(socket, "create_connection", connect_late)
-    with listening(pretend(frame(encode_png(np.zeros((8, 8, 3), np.uint8))))) as address:
+    with answering_once(pretend(frame(encode_png(np.zeros((8, 8, 3), np.uint8))))) as address:
         target = SailenvTarget(*address)
         with closing(target), pytest.raises(RendererLostError, match="aborted"):
             target.render(triangle(), [VIEW], size=(8, 8))
@@ -106,23 +90,13 @@ def test_a_renderer_that_stays_silent_is_given_up() -> None:
     def answer(connection: socket.socket) -> None:
         done.wait(240)
 
-    with listening(answer) as address:
+    with answering_once(answer) as address:
         assert "did not answer within" in render(address, timeout=0.2)
         done.set()
 
 
 def frame(picture: bytes, *, delta_time: float = 0.0) -> list[bytes]:
     return encode_frame([picture], delta_time=delta_time, compress=False)
-
-
-def saying(data: bytes) -> Callable[[socket.socket], None]:
-    """Answers the first bytes with ``data``."""
-
-    def answer(connection: socket.socket) -> None:
-        connection.recv(9)
-        connection.sendall(data)
-
-    return answer
 
 
 BLACK = encode_png(np.zeros((8, 8, 3), np.uint8))
@@ -142,7 +116,7 @@ OTHER = "not a SAILenv renderer"
     ],
 )
 def test_a_renderer_that_fails_is_an_error_with_the_reason(answer: Callable[[socket.socket], None], words: str) -> None:
-    with listening(answer) as address:
+    with answering_once(answer) as address:
         assert words in render(address)
 
 

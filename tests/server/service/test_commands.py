@@ -222,12 +222,6 @@ WRONG = [
     pytest.param(["mug", "nowhere.glb", "--label", "mug", "--out", "out"], 2, "no file 'nowhere.glb'", id="no file"),
     pytest.param(["mug", "notes.txt", "--label", "mug", "--out", "out"], 2, "is not a zip archive", id="no model"),
     pytest.param(["mug", "mug", "--label", "mug", "--out", "o", "--suite", "s"], 2, "standard-1", id="no such suite"),
-    pytest.param(
-        ["mug", "mug", "--label", "mug", "--out", "o", "--suite", "standard-1", "--views", "9"],
-        2,
-        "the suite standard-1 fixes views and seed",
-        id="another number of views",
-    ),
     pytest.param(["--verify", "notes.txt"], 2, "notes.txt is not a manifest", id="no manifest"),
     pytest.param(["mug", "--verify", "notes.txt"], 2, "--verify takes a manifest alone", id="a manifest and a file"),
 ]

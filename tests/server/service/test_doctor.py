@@ -1,17 +1,13 @@
 """``trompe doctor``: content with a healthy machine, helpful with another."""
 
-import http.server
 import json
-import socket
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import pytest
 from click.testing import CliRunner
 
-from tests.served import reserved_port
+from tests.served import answering_once, reserved_port, saying
 from trompe_server.queue.store import JobStore
 from trompe_server.service import commands, doctor
 from trompe_server.settings import Settings
@@ -81,35 +77,11 @@ def test_a_device_that_is_not_there_is_found() -> None:
     assert "--device cpu" in str(finding.remedy)
 
 
-class Healthy(http.server.BaseHTTPRequestHandler):
-    """Answers like a Trompe service."""
-
-    def do_GET(self) -> None:
-        self.send_response(200)
-        self.end_headers()
-        self.wfile.write(b'{"status": "ok"}')
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Say nothing."""
-
-
-@pytest.fixture
-def healthy() -> Iterator[int]:
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Healthy) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-        thread.start()
-        yield server.server_port
-        server.shutdown()
-        thread.join()
-
-
-def test_a_port_is_free_or_ours_or_somebody_elses(healthy: int) -> None:
-    assert doctor._check_port(healthy) == "`trompe serve` is running"
+def test_a_port_is_free_or_ours_or_somebody_elses() -> None:
+    with answering_once(saying(b'HTTP/1.0 200 OK\r\n\r\n{"status": "ok"}')) as (_, port):
+        assert doctor._check_port(port) == "`trompe serve` is running"
     with reserved_port() as port:
         assert doctor._check_port(port) == "free for `trompe serve`"
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        thread = threading.Thread(target=lambda: other.accept()[0].close())
-        thread.start()
-        finding = failed(doctor._check_port, other.getsockname()[1])
-        thread.join()
+    with answering_once(lambda connection: None) as (_, port):
+        finding = failed(doctor._check_port, port)
     assert "trompe serve --port" in str(finding.remedy)
