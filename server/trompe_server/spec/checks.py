@@ -23,14 +23,14 @@ class Classes(Protocol):
     def classes(self) -> Sequence[str] | None: ...
 
 
-def check_labels(labels: Sequence[int], n_classes: int, *, given: Sequence[str | int] = ()) -> None:
+def check_labels(labels: Sequence[int], n_classes: int, *, given: Sequence[object] = ()) -> None:
     """Raise ``SpecError`` unless the object's classes (indices) are distinct, and some but not all of ``n_classes``.
 
     given: the words in which they were named, for the message.
     """
     for place, label in enumerate(labels):
         if (first := labels.index(label)) < place:
-            words = given or labels
+            words: Sequence[object] = given or labels
             raise SpecError(
                 f"The labels {words[first]!r} and {words[place]!r} are the same class, {label}: name each `label` once."
             )
