@@ -8,7 +8,7 @@ import glob
 import hashlib
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import aclosing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,15 +27,20 @@ SUM: Final = re.compile(r"\.([0-9a-f]{64})\.part$")
 PARTIAL, UNCHANGED, UNSATISFIABLE = 206, 304, 416
 
 
+def check_inside(folder: Path, names: Iterable[str]) -> None:
+    """Raise ``ContractError`` for the name of a file outside ``folder``."""
+    for name in names:
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise ContractError(f"The server offers a file named {name!r}, outside {folder}; not written.")
+
+
 async def fetch_all(port: Port, job_id: str, folder: Path) -> tuple[Job, list[Path]]:
     """Download all artifacts of a job into ``folder``. Returns the job and the paths.
 
     Raises ``ContractError`` for a path outside the folder, ``BrokenDownload``.
     """
     job = await send(port, _core.job(job_id))
-    for name in job.artifacts:
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise ContractError(f"The server offers a file named {name!r}, outside {folder}; not downloaded.")
+    check_inside(folder, job.artifacts)
     return job, [await fetch(port, _core.artifact(job_id, name), folder / name) for name in job.artifacts]
 
 

@@ -135,7 +135,7 @@ def zipped(source: Path) -> bytes:
     return upload.content
 
 
-ADVERSARIAL = pack_zip({"mug.obj": b"o mug", "a.png": b"repainted"})
+ADVERSARIAL = pack_zip({"mug.obj": b"o mug", "a.png": b"repainted", "maps/b.png": b"kept"})
 JUDGED = [MANIFEST, MANIFEST_PAGE]
 """Files of a judgement."""
 

@@ -264,6 +264,7 @@ def test_an_object_comes_back_in_the_form_it_was_given(server: FakeServer, mug_f
     assert made == {
         "cup-adversarial.zip",
         "mug-adversarial/a.png",
+        "mug-adversarial/maps/b.png",
         "mug-adversarial/mug.obj",
         "report/index.html",
         "result.json",

@@ -6,13 +6,13 @@ import tempfile
 import time
 import zipfile
 from contextlib import suppress
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import click
 
-from trompe_client._errors import ContractError
 from trompe_client._job import JobHandle
 from trompe_client._progress import Progress, Show, shown
+from trompe_client._transfer import check_inside
 from trompe_client.cli.output import console, print_json, say
 from trompe_shared.api import ADVERSARIAL, Event, JobState, JudgementSpec, in_flags
 from trompe_shared.errors import TrompeError
@@ -103,17 +103,12 @@ def _in_the_form_of(source: str, file: Path) -> Path:
 
 
 def _unpack(archive: Path, folder: Path) -> None:
-    """Unpack a flat zip, and replace ``folder`` by it once it is complete."""
+    """Unpack a zip, and replace ``folder`` by it once it is complete."""
     with tempfile.TemporaryDirectory(dir=archive.parent, prefix=".unpacking-") as scratch:
         fresh = Path(scratch, "object")
-        fresh.mkdir()
         with zipfile.ZipFile(archive) as members:
-            for info in members.infolist():
-                if PurePosixPath(info.filename).name != info.filename:
-                    raise ContractError(
-                        f"{archive.name} should be a flat zip, but holds {info.filename!r}; not unpacked."
-                    )
-                (fresh / info.filename).write_bytes(members.read(info))
+            check_inside(folder, members.namelist())
+            members.extractall(fresh)
         if folder.exists():
             shutil.rmtree(folder)
         os.replace(fresh, folder)
