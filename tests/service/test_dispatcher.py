@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -176,6 +177,16 @@ def test_a_process_that_dies_before_it_is_ready_is_a_fault_and_is_tried_again(tm
         wait_until(lambda: executor.ended(0.1) == [] and "2 times" in str(executor.workers()[0].fault))
     finally:
         executor.close()
+
+
+def test_a_stop_does_not_wait_for_a_process_that_is_starting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started = threading.Event()
+    monkeypatch.setattr("trompe_server.executor.local.fork", lambda *_: started.wait())
+    closing = threading.Thread(target=LocalExecutor(Setup(Settings(data=tmp_path), RendererAddresses())).close)
+    closing.start()
+    closing.join(60)
+    assert not closing.is_alive()
+    started.set()
 
 
 def test_a_data_folder_keeps_its_dispatcher_s_name_and_lends_it_to_one(tmp_path: Path) -> None:

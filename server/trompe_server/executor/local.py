@@ -70,7 +70,7 @@ class LocalExecutor:
 
     def close(self) -> None:
         for slot in self._slots:
-            slot.kill()
+            slot.kill(patience=0.0)
 
 
 class _Slot:
@@ -107,9 +107,12 @@ class _Slot:
         except OSError:  # it died just now, as ``listen`` will hear
             logger.warning("worker %s died before attempt %d of job %s", self.name, claim.attempt, claim.job.id)
 
-    def kill(self) -> None:
-        """End the process at once."""
-        self._starting.join()
+    def kill(self, *, patience: float | None = None) -> None:
+        """End the process at once. One that has not started in time ends itself, since its connection is closed.
+
+        patience: longest time to wait for its start, seconds; by default any, as the fork server imports torch.
+        """
+        self._starting.join(patience)
         if self._process is not None:
             self._process.kill()
             self._process.join()

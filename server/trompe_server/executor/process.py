@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -54,7 +54,8 @@ def run_attempts(connection: Connection, environment: Mapping[str, str], setup: 
     attempts = Attempts(setup.settings, setup.renderers)
     if torch := sys.modules.get("torch"):  # the fork server has imported it with its own number of threads
         torch.set_num_threads(threads())
-    connection.send(READY)
+    with suppress(OSError):  # the executor closed, as ``recv`` will tell
+        connection.send(READY)
     while True:
         try:
             claim = connection.recv()

@@ -14,7 +14,7 @@ from typing import Final
 
 from trompe_shared.errors import TrompeError
 
-GRACE: Final = 15.0
+GRACE: Final = 5.0
 """Seconds from SIGTERM to a forced exit."""
 
 
