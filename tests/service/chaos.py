@@ -359,7 +359,7 @@ def check_history(job: Job, events: Sequence[Event]) -> str | None:
     if [event.id for event in events] != list(range(1, len(events) + 1)):
         return f"its events are numbered {[event.id for event in events]}"
     letters = "".join(_letter(event) for event in events)
-    if not re.fullmatch("q(sr*q)*sr*f", letters):
+    if not re.fullmatch("q+(sr*q+)*sr*f", letters):  # a waiting job is told why it waits
         return f"its states were {[event.state.value for event in events]}"
     if letters.count("s") != job.attempts:
         return f"it was started {letters.count('s')} times in {job.attempts} attempts"
