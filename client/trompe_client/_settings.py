@@ -23,10 +23,10 @@ class Connection:
     @classmethod
     def find(cls, url: str | None, *, token: str | None, timeout: float, transport: Any) -> "Connection":
         """Defaults are TROMPE_SERVER and TROMPE_TOKEN. Raises ``SpecError`` for a wrong address."""
-        address = (url or os.environ.get("TROMPE_SERVER") or DEFAULT_SERVER).rstrip("/")
+        address = url or os.environ.get("TROMPE_SERVER") or DEFAULT_SERVER
         if not _is_url(address):
             raise SpecError(f"The server's URL must be http://HOST:PORT or https://HOST, got {address!r}.")
-        return cls(address, token or os.environ.get("TROMPE_TOKEN") or None, timeout, transport)
+        return cls(address.rstrip("/"), token or os.environ.get("TROMPE_TOKEN") or None, timeout, transport)
 
 
 def _is_url(text: str) -> bool:

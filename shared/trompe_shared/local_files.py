@@ -86,9 +86,8 @@ def files_of(mesh: Path) -> list[str]:
     if not mtls and not table:
         mtls = _found(folder, [file.name for file in folder.iterdir() if file.suffix.lower() == ".mtl"])
     maps = [name for file in table for name in _found(folder, _strings(_json(folder / file)))]
-    return list(
-        dict.fromkeys([mesh.name, *table, *mtls, *maps, *(name for mtl in mtls for name in _maps(folder, mtl))])
-    )
+    maps += [name for mtl in mtls for name in _maps(folder, mtl)]
+    return list(dict.fromkeys([mesh.name, *table, *mtls, *maps]))
 
 
 def _maps(folder: Path, mtl: str) -> Iterator[str]:
@@ -176,11 +175,10 @@ def libraries(text: str, files: Collection[str]) -> dict[str, str]:
     All MTLs if it names none of them.
     """
     beside = [name for name in files if name.lower().endswith(".mtl")]
-    spelled = {name.casefold(): name for name in beside} | {name: name for name in beside}
     found: dict[str, str] = {}
     for written in library_names(text):
         name = written.replace("\\", "/").rsplit("/", 1)[-1]
-        if (file := spelled.get(name, spelled.get(name.casefold()))) is not None:
+        if (file := named(name, beside)) is not None:
             found.setdefault(file, written.removesuffix(name) + file)
     return found or {name: name for name in beside}
 
