@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from trompe_server.surrogate import tensor_of
-from trompe_server.surrogate.blocks import common_change, halvings, repeated, rooms
+from trompe_server.surrogate.blocks import common_change, repeated, rooms
 from trompe_shared.api import levels_within
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D
@@ -69,9 +69,7 @@ class Budget:
 
         delta: of each texel, or of the mean of each block of texels (``blocks``).
         """
-        count = halvings(delta.shape, texture.shape)
-        change = common_change(delta, texture.float() / 255) if count else delta
-        levels = (change * 255).round().clamp(-self.levels, self.levels).to(torch.int16)
+        levels = (common_change(delta, texture) * 255).round().clamp(-self.levels, self.levels).to(torch.int16)
         return repeated(levels, texture.shape).add(texture).clamp_(0, 255).to(torch.uint8)
 
     def repaint(self, obj: Object3D, deltas: Mapping[str, Float[Tensor, "h w 3"]]) -> Object3D:

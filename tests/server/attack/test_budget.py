@@ -17,6 +17,7 @@ from trompe_server.attack.budget import HUE
 from trompe_server.attack.perception import perceptual_bounds
 from trompe_server.judging.visibility import perceived_change
 from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
+from trompe_server.surrogate.blocks import means
 from trompe_shared.errors import SpecError
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
@@ -94,6 +95,19 @@ def test_the_texture_that_is_saved_keeps_the_budget_in_whole_levels(epsilon: flo
     assert saved.dtype == torch.uint8
     assert change.max() <= np.floor(epsilon * 255 + 1e-6)
     assert (saved - (texture.float() + delta * 255)).abs().max() <= 1 + 1e-3
+
+
+@given(st.integers(1, 2), st.floats(2 / 255, 1), SEEDS)
+@settings(max_examples=60)
+def test_blocks_are_saved_with_the_means_that_the_attack_found(count: int, epsilon: float, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    texture = torch.from_numpy(random.integers(-80, 336, (8, 12, 3)).clip(0, 255).astype(np.uint8))  # many saturated
+    budget = Budget(epsilon, epsilon)
+    wish = torch.from_numpy(random.uniform(-1.5 * epsilon, 1.5 * epsilon, (8 >> count, 12 >> count, 3))).float()
+    delta = budget.box(texture.float() / 255, count).project(wish)
+    change = budget.quantise(delta, texture).float() - texture.float()
+    assert change.abs().max() <= budget.levels
+    assert (means(change, count) - 255 * delta).abs().max() <= 1.5  # rounded, and down to a whole level at the bound
 
 
 def test_a_flipped_texture_is_a_texture() -> None:
