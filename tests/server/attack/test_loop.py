@@ -43,6 +43,7 @@ from trompe_server.attack.search import RISE, SAFE_ENOUGH, went_on
 from trompe_server.classifiers import NetworkClassifier, load_classifier
 from trompe_server.judging.metrics import accuracy, texels_altered
 from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
+from trompe_server.surrogate.blocks import means
 from trompe_shared.errors import SpecError
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, load_object
@@ -201,6 +202,8 @@ def test_texels_that_views_do_not_tell_apart_move_together_within_the_budget(
     painted = textures_of(budget.repaint(fine_square, state.deltas))
     change = painted["m0.png"] - textures_of(fine_square)["m0.png"]
     assert change.abs().max() <= 15 / 255 + EPS
+    saved = means(change, surrogate.spare_levels["m0.png"])
+    assert (saved - state.deltas["m0.png"]).abs().max() <= 1.5 / 255  # rounded, and down to a whole level at the bound
     seen = [surrogate.render_all(surrogate.texels(each)) for each in (painted, textures_of(fine_square))]
     before, after = (float(Goal(LABEL).losses(fake_classifier().logits(each)).mean()) for each in reversed(seen))
     assert after > before + 0.02
