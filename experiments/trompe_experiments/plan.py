@@ -13,7 +13,7 @@ from trompe_experiments.design import AssetsFolder, Experiment, expanded
 from trompe_experiments.table import RowId, job_key
 from trompe_shared.api import JobRequest
 from trompe_shared.errors import ObjectError, SpecError
-from trompe_shared.local_files import CLASSIFIER_SUFFIXES, PICTURE_SUFFIXES
+from trompe_shared.local_files import CLASSIFIER_SUFFIXES, LOOKED_UP, PICTURE_SUFFIXES
 from trompe_shared.presets import with_preset
 from trompe_shared.shipped import shipped_objects
 
@@ -95,8 +95,8 @@ def name_of(source: str) -> str:
     return Path(source).stem if _is_file(source) else source
 
 
-def _is_file(source: str | Path) -> bool:
-    return Path(source).suffix.lower() in FILE_SUFFIXES
+def _is_file(source: str) -> bool:
+    return Path(source).suffix.lower() in FILE_SUFFIXES and not source.startswith(LOOKED_UP)
 
 
 def _row(place: RowId, name: str, options: Options, files: "_Files") -> Row:
@@ -153,5 +153,5 @@ class _Files:
 
     def _read(self, kind: str, source: str | Path) -> Upload | str:
         """See ``trompe_client._plan.Read``. Objects are names unless they are paths."""
-        is_file = isinstance(source, Path) or kind == "mask" or _is_file(source)
+        is_file = isinstance(source, Path) or kind == "mask" or _is_file(str(source))
         return source_of(kind, self.path(str(source))) if is_file else str(source)

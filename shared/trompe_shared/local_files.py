@@ -16,9 +16,11 @@ from trompe_shared.errors import ClassifierError, ObjectError
 CLASSIFIER_SUFFIXES: Final = (".pt2", ".onnx")
 LOOKED_UP: Final = ("torchvision:", "timm:", "robustbench:", "hf:")
 """Prefixes of networks by name, whatever their suffix."""
-SPLIT_SUFFIXES: Final = {".obj", ".gltf"}
-"""Models with textures and materials in files beside them."""
-MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, ".glb", ".fbx", ".ply", ".stl"}
+SPLIT_SUFFIXES: Final = {".obj", ".gltf", ".fbx", ".ply"}
+"""Models that can have textures and materials in files beside them."""
+WHOLE_SUFFIXES: Final = {".fbx", ".ply"}
+"""Those of them that can also do without."""
+MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, ".glb", ".stl"}
 PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".gif"}
 """Of the formats of textures (``object3d.IMAGE_FORMATS``)."""
 _MTLLIB: Final = re.compile(r"mtllib(?<![^\r\n]mtllib)[ \t]+([^\r\n]+)")
@@ -28,7 +30,7 @@ _MAP: Final = re.compile(r"map_|(?:bump|norm|disp|decal|refl)$", re.IGNORECASE)
 
 
 def model_file(path: Path) -> tuple[str, bytes | Path]:
-    """(Name, content) of a zip, a model file (an .obj or .gltf with the files it names), or a folder with one.
+    """(Name, content) of a zip, a model file (with the files it names), or a folder with one.
 
     The content is the path of a single file, or a zip's bytes. Raises ``ObjectError``.
     """
@@ -38,8 +40,9 @@ def model_file(path: Path) -> tuple[str, bytes | Path]:
         raise ObjectError(
             f"There is no file {str(path)!r}. Give a zip, a model file, a folder with one, or a stored object's name."
         )
-    if path.suffix.lower() in SPLIT_SUFFIXES:
-        return f"{path.stem}.zip", _zip_files(path.parent, files_of(path))
+    files = files_of(path) if path.suffix.lower() in SPLIT_SUFFIXES else []
+    if len(files) > (path.suffix.lower() in WHOLE_SUFFIXES):
+        return f"{path.stem}.zip", _zip_files(path.parent, files)
     if path.suffix.lower() not in MODEL_SUFFIXES and not zipfile.is_zipfile(path):
         raise ObjectError(f"{str(path)!r} is not a zip archive. Give a zip, a model file, or a folder with one.")
     return path.name, path
@@ -77,8 +80,10 @@ def models_in(folder: Path) -> list[Path]:
 
 
 def files_of(mesh: Path) -> list[str]:
-    """An .obj or .gltf file and the files it names, also through its materials, as paths below its folder."""
+    """A model file and the files it names, also through its materials, as paths below its folder."""
     folder = mesh.parent
+    if mesh.suffix.lower() in WHOLE_SUFFIXES:
+        return [mesh.name, *_pictures_in(mesh)]
     if mesh.suffix.lower() == ".gltf":
         return [mesh.name, *_found(folder, _uris(_json(mesh)))]
     table = _found(folder, [f"{mesh.stem}_mat_def.json"])
@@ -88,6 +93,20 @@ def files_of(mesh: Path) -> list[str]:
     maps = [name for file in table for name in _found(folder, _strings(_json(folder / file)))]
     maps += [name for mtl in mtls for name in _maps(folder, mtl)]
     return list(dict.fromkeys([mesh.name, *table, *mtls, *maps]))
+
+
+def _pictures_in(mesh: Path) -> list[str]:
+    """The pictures in the folder of an .fbx or .ply, or one level below, whose names occur in it."""
+    content, folder = mesh.read_bytes().lower(), mesh.parent
+    found = (file for pattern in ("*", "*/*") for file in sorted(folder.glob(pattern)))
+    pictures = (file for file in found if file.suffix.lower() in PICTURE_SUFFIXES)
+    occur = [str(file.relative_to(folder)) for file in pictures if re.search(_word(file.name), content)]
+    return _found(folder, occur)
+
+
+def _word(name: str) -> bytes:
+    """Pattern of a file's name that is not the end of a longer name."""
+    return rb"(?<![\w-])" + re.escape(name.lower().encode())
 
 
 def _maps(folder: Path, mtl: str) -> Iterator[str]:

@@ -236,7 +236,7 @@ def test_files_are_named_by_their_bytes_and_then_by_what_the_server_called_them(
 
 
 def test_configurations_name_files_without_folder_and_suffix_and_other_networks_in_full(assets: Path) -> None:
-    networks = ["timm:resnet50.a1_in1k", "timm:resnet50.tv_in1k", "$TROMPE_ASSETS/classifiers/mobilenet_v2.pt2"]
+    networks = ["timm:resnet50.a1_in1k", "hf:someone/net.onnx", "$TROMPE_ASSETS/classifiers/mobilenet_v2.pt2"]
     plan = planned(grid={"classifier": networks})
     assert [row.place.configuration for row in plan.rows] == [
         f"classifier {name}" for name in (*networks[:2], "mobilenet_v2")

@@ -39,6 +39,8 @@ SPLIT = {
     "no mtllib": {"m.obj": "", "other.mtl": "map_Kd A.png\nmap_Ks none.png", "a.png": ""},
     "mat_def": {"m.obj": "", "m_mat_def.json": TABLE, "tex/a.png": ""},
     "nothing readable": {"m.gltf": "{"},
+    "PLY": {"m.ply": "ply\ncomment TextureFile A b.png\nend_header", "a b.png": ""},
+    "FBX": {"m.fbx": 'RelativeFilename: "C:\\x\\Skin.TGA", "beta-a.png"', "tex/skin.tga": "", "beta-a.png": ""},
 }  # fmt: skip
 
 
@@ -51,6 +53,12 @@ def test_files_that_a_model_names_keep_their_folders(tmp_path: Path, files: dict
     assert packed(tmp_path) == {*files, "m_mat_def.jsn", "holiday.jpg"}
 
 
+@pytest.mark.parametrize("suffix", [".fbx", ".ply"])
+def test_a_model_without_pictures_beside_it_is_sent_as_it_is(tmp_path: Path, suffix: str) -> None:
+    written(tmp_path, {f"m{suffix}": "comment TextureFile banana.png", "a.png": "", "notes/banana.txt": ""})
+    assert model_file(tmp_path / f"m{suffix}") == (f"m{suffix}", tmp_path / f"m{suffix}")
+
+
 def test_no_file_outside_of_the_models_folder_is_packed(tmp_path: Path) -> None:
     uris = ["../key.png", str(tmp_path / "key.png"), "link.png", "linked/key.png", "own.png"]
     written(
@@ -59,6 +67,8 @@ def test_no_file_outside_of_the_models_folder_is_packed(tmp_path: Path) -> None:
     (tmp_path / "m/link.png").symlink_to(tmp_path / "key.png")
     (tmp_path / "m/linked").symlink_to(tmp_path)
     assert packed(tmp_path / "m/m.gltf") == {"m.gltf", "own.png"}
+    written(tmp_path, {"m/m.ply": "key.png link.png own.png"})
+    assert packed(tmp_path / "m/m.ply") == {"m.ply", "own.png"}
 
 
 def test_pictures_are_those_that_textures_may_be() -> None:
