@@ -138,12 +138,17 @@ def _in_blocks(
 
 def _box(objective: Objective, deltas: Textures, budget: Budget) -> Box:
     """The budget's box around all textures, as one."""
-    low, high, bounds = {}, {}, {}
+    surrogate = objective.surrogate
+    influence = surrogate.influence() if budget.perceptual else {}
+    low, high, bounds, weights = {}, {}, {}, {}
     for name, texture in objective.textures.items():
         size, bound = deltas[name].shape[:2], None
+        count = halvings(size, texture.shape)
         if budget.perceptual:
-            footprint = objective.surrogate.footprint[name]
+            footprint = surrogate.footprint[name]
             bound = bounds[name] = perceptual_bounds(texture, size, footprint=footprint, epsilon=budget.epsilon)
-        box = budget.box(texture, halvings(size, texture.shape), bound=bound)
+            weights[name] = means(influence[name][..., None], count) * 4**count
+        box = budget.box(texture, count, bound=bound)
         low[name], high[name] = box.low, box.high
-    return Box(budget, objective.join(low), objective.join(high), objective.join(bounds) if bounds else None)
+    whole = Box(budget, objective.join(low), objective.join(high))
+    return replace(whole, bound=objective.join(bounds), weight=objective.join(weights)) if budget.perceptual else whole

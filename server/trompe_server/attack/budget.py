@@ -1,7 +1,8 @@
 """Budget of the change: an L-infinity ball around the original texture, within valid colours.
 
 A perceptual budget has a bound of its own for each texel, never above epsilon, and allows less change of hue than of
-lightness: people notice a tint sooner than a shade of the same size.
+lightness: people notice a tint sooner than a shade of the same size. It spends visible change where it pays: texels
+with little gradient for what views show of them go back to where they were.
 """
 
 from collections.abc import Mapping
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from trompe_server.surrogate import tensor_of
@@ -25,6 +26,8 @@ Change = Float[Tensor, "*texels 3"]
 
 HUE: Final = 1.0
 """Largest difference between the changes of a texel's channels, as a share of its bound."""
+MOVING: Final = 0.3
+"""Share of what views show of the moving texels that changes, in a perceptual budget."""
 
 
 @dataclass(frozen=True)
@@ -86,13 +89,15 @@ class Budget:
 class Box:
     """The allowed changes of texels or blocks, from ``low`` to ``high``, with zero among them.
 
-    bound: of a perceptual budget: channels are at most ``HUE`` of it apart, and steps shrink as it does.
+    bound: of a perceptual budget: channels are at most ``HUE`` of it apart, and steps shrink as it does. weight: of a
+    perceptual budget: of each texel or block in the pixels of all views.
     """
 
     budget: Budget
     low: Change
     high: Change
     bound: Bound | None = None
+    weight: Float[Tensor, "*texels 1"] | None = None
 
     def project(self, delta: Change) -> Change:
         """The nearest allowed change."""
@@ -109,4 +114,20 @@ class Box:
         step = direction.sign().mul_(factor * self.budget.alpha)
         if self.bound is not None:
             step.mul_(self.bound / self.budget.epsilon)
+        if self.weight is not None:
+            back = torch.minimum(delta.abs(), step.abs()).copysign(-delta)
+            step = torch.where(_strongest(direction, self.weight), step, back)
         return self.project(step.add_(delta))
+
+
+def _strongest(direction: Change, weight: Float[Tensor, "*texels 1"]) -> Bool[Tensor, "*texels 1"]:
+    """The texels with the most gradient for their weight, up to ``MOVING`` of the weight of all with a gradient."""
+    gradient = direction.abs().sum(-1, keepdim=True)
+    order = (
+        (gradient / weight.clamp(min=torch.finfo(weight.dtype).tiny)).flatten().argsort(descending=True, stable=True)
+    )
+    weights = (weight * (gradient > 0)).flatten()[order]
+    before = weights.cumsum(0) - weights
+    chosen = torch.empty_like(weights, dtype=torch.bool)
+    chosen[order] = before < MOVING * weights.sum()
+    return chosen.view_as(weight)

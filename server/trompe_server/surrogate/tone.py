@@ -65,7 +65,7 @@ class ToneMap:
     black: Float[Tensor, ""]
 
     @classmethod
-    def of(cls, arrays: Mapping[str, NDArray[np.float32]]) -> "ToneMap":
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> "ToneMap":
         """Inverse of ``arrays``. Raises ``ValueError`` if one is missing."""
         try:
             return cls(*(torch.from_numpy(arrays[field.name]) for field in fields(cls)))

@@ -1,6 +1,7 @@
 """The budget: projection, steps, 8-bit quantisation, perceptual bounds and the bound on images, against formulas."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,18 @@ def test_a_perceptual_step_is_as_large_as_the_bound_allows() -> None:
     texture, bound = torch.full((1, 2, 3), 0.5), torch.tensor([[[0.1], [0.02]]])
     delta = Budget(0.1, 0.05).box(texture, bound=bound).ascend(torch.zeros(1, 2, 3), torch.ones(1, 2, 3))
     torch.testing.assert_close(delta[0, :, 0], torch.tensor([0.05, 0.01]))
+
+
+def test_a_perceptual_step_moves_the_texels_with_the_most_gradient_for_what_is_seen_of_them() -> None:
+    gradient = torch.tensor([5.0, 8.0, 0.2, -6.0, 0.0, 1.0])
+    weight = torch.tensor([1.0, 8.0, 1.0, 2.0, 9.0, 8.0])  # 20 with a gradient: a share of 0.3 is 6
+    before = torch.tensor([-0.01, 0.03, 0.01, 0.02, 0.02, -0.03])
+    flat, bound = torch.full((1, 6, 3), 0.5), torch.full((1, 6, 1), 0.1)
+    box = replace(Budget(0.1, 0.02).box(flat, bound=bound), weight=weight.view(1, 6, 1))
+    delta, direction = (each.view(1, 6, 1).expand(-1, -1, 3) for each in (before, gradient))
+    after = box.ascend(delta, direction)
+    torch.testing.assert_close(after[0, :, 0], torch.tensor([0.01, 0.05, 0.0, 0.0, 0.02, -0.01]))
+    assert torch.equal(after[0, :, 0], after[0, :, 2])
 
 
 def test_texels_without_gradient_stay_where_they_are() -> None:
