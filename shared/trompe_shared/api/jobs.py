@@ -212,7 +212,7 @@ class PaintOptions(_Part):
     )
     perceptual: bool = option(
         False,
-        "bound each texel by its visibility, epsilon at most: less in plain areas, less hue than lightness",
+        "hide the change: less of it in plain areas, less hue, fewer texels; give a larger epsilon for the same effect",
     )
     epsilon_view: Annotated[float, Field(gt=0, le=1)] | None = option(
         None, "largest change of a pixel of the surrogate's views, 0..1 (the paper's view constraint)"
