@@ -16,11 +16,11 @@ from trompe_shared.errors import ClassifierError, ObjectError
 CLASSIFIER_SUFFIXES: Final = (".pt2", ".onnx")
 LOOKED_UP: Final = ("torchvision:", "timm:", "robustbench:", "hf:")
 """Prefixes of networks by name, whatever their suffix."""
-SPLIT_SUFFIXES: Final = {".obj", ".gltf", ".fbx", ".ply"}
-"""Models that can have textures and materials in files beside them."""
-WHOLE_SUFFIXES: Final = {".fbx", ".ply"}
-"""Those of them that can also do without."""
-MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, ".glb", ".stl"}
+SPLIT_SUFFIXES: Final = {".obj", ".gltf"}
+"""Models with textures and materials in files beside them."""
+PICTURED_SUFFIXES: Final = {".fbx", ".ply"}
+"""Models that may have pictures in files beside them."""
+MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, *PICTURED_SUFFIXES, ".glb", ".stl"}
 PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".gif"}
 """Of the formats of textures (``object3d.IMAGE_FORMATS``)."""
 _MTLLIB: Final = re.compile(r"mtllib(?<![^\r\n]mtllib)[ \t]+([^\r\n]+)")
@@ -40,12 +40,18 @@ def model_file(path: Path) -> tuple[str, bytes | Path]:
         raise ObjectError(
             f"There is no file {str(path)!r}. Give a zip, a model file, a folder with one, or a stored object's name."
         )
-    files = files_of(path) if path.suffix.lower() in SPLIT_SUFFIXES else []
-    if len(files) > (path.suffix.lower() in WHOLE_SUFFIXES):
-        return f"{path.stem}.zip", _zip_files(path.parent, files)
+    if is_split(path):
+        return f"{path.stem}.zip", _zip_files(path.parent, files_of(path))
     if path.suffix.lower() not in MODEL_SUFFIXES and not zipfile.is_zipfile(path):
         raise ObjectError(f"{str(path)!r} is not a zip archive. Give a zip, a model file, or a folder with one.")
     return path.name, path
+
+
+def is_split(path: Path) -> bool:
+    """Whether a model is sent with files beside it."""
+    if path.suffix.lower() in PICTURED_SUFFIXES:
+        return path.is_file() and len(files_of(path)) > 1
+    return path.suffix.lower() in SPLIT_SUFFIXES
 
 
 def classes_beside(path: Path) -> list[str] | None:
@@ -70,7 +76,7 @@ def _zip_folder(folder: Path) -> bytes:
     if not models:
         raise ObjectError(f"The folder {str(folder)!r} holds no .obj, .gltf or other model file.")
     files = [file.name for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
-    split = [model for model in models if model.suffix.lower() in SPLIT_SUFFIXES]
+    split = [model for model in models if is_split(model)]
     return _zip_files(folder, [*files, *(name for model in split for name in files_of(model))])
 
 
@@ -82,7 +88,7 @@ def models_in(folder: Path) -> list[Path]:
 def files_of(mesh: Path) -> list[str]:
     """A model file and the files it names, also through its materials, as paths below its folder."""
     folder = mesh.parent
-    if mesh.suffix.lower() in WHOLE_SUFFIXES:
+    if mesh.suffix.lower() in PICTURED_SUFFIXES:
         return [mesh.name, *_pictures_in(mesh)]
     if mesh.suffix.lower() == ".gltf":
         return [mesh.name, *_found(folder, _uris(_json(mesh)))]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from trompe_shared.local_files import PICTURE_SUFFIXES, model_file
+from trompe_shared.local_files import PICTURE_SUFFIXES, is_split, model_file
 from trompe_shared.object3d import IMAGE_FORMATS, unpack
 
 
@@ -57,6 +57,8 @@ def test_files_that_a_model_names_keep_their_folders(tmp_path: Path, files: dict
 def test_a_model_without_pictures_beside_it_is_sent_as_it_is(tmp_path: Path, suffix: str) -> None:
     written(tmp_path, {f"m{suffix}": "comment TextureFile banana.png", "a.png": "", "notes/banana.txt": ""})
     assert model_file(tmp_path / f"m{suffix}") == (f"m{suffix}", tmp_path / f"m{suffix}")
+    assert not is_split(tmp_path / f"m{suffix}")
+    assert not is_split(Path(f"stored{suffix}"))
 
 
 def test_no_file_outside_of_the_models_folder_is_packed(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from trompe_client.cli.output import console, print_json, say
 from trompe_shared.api import ADVERSARIAL, Event, JobState, JudgementSpec, in_flags
 from trompe_shared.errors import TrompeError
 from trompe_shared.json_option import as_json
-from trompe_shared.local_files import SPLIT_SUFFIXES
+from trompe_shared.local_files import is_split
 
 
 def follow(
@@ -94,7 +94,7 @@ def _in_the_form_of(source: str, file: Path) -> Path:
     Returns the folder; any other file stays as it is.
     """
     given = Path(source)
-    if not (file.name.endswith(f"{ADVERSARIAL}.zip") and (given.is_dir() or given.suffix.lower() in SPLIT_SUFFIXES)):
+    if not (file.name.endswith(f"{ADVERSARIAL}.zip") and (given.is_dir() or is_split(given))):
         return file
     folder = file.with_suffix("")
     _unpack(file, folder)

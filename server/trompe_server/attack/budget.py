@@ -123,9 +123,8 @@ class Box:
 def _strongest(direction: Change, weight: Float[Tensor, "*texels 1"]) -> Bool[Tensor, "*texels 1"]:
     """The texels with the most gradient for their weight, up to ``MOVING`` of the weight of all with a gradient."""
     gradient = direction.abs().sum(-1, keepdim=True)
-    order = (
-        (gradient / weight.clamp(min=torch.finfo(weight.dtype).tiny)).flatten().argsort(descending=True, stable=True)
-    )
+    worth = gradient / weight.clamp(min=torch.finfo(weight.dtype).tiny)
+    order = worth.flatten().argsort(descending=True, stable=True)
     weights = (weight * (gradient > 0)).flatten()[order]
     before = weights.cumsum(0) - weights
     chosen = torch.empty_like(weights, dtype=torch.bool)

@@ -166,12 +166,12 @@ class _Editor(Writer):
             _keep(self.document, key, [name for name in self.document[key] if name not in unused])
 
     def _replace_file(self, entry: Json, uri: str, png: bytes) -> None:
-        path = self._container.upload.beside(uri)
+        upload = self._container.upload
+        path = upload.beside(uri)
         if not path.lower().endswith(".png"):
             del self._files[path]
-            folder, _, _ = uri.rpartition("/")
             path = free_name(path.rsplit(".", 1)[0] + ".png", self._files)
-            entry["uri"] = "/".join(part for part in (folder, quote(path.rsplit("/", 1)[-1])) if part)
+            entry["uri"] = quote(posixpath.relpath(path, posixpath.dirname(upload.main) or "."))
         self._files[path] = png
 
     def _replace_view(self, entry: Json, png: bytes) -> None:

@@ -32,21 +32,26 @@ class Upload:
         return base_name(self.main).rsplit(".", 1)[0] or "object"
 
     def beside(self, uri: str) -> str:
-        """The path of a relative URI in the mesh file, in other capitals if only such a file is there.
+        """The path of a relative URI in the mesh file, in other capitals or folders if only such a file is there.
 
-        Raises ``ObjectError`` outside the mesh's folder.
+        Raises ``ObjectError`` for a URI outside the mesh's folder.
         """
         path = posixpath.normpath(posixpath.join(posixpath.dirname(self.main), unquote(uri).replace("\\", "/")))
         if ":" in uri or path.startswith(("/", "..")):
             raise ObjectError(
                 f"{self.main!r} names {uri[:80]!r}; only files below its own folder are read. Put the file there."
             )
-        found = named(path, self.files)
+        found = named(path, self.files) or self._elsewhere(base_name(path))
         if found is None:
             raise ObjectError(
                 f"{self.main!r} names {uri[:80]!r}, which is missing; zip the model together with its files."
             )
         return found
+
+    def _elsewhere(self, name: str) -> str | None:
+        """The only file of a name in any folder."""
+        alike = [path for path in self.files if base_name(path).casefold() == name.casefold() and not is_litter(path)]
+        return alike[0] if len(alike) == 1 else None
 
     def flat(self) -> dict[str, bytes]:
         """The files by name without folders, but litter. Raises ``ObjectError`` if two names are equal."""

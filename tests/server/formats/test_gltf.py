@@ -470,8 +470,8 @@ def external(ending: str = "png") -> dict[str, bytes]:
     }
 
 
-@pytest.mark.parametrize("picture", ["my maps/skin.png", "My Maps/SKIN.png"])
-def test_of_a_folder_only_the_picture_changes_whatever_its_capitals(picture: str) -> None:
+@pytest.mark.parametrize("picture", ["my maps/skin.png", "My Maps/SKIN.png", "Skin.png", "other/skin.png"])
+def test_of_a_folder_only_the_picture_changes_whatever_its_capitals_and_place(picture: str) -> None:
     files = external()
     files[picture] = files.pop("my maps/skin.png")
     data = pack_zip(files)
@@ -482,12 +482,16 @@ def test_of_a_folder_only_the_picture_changes_whatever_its_capitals(picture: str
     assert list(after) == list(files)
 
 
-def test_a_picture_that_was_no_png_becomes_one_and_is_named_so() -> None:
-    data = pack_zip(external("jpg"))
+@pytest.mark.parametrize("place", ["my maps/skin.jpg", "skin.jpg"])
+def test_a_picture_that_was_no_png_becomes_one_and_is_named_so(place: str) -> None:
+    files = external("jpg")
+    files[place] = files.pop("my maps/skin.jpg")
+    data = pack_zip(files)
     after = unpack(repaint_file(data, painted(read_object(data, name="s.zip").obj), name="s.zip").data)
-    assert json.loads(after["square.gltf"])["images"] == [{"uri": "my%20maps/skin.png"}]
-    assert after["my maps/skin.png"][:4] == b"\x89PNG"
-    assert "my maps/skin.jpg" not in after
+    renamed = place.replace("jpg", "png")
+    assert json.loads(after["square.gltf"])["images"] == [{"uri": renamed.replace(" ", "%20")}]
+    assert after[renamed][:4] == b"\x89PNG"
+    assert place not in after
 
 
 def test_a_file_with_another_use_under_another_uri_stays() -> None:
