@@ -1,18 +1,16 @@
-"""Fixtures shared by the packages: a renderer worker, a running service, and objects made from a few numbers."""
+"""Fixtures shared by the packages: a renderer worker and an object; order, threads and skips of all tests."""
 
 import os
 import re
 import signal
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Generator, Iterator
 
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
 from tests.pretend_device import register
-from tests.surfaces import Surface, object_of, quad
 from tests.worker_process import started
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.object3d import Object3D, load_object
@@ -86,23 +84,11 @@ def pytest_runtest_makereport(
     return report
 
 
-@contextmanager
-def _running_worker(*options: str) -> Iterator[tuple[str, int]]:
-    with started(*options) as worker:
-        yield worker.address
-
-
-@pytest.fixture(scope="session")
-def running_worker() -> Callable[..., AbstractContextManager[tuple[str, int]]]:
-    """Runs a renderer worker with the given options during a block, which gets its address."""
-    return _running_worker
-
-
 @pytest.fixture(scope="session")
 def worker() -> Iterator[tuple[str, int]]:
     """The address of a renderer worker shared by all tests."""
-    with _running_worker() as address:
-        yield address
+    with started() as running:
+        yield running.address
 
 
 @pytest.fixture
@@ -115,18 +101,6 @@ def target(worker: tuple[str, int]) -> Iterator[SailenvTarget]:
 @pytest.fixture(scope="session")
 def mug() -> Object3D:
     return load_object(shipped_objects()["mug"].read())
-
-
-@pytest.fixture(scope="session")
-def make_object() -> Callable[..., Object3D]:
-    """``object_of``."""
-    return object_of
-
-
-@pytest.fixture(scope="session")
-def make_quad() -> Callable[..., Surface]:
-    """``quad``."""
-    return quad
 
 
 @pytest.fixture

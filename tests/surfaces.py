@@ -42,3 +42,8 @@ def quad(
     uvs = repeat * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     rows = [0, 1, 2, 0, 2, 3]
     return square[rows].reshape(-1, 3, 3), uvs[rows].reshape(-1, 3, 2), texture
+
+
+def with_alpha(obj: Object3D, name: str, alpha: NDArray[np.uint8]) -> Object3D:
+    """``obj`` with an alpha channel (H, W), of the texture's size, in one of its albedo files."""
+    return object_from_files({**obj.files, name: encode_png(np.dstack([obj.textures[name], alpha]))})

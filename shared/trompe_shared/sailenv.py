@@ -287,14 +287,6 @@ class Command:
         return tuple(kind.take(read) for kind in self.reply)
 
 
-@dataclass(frozen=True)
-class DecodedCommand:
-    """A decoded command with its fields by name."""
-
-    command: Command
-    values: Mapping[str, Any]
-
-
 def _status(code: int, name: str, request: Mapping[str, FieldCodec], *reply: FieldCodec) -> Command:
     return Command(code, name, request, reply, status=True)
 
@@ -368,7 +360,7 @@ COMMANDS: Final[Mapping[str, Command]] = {row.name: row for row in _ROWS}
 _BY_CODE: Final = {row.code: row for row in _ROWS}
 
 
-def decode_request(read: Reader, *, is_long: Callable[[], bool]) -> DecodedCommand:
+def decode_request(read: Reader, *, is_long: Callable[[], bool]) -> tuple[Command, dict[str, Any]]:
     """Read one command of a client.
 
     ``is_long`` says whether the client speaks the longer dialect. It is called after the short form of a command with
@@ -384,7 +376,7 @@ def decode_request(read: Reader, *, is_long: Callable[[], bool]) -> DecodedComma
             values |= {name: kind.take(read) for name, kind in command.tail.items()}
     except ProtocolError as error:
         raise ProtocolError(f"{command.name}: {error}") from error
-    return DecodedCommand(command, values)
+    return command, values
 
 
 def encode_status(refusal: str | None = None) -> bytes:

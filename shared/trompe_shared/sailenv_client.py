@@ -250,6 +250,8 @@ class _Connection:
                 "that can be sent to a renderer. Use smaller textures or a simpler mesh."
             )
         (path,) = self.ask("send_obj_zip", file=(f"{obj.name}.zip", archive))
+        if not path:
+            raise RendererError(f"it refused the file of {obj.name!r}. {self._reason()}")
         (instance,) = self.ask(
             "spawn_object",
             name=f"file:{path}",

@@ -1,7 +1,6 @@
 """Worker processes of several kinds, and bare clients that are closed after each test."""
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ from tests.wire import Wire
 from tests.worker_process import Worker, started
 
 Address = tuple[str, int]
-Running = Callable[..., AbstractContextManager[Address]]
 
 
 @pytest.fixture
@@ -34,22 +32,22 @@ def agent(wire: Callable[..., Wire]) -> Wire:
 
 
 @pytest.fixture(scope="session")
-def shadowless_worker(running_worker: Running) -> Iterator[Address]:
-    with running_worker("--set", "shadows=no") as address:
-        yield address
+def shadowless_worker() -> Iterator[Address]:
+    with started("--set", "shadows=no") as running:
+        yield running.address
 
 
 @pytest.fixture(scope="session")
-def ticking_worker(running_worker: Running) -> Iterator[Address]:
+def ticking_worker() -> Iterator[Address]:
     """Half a second passes in its world from frame to frame."""
-    with running_worker("--time-step", "0.5", "--depth-range", "0.8") as address:
-        yield address
+    with started("--time-step", "0.5", "--depth-range", "0.8") as running:
+        yield running.address
 
 
 @pytest.fixture(scope="session")
-def second_worker(running_worker: Running) -> Iterator[Address]:
-    with running_worker() as address:
-        yield address
+def second_worker() -> Iterator[Address]:
+    with started() as running:
+        yield running.address
 
 
 @pytest.fixture

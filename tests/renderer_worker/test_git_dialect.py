@@ -1,5 +1,6 @@
 """SAILenv's client from its git repository: a recorded session in bytes, and the detection of its dialect."""
 
+import re
 import socket
 import struct
 import time
@@ -18,14 +19,14 @@ LONG = SHORT | {"frustum_limited": True, "dynamic": None}
 
 
 def exchanges() -> Iterator[tuple[int, str, list[str]]]:
-    """Line number, ``>`` or ``<``, and tokens of each line of the transcript, without comments."""
+    """Line number, ``>`` or ``<``, and tokens of each message of the transcript, without comments."""
     for number, line in enumerate(TRANSCRIPT.read_text().splitlines(), start=1):
-        if not line.startswith("#"):
-            yield number, line[0], line[1:].split()
+        for direction, words in re.findall("([<>])([^<>]*)", line.partition("#")[0]):
+            yield number, direction, words.split()
 
 
 class Replay:
-    """Sends a client's lines and compares the answers."""
+    """Sends a client's messages and compares the answers."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         self.socket = socket.create_connection(address, timeout=240)

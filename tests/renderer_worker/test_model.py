@@ -3,6 +3,7 @@
 import gc
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +20,8 @@ from trompe_renderer.protocol.upload import ModelCache
 from trompe_renderer.world.model import HashedModel, content_key, model_of, repainted
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import ObjectError, RendererError
-from trompe_shared.object3d import Object3D, load_object, object_from_files, pack_zip
+from trompe_shared.local_files import pack_zip
+from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files
 
 ENGINE = EngineInfo("test", "1")
 
@@ -78,6 +80,16 @@ def test_any_other_difference_makes_another_shape() -> None:
     half = ((0.0, 0.0, 0.0), (0.1, 0.06, 0.05))
     objects = [boxes(maps=maps), boxes(half, maps=maps), boxes(maps={"normal": noise(2, 4, 4)}), boxes()]
     assert len({read(models, each.to_zip()).shape for each in objects}) == 4
+
+
+def test_models_that_differ_in_their_alpha_alone_have_different_keys() -> None:
+    box, cut = boxes(), np.full((8, 8, 4), 255, np.uint8)
+    cut[:, :4, 3] = 0
+    keys = {
+        model_of(replace(box, files=dict(box.files) | {"front_albedo.png": encode_png(each)})).key
+        for each in (cut, cut[:, ::-1], cut[..., :3])
+    }
+    assert len(keys) == 3
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The content of the worker's pictures: geometry, colours, light, shadows."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -201,6 +202,19 @@ def test_a_shadow_lies_where_the_light_throws_it(target: SailenvTarget, azimuth:
     covered = np.abs(on_screen(camera, shift + 0.6 * offsets * half) - on_screen(camera, np.array([[0, height, 0]])))
     assert shaded[(covered > 12).any(axis=1)].all()  # the plate hides nearer spots
     assert (np.array(outside)[[0, 2, 6, 8]] > 0.9 * lit).sum() >= 3
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e2, 1e4, 1e6])
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_plate_close_behind_another_is_hidden_at_any_size(target: SailenvTarget, scale: float, order: int) -> None:
+    def picture(size: float) -> Picture:
+        plates = [((0.0, 0.0, 0.0), (0.1, 0.1, 1e-4)), ((-0.05, 0.0, 1e-3), (0.05, 0.1, 1e-4))]
+        scaled: Any = [np.multiply(plate, size) for plate in plates[::order]]
+        halves = np.repeat(np.array([[[255, 0, 0], [0, 0, 255]]], np.uint8), 2, axis=0)
+        return show(target, boxes(*scaled, textures={"front": halves}), Camera(0.4 * size, 20, 15))
+
+    different = np.abs(picture(scale).astype(int) - picture(1.0)).max(axis=-1) > 40
+    assert different.mean() < 0.02
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 20.0])

@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from functools import partial
 from importlib.metadata import version
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ import pytest
 from tests.served import reserved_port
 from tests.wire import boxes
 from tests.worker_process import SHARP, SHARP_SETTINGS, Worker, started
-from trompe_server.renderers import RendererPool, SailenvTarget
+from trompe_server.renderers import RendererPool, SailenvTarget, TargetRenderer
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, RendererLostError
 from trompe_shared.geometry import Camera, Light, View
@@ -148,13 +147,10 @@ def test_an_interrupted_request_ends_at_once_and_the_pool_goes_on(
 
 
 def test_a_worker_with_another_engine_is_left_out(
-    worker: Address,
-    running_worker: Callable[..., Any],
-    expected: Expected,
-    nobody: Nobody,
-    caplog: pytest.LogCaptureFixture,
+    worker: Address, expected: Expected, nobody: Nobody, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with running_worker(*SHARP) as other:
+    with started(*SHARP) as running:
+        other = running.address
         for addresses in ([worker, other], [other, worker]):
             with closing(Pool(addresses, engine=OURS)) as pool:
                 assert (pool.render(painted(1), VIEWS, size=SIZE) == expected(1)).all()
@@ -170,21 +166,25 @@ def test_a_worker_with_another_engine_is_left_out(
             pool.render(painted(1), VIEWS, size=SIZE)
 
 
-@pytest.mark.parametrize("pooled", [True, False])
-def test_a_worker_with_another_engine_after_its_restart_is_left_out(
-    worker: Address, expected: Expected, pooled: bool
-) -> None:
+def test_a_worker_with_another_engine_after_its_restart_is_left_out(worker: Address, expected: Expected) -> None:
     """Its first pictures are right; the restarted one would give others."""
-    with reserved_port() as port:
+
+    def shown(target: TargetRenderer) -> np.ndarray:
+        return target.render(painted(1), VIEWS[:4], size=SIZE)
+
+    with reserved_port() as port, ExitStack() as stack:
         with started("--port", str(port)) as mine:
-            target = Pool([mine.address], rest=0.1) if pooled else SailenvTarget(*mine.address)
-            assert (target.render(painted(1), VIEWS[:4], size=SIZE) == expected(1)[:4]).all()
-        with started("--port", str(port), *SHARP), closing(target):
-            for _ in range(2):
+            targets: list[TargetRenderer] = [Pool([mine.address], rest=0.1), SailenvTarget(*mine.address)]
+            for target in targets:
+                stack.enter_context(closing(target))
+                assert (shown(target) == expected(1)[:4]).all()
+        with started("--port", str(port), *SHARP):
+            for target in 2 * targets:
                 with pytest.raises(RendererLostError, match=rf"{SHARP_SETTINGS}\), but pyrender \S+ was asked for"):
-                    target.render(painted(1), VIEWS[:4], size=SIZE)
-        with started("--port", str(port)), closing(target):
-            assert (target.render(painted(1), VIEWS[:4], size=SIZE) == expected(1)[:4]).all()
+                    shown(target)
+        with started("--port", str(port)):
+            for target in targets:
+                assert (shown(target) == expected(1)[:4]).all()
 
 
 def test_the_least_busy_worker_is_asked_first() -> None:

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.surfaces import object_of, quad
 from tests.wire import WHITE, boxes
+from tests.worker_process import started
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D, load_object
 
-Make = Callable[..., Any]
 Show = Callable[..., NDArray[np.int64]]
 
 SIZE = (60, 80)
@@ -30,14 +31,14 @@ PIXEL = 2 * 0.5 * np.tan(np.radians(30)) / SIZE[0]
 
 
 @pytest.fixture(scope="module")
-def show(running_worker: Callable[..., Any], worker: tuple[str, int]) -> Iterator[Show]:
+def show(worker: tuple[str, int]) -> Iterator[Show]:
     """An image (H, W, 3) in front of black by a worker with options; tests share the workers."""
     with ExitStack() as running:
         addresses: dict[tuple[str, ...], Any] = {(): worker}
 
         def image(options: tuple[str, ...], obj: Object3D, camera: Camera, light: Light = AMBIENT) -> Any:
             if options not in addresses:
-                addresses[options] = running.enter_context(running_worker(*options))
+                addresses[options] = running.enter_context(started(*options)).address
             with closing(SailenvTarget(*addresses[options])) as target:
                 return target.render(obj, [View(camera, light, (0, 0, 0))], size=SIZE)[0].astype(int)
 
@@ -79,9 +80,9 @@ def test_the_larger_a_shadow_map_is_the_truer_are_the_edges_of_shadows(show: Sho
     assert off[0] > 1.5 * off[1] > 3 * off[2] > 0
 
 
-def test_an_anisotropic_filter_keeps_stripes_on_a_slanted_floor(show: Show, make_object: Make, make_quad: Make) -> None:
+def test_an_anisotropic_filter_keeps_stripes_on_a_slanted_floor(show: Show) -> None:
     stripes = np.broadcast_to(np.array([0, 0, 255, 255], np.uint8)[:, None, None].repeat(3, 2), (4, 1, 3))
-    floor = make_object(make_quad(np.tile(stripes, (32, 128, 1)), half=0.2))
+    floor = object_of(quad(np.tile(stripes, (32, 128, 1)), half=0.2))
     images = [show(options, floor, Camera(0.5, 78, 0)) for options in ((), ("--set", "anisotropy=16"))]
     contrast = [image[20:40, 38:42, 0].std(axis=0).mean() for image in images]
     assert contrast[1] > 1.5 * contrast[0]

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from tests.fakes import FakeTarget
+from tests.surfaces import with_alpha
 from tests.wire import boxes, plain
 from trompe_server.renderers import RendererPool, SailenvTarget, TargetRenderer
 from trompe_shared.errors import ObjectError, RendererError
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import Object3D, encode_png, object_from_files
+from trompe_shared.object3d import Object3D, object_from_files
 
 SIZE = (40, 56)
 VIEWS = [View(Camera(0.3, azimuth, elevation)) for azimuth, elevation in ((0, 0), (60, 30), (0, 90), (10, -90))]
@@ -94,8 +95,7 @@ def test_every_way_to_a_worker_shows_exactly_the_same_bytes(
     def cut(columns: int) -> Object3D:
         """The box without the first columns of its front's texture."""
         opaque = np.arange(53) >= columns
-        cut_out = np.dstack([box.textures["front_albedo.png"], np.full((37, 53), 255 * opaque, np.uint8)])
-        return object_from_files({**box.files, "front_albedo.png": encode_png(cut_out)})
+        return with_alpha(box, "front_albedo.png", np.full((37, 53), 255 * opaque, np.uint8))
 
     lit = boxes(maps={"normal": plain(128, 128, 255)})
     table = lit.files["box_mat_def.json"].replace(b"front_albedo.png", b"normal.png")

@@ -7,11 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.made_objects import CANDLE, FLAG, GLASS, LATTICE, lantern
+from tests.surfaces import with_alpha
 from tests.wire import Wire, on_screen
 from trompe_server.formats import read_object
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import Object3D, encode_png, object_from_files
+from trompe_shared.object3d import Object3D
 
 SIZE = (160, 160)
 GREY = (90, 90, 90)
@@ -79,8 +80,7 @@ def test_a_repaint_of_glass_shows_through_it(made: Object3D, target: SailenvTarg
 def test_the_same_paint_with_another_alpha_is_another_object(target: SailenvTarget) -> None:
     solid = read_object(lantern(opacity=1.0), name="lantern.glb").obj
     name = solid.materials["glass"].albedo
-    picture = np.dstack([solid.textures[name], np.full((64, 64), 200, np.uint8)])
-    clear = object_from_files({**solid.files, name: encode_png(picture)})
+    clear = with_alpha(solid, name, np.full((64, 64), 200, np.uint8))
     seen = [colour_at(target, obj, FRONT, (0, 0, 0)) for obj in (solid, clear, solid)]
     assert np.abs(seen[0] - GLASS).max() < 6
     assert np.abs(seen[1] - (200 * np.array(GLASS) + 55 * np.array(CANDLE)) / 255).max() < 6

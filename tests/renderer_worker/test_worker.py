@@ -23,7 +23,7 @@ from trompe_renderer.protocol.session import Session
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError
 from trompe_shared.geometry import Camera
-from trompe_shared.object3d import pack_zip
+from trompe_shared.local_files import pack_zip
 from trompe_shared.sailenv import COMMANDS, MAX_TEXT, VIEW_FLAGS, decode_frame
 
 Connect = Callable[..., Wire]

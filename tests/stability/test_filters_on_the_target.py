@@ -4,13 +4,14 @@ The default sampling model mispredicts them; calibration finds a better one from
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import closing
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from tests.surfaces import object_of, quad
+from tests.worker_process import started
 from trompe_server.renderers import SailenvTarget
 from trompe_server.surrogate import SamplingModel, curve_surrogate, prepare_geometry
 from trompe_server.surrogate.calibration import CURVE_GREYS, calibrate, painted_grey, painted_noise
@@ -20,7 +21,6 @@ from trompe_shared.object3d import Object3D
 from trompe_shared.shipped import shipped_objects
 
 Image8 = NDArray[np.uint8]
-Running = Callable[..., AbstractContextManager[tuple[str, int]]]
 Ask = Callable[[Object3D, Sequence[View]], Image8]
 SIZE = (96, 96)
 MUG = shipped_objects()["mug"]
@@ -45,11 +45,12 @@ def found(obj: Object3D, views: Sequence[View], ask: Ask) -> tuple[SamplingModel
 
 
 @pytest.fixture(scope="module")
-def anisotropic(running_worker: Running) -> Iterator[Ask]:
-    with running_worker("--set", "anisotropy=16") as address:
-        target = SailenvTarget(*address, timeout=240)
+def anisotropic() -> Iterator[Ask]:
+    with (
+        started("--set", "anisotropy=16") as running,
+        closing(SailenvTarget(*running.address, timeout=240)) as target,
+    ):
         yield lambda obj, views: target.render(obj, views, size=SIZE)
-        target.close()
 
 
 @pytest.mark.parametrize("shown", ["plane", pytest.param("mug", marks=pytest.mark.thorough)])

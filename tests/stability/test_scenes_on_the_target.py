@@ -1,19 +1,18 @@
 """Scenes that are hard to rasterise: the surrogate sees the renderer's surfaces and predicts repaints."""
 
-import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
-from PIL import Image
 
-from tests.surfaces import Surface, object_of, quad
+from tests.surfaces import Surface, object_of, quad, with_alpha
 from trompe_server.job.report.warnings import POOR_VIEW
 from trompe_server.renderers import SailenvTarget
-from trompe_server.surrogate import SamplingModel, Surrogate, curve_surrogate, prepare_geometry
+from trompe_server.surrogate import SamplingModel, Surrogate, curve_surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate.calibration import CURVE_GREYS, build_surrogate, calibrate, painted_grey, painted_noise
 from trompe_server.surrogate.fidelity import Fidelity, measure_fidelity
 from trompe_server.surrogate.sampling import Gather
@@ -32,13 +31,6 @@ AROUND = [
 
 def noise(height: int, width: int, seed: int = 0) -> Image8:
     return np.random.default_rng(seed).integers(40, 216, (height, width, 3), dtype=np.uint8)
-
-
-def with_opacity(obj: Object3D, name: str, opacity: Image8) -> Object3D:
-    """``obj`` with an alpha channel (H, W), of the texture's size, in one of its albedo files."""
-    buffer = io.BytesIO()
-    Image.fromarray(np.dstack([obj.textures[name], opacity])).save(buffer, "PNG")
-    return object_from_files({**obj.files, name: buffer.getvalue()})
 
 
 def holes(side: int) -> Image8:
@@ -162,7 +154,7 @@ def awkward() -> Object3D:
 
 def cut_out() -> Object3D:
     front, back = quads((0.1, 0.04, 128), (0.12, -0.02, 64))
-    return with_opacity(object_of(front, back, reverse(back, noise(16, 16))), "m0.png", holes(128))
+    return with_alpha(object_of(front, back, reverse(back, noise(16, 16))), "m0.png", holes(128))
 
 
 def blended(obj: Object3D, **opacity: float) -> Object3D:
@@ -176,7 +168,7 @@ def blended(obj: Object3D, **opacity: float) -> Object3D:
 def glazed() -> Object3D:
     front, back = quads((0.1, 0.04, 128), (0.12, -0.02, 64))
     obj = object_of(front, back, reverse(back, noise(16, 16)))
-    return blended(with_opacity(obj, "m0.png", holes(128)), m0=0.8)
+    return blended(with_alpha(obj, "m0.png", holes(128)), m0=0.8)
 
 
 def vase() -> Object3D:
@@ -266,7 +258,7 @@ def test_a_sheet_shows_the_scene_behind_its_holes_and_a_repaint_keeps_them(targe
 
 def test_an_alpha_channel_that_cuts_nothing_out_changes_no_image_and_no_operator(worker: tuple[str, int]) -> None:
     plain = overlapping()
-    faint = with_opacity(plain, "m0.png", np.full((64, 64), 128, np.uint8))
+    faint = with_alpha(plain, "m0.png", np.full((64, 64), 128, np.uint8))
     images = []
     for obj in (plain, faint):
         target = SailenvTarget(*worker)
@@ -284,6 +276,8 @@ def test_hidden_parts_and_empty_views_change_nothing(target: SailenvTarget) -> N
     (batch,) = shown.surrogate.geometry.batches
     assert batch.counts[1] == 0
     assert (shown.clean[1] == MAGENTA).all()
-    hidden = obj.with_textures({"m1.png": 255 - obj.textures["m1.png"]})
+    hidden, seen = (obj.with_textures({name: 255 - obj.textures[name]}) for name in ("m1.png", "m0.png"))
     assert (target.render(hidden, AROUND[:1], size=SIZE)[0] == shown.clean[0]).all()
     assert (shown.surrogate.influence()["m1.png"] == 0).all()
+    before, *after = (shown.surrogate.render_all(shown.surrogate.texels(textures_of(o))) for o in (obj, hidden, seen))
+    assert [torch.equal(before, images) for images in after] == [True, False]

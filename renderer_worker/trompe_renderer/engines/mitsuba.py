@@ -1,5 +1,6 @@
 """The Mitsuba 3 engine: a path tracer. Pictures are random, by the noise number of the snapshot."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Annotated, Any, Final, Literal
@@ -15,6 +16,7 @@ from trompe_renderer.engines.surfaces import (
     ContentCache,
     Surface,
     TextureImage,
+    clipping_planes,
     composited,
     encoded_light,
     surfaces_of,
@@ -28,6 +30,7 @@ from trompe_shared.opacity import CUTOFF
 
 NEAR: Final = 1e-3
 FAR: Final = 1e5
+"""Clipping planes, metres: a ray needs no depth buffer."""
 MAX_RAYS: Final = 2**23
 """Rays of one pass: bounds the memory."""
 
@@ -53,14 +56,15 @@ class MitsubaEngine:
         self._textures: ContentCache[Any] = ContentCache()
 
     def render(self, world: Snapshot, *, width: int, height: int) -> NDArray[np.uint8]:
+        surfaces = list(surfaces_of(world))
         scene = mitsuba.load_dict(
             {
                 "type": "scene",
                 "integrator": self._integrator(width * height),
-                "sensor": _sensor(world, self._options.filter, width, height),
+                "sensor": _sensor(world, surfaces, self._options.filter, width, height),
                 **{f"light{number}": _light(light) for number, light in enumerate(world.lights)},
                 **({"ambient": {"type": "constant", "radiance": _rgb(world.ambient)}} if any(world.ambient) else {}),
-                **{f"mesh{number}": self._mesh(number, each) for number, each in enumerate(surfaces_of(world))},
+                **{f"mesh{number}": self._mesh(number, each) for number, each in enumerate(surfaces)},
             }
         )
         rgba = np.array(mitsuba.render(scene, spp=self._options.samples, seed=noise_seed(world)))
@@ -135,14 +139,15 @@ def _mesh(name: str, surface: Surface) -> Any:
     return mesh
 
 
-def _sensor(world: Snapshot, rfilter: str, width: int, height: int) -> dict[str, Any]:
+def _sensor(world: Snapshot, surfaces: Sequence[Surface], rfilter: str, width: int, height: int) -> dict[str, Any]:
     """Mitsuba's camera looks along z, with x to the left."""
+    near, far = clipping_planes(world.camera, [surface.ball for surface in surfaces])
     return {
         "type": "perspective",
         "fov": FIELD_OF_VIEW,
         "fov_axis": "y",
-        "near_clip": NEAR,
-        "far_clip": FAR,
+        "near_clip": min(NEAR, near),
+        "far_clip": max(FAR, far),
         "to_world": mitsuba.ScalarTransform4f((world.camera @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist()),
         "sampler": {"type": "independent"},
         "film": {

@@ -3,17 +3,16 @@
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, Final, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_renderer.world.model import HashedModel, content_key
-from trompe_renderer.world.snapshot import Matrix, Sky, Snapshot, WorldLight
+from trompe_renderer.world.model import HashedModel
+from trompe_renderer.world.snapshot import Matrix, Sky, Snapshot
 from trompe_shared.geometry import FIELD_OF_VIEW
-from trompe_shared.object3d import Material, Part, decode_rgb, open_image
-from trompe_shared.opacity import opacity_of
+from trompe_shared.object3d import Material, decode_rgb, open_image
+from trompe_shared.wavefront import Part
 
 NEAR: Final = 0.005
 FAR: Final = 1000.0
@@ -43,12 +42,12 @@ class TextureImage:
         """Equal for equal pixels."""
         name, model = self.name, self.model
         key = model.albedos.get(name) or f"{model.shape} {self.use} {name}"
-        return key + (_opacity(model.obj.files[name], name in model.obj.blended)[0] if self.use == "albedo" else "")
+        return key + (model.opacity(name)[0] if self.use == "albedo" else "")
 
     @property
     def transparent(self) -> bool:
         """Whether the pixels of an albedo have alpha."""
-        return _opacity(self.model.obj.files[self.name], self.name in self.model.obj.blended)[1] is not None
+        return self.model.opacity(self.name)[1] is not None
 
     def pixels(self) -> Pixels:
         """(H, W, channels) uint8, row 0 on top: sRGB, with alpha if transparent; a normal map; (roughness, metallic).
@@ -57,7 +56,7 @@ class TextureImage:
         """
         name, obj = self.name, self.model.obj
         if self.use == "albedo":
-            texture, opacity = obj.textures[name], _opacity(obj.files[name], name in obj.blended)[1]
+            texture, opacity = obj.textures[name], self.model.opacity(name)[1]
             alike = opacity is not None and opacity.shape == texture.shape[:2]
             return np.dstack([texture, opacity]) if alike else texture  # type: ignore[list-item]
         data = obj.files[name]
@@ -139,15 +138,17 @@ class ContentCache(Generic[T]):
 
 
 def clipping_planes(camera: Matrix, balls: Iterable[Ball]) -> tuple[float, float]:
-    """Distances (near, far), metres: nearer for a tiny object close to the camera, farther for a distant one."""
-    near, far = NEAR, FAR
+    """Distances (near, far), metres: nearer for a tiny object close to the camera, farther for a distant or huge one,
+    for which the near plane moves away too, as depth has a fixed number of bits."""
+    near, far, free = NEAR, FAR, np.inf
     for pose, centroid, scale in balls:
         centre = pose[:3, :3] @ centroid + pose[:3, 3]
         away = float(np.linalg.norm(centre - camera[:3, 3]))
-        size = float(np.linalg.norm(pose[:3, 0])) * scale
+        size = float(np.linalg.norm(pose[:3, :3], 2)) * scale
         near = min(near, 0.1 * max(size, away - size)) or near
         far = max(far, away + size)
-    return near, far
+        free = min(free, away - size / 2)
+    return (max(near, 1e-3 * free) if np.isfinite(free) else near), far
 
 
 def sphere_around(surfaces: Iterable[Surface]) -> tuple[NDArray[np.float64], float]:
@@ -159,13 +160,6 @@ def sphere_around(surfaces: Iterable[Surface]) -> tuple[NDArray[np.float64], flo
     radii = np.array([np.linalg.norm(pose[:3, :3], 2) * size / 2 for pose, _, size in balls])[:, None]
     centre = ((centres - radii).min(0) + (centres + radii).max(0)) / 2
     return centre, float((np.linalg.norm(centres - centre, axis=1) + radii[:, 0]).max())
-
-
-def towards(light: WorldLight) -> list[float]:
-    """Unit vector (3,) to where a directional light comes from."""
-    direction = np.asarray(light.direction, dtype=np.float64)
-    found: list[float] = (-direction / np.linalg.norm(direction)).tolist()
-    return found
 
 
 def background_pixels(world: Snapshot, *, width: int, height: int) -> Pixels:
@@ -216,13 +210,6 @@ def encoded_light(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     """Linear light to sRGB, clipped to [0, 1]."""
     clipped = np.clip(linear, 0, 1)
     return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
-
-
-@lru_cache(maxsize=32)
-def _opacity(data: bytes, blended: bool) -> tuple[str, Pixels | None]:
-    """A cache key of an albedo file's alpha, and the alpha (H, W); "" and ``None`` if all of it is opaque."""
-    opacity = opacity_of(data, blended=blended)
-    return ("", None) if opacity is None else (f" opacity {content_key(opacity)}", opacity)
 
 
 def _roughness_metallic(data: bytes, name: str) -> Pixels:

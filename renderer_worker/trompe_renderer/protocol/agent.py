@@ -28,7 +28,7 @@ from trompe_shared.sailenv import (
     COMMANDS,
     MAX_SIDE,
     REGISTER,
-    DecodedCommand,
+    Command,
     decode_request,
     encode_frame,
     encode_status,
@@ -83,12 +83,12 @@ class Agent:
         self._register()
         while True:
             self.doing = _NAMES.get(code := self._link.wait(), f"{code:#04x}")
-            request = decode_request(self._link.read, is_long=self._is_long)
-            if request.command.name == "delete":
+            command, values = decode_request(self._link.read, is_long=self._is_long)
+            if command.name == "delete":
                 return
-            if request.command.name in LONG_ONLY:
+            if command.name in LONG_ONLY:
                 self._long = True
-            self._answer(request)
+            self._answer(command, values)
 
     def _register(self) -> None:
         fields = REGISTER.decode_fields(self._link.read)
@@ -103,21 +103,20 @@ class Agent:
             self._long = self._link.says_more(DIALECT_WAIT)
         return self._long
 
-    def _answer(self, request: DecodedCommand) -> None:
-        command = request.command
+    def _answer(self, command: Command, values: Mapping[str, Any]) -> None:
         if command.name == "frame":
-            self._send_frame(request.values["flags"])
+            self._send_frame(values["flags"])
         elif command.name == "render_views":
-            self._send_pictures(request.values["views"])
+            self._send_pictures(values["views"])
         else:
             try:
-                values = getattr(self._session, command.name)(**request.values) or ()
+                answer = getattr(self._session, command.name)(**values) or ()
             except Exception as error:  # the client waits for a whole reply in any case
-                self._link.send(_refusal(request, self._note(command.name, self._reason(error))))
+                self._link.send(_refusal(command, values, self._note(command.name, self._reason(error))))
             else:
                 for reason in self._session.take_refusals():
                     self._note(command.name, reason)
-                self._link.send(command.encode_reply(*values))
+                self._link.send(command.encode_reply(*answer))
 
     def _reason(self, error: Exception) -> str:
         """The reason of a refusal. Internal errors are logged with their traceback."""
@@ -222,9 +221,8 @@ def _labels(engine: Engine, world: Snapshot, before: Snapshot, *, width: int, he
     return engine.gbuffer(world, before, width=width, height=height)
 
 
-def _refusal(request: DecodedCommand, reason: str) -> bytes:
+def _refusal(command: Command, values: Mapping[str, Any], reason: str) -> bytes:
     """The whole reply that refuses a request: for a scenario an empty id for each of its objects."""
-    command = request.command
     if command.repeated:
-        return command.encode_reply(*[""] * len(request.values["scenario"]["objects"]))
+        return command.encode_reply(*[""] * len(values["scenario"]["objects"]))
     return command.encode_refusal(reason)

@@ -85,7 +85,7 @@ class Server:
         with self._left:
             if len(self._agents) < self._limits.agents:
                 return True
-            idle = [(link.idle_since, link) for link, _ in self._agents.values() if link.idle_since is not None]
+            idle = [(since, link) for link, _ in self._agents.values() if (since := link.idle_since) is not None]
             since, link = min(idle, key=lambda item: item[0], default=(math.inf, None))
             if link is None or time.monotonic() - since < self._limits.idle_timeout:
                 return False

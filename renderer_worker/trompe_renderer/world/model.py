@@ -3,13 +3,14 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D
+from trompe_shared.opacity import opacity_of
 
 Texture = NDArray[np.uint8]
 
@@ -29,7 +30,12 @@ class HashedModel:
     @cached_property
     def key(self) -> str:
         """Equal for equal content."""
-        return content_key(repr((self.shape, sorted(self.albedos.items()))).encode())
+        opacities = [self.opacity(name)[0] for name in sorted(self.albedos)]
+        return content_key(repr((self.shape, sorted(self.albedos.items()), opacities)).encode())
+
+    def opacity(self, name: str) -> tuple[str, Texture | None]:
+        """A cache key of an albedo's alpha, and the alpha (H, W); "" and ``None`` if all of it is opaque."""
+        return _opacity(self.obj.files[name], name in self.obj.blended)
 
     @property
     def nbytes(self) -> int:
@@ -69,6 +75,12 @@ def repainted(model: HashedModel, textures: Mapping[str, Texture]) -> HashedMode
         raise ObjectError("A texture must have at least one texel.")
     obj = replace(model.obj, textures={**model.obj.textures, **textures})
     return HashedModel(model.shape, {**model.albedos, **{name: _texture_key(t) for name, t in textures.items()}}, obj)
+
+
+@lru_cache(maxsize=32)
+def _opacity(data: bytes, blended: bool) -> tuple[str, Texture | None]:
+    opacity = opacity_of(data, blended=blended)
+    return ("", None) if opacity is None else (f" opacity {content_key(opacity)}", opacity)
 
 
 def _texture_key(texture: Texture) -> str:

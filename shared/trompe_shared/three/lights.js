@@ -12,10 +12,10 @@ export function setLight(light, { color, intensity }) {
   light.intensity = Math.PI * intensity;
 }
 
-// Aim a directional light from the direction `towards` (unit vector) at a sphere, whose shadows it casts on itself.
+// Aim a directional light from the direction `towards` at a sphere, whose shadows it casts on itself.
 export function aimSun(sun, towards, { center, radius }) {
   sun.target.position.copy(center);
-  sun.position.fromArray(towards).multiplyScalar(2 * radius).add(center);
+  sun.position.fromArray(towards).setLength(2 * radius).add(center);
   const box = sun.shadow.camera;
   [box.left, box.bottom, box.right, box.top] = [-1, -1, 1, 1].map((side) => 1.01 * side * radius);
   [box.near, box.far] = [0.9 * radius, 3.1 * radius];

@@ -35,7 +35,7 @@ def render(address: tuple[str, int], *, timeout: float = 240.0) -> str:
     return str(raised.value)
 
 
-def pretend(frame: list[bytes], *, instance: str = "1") -> Callable[[socket.socket], None]:
+def pretend(frame: list[bytes], *, path: str = "path", instance: str = "1") -> Callable[[socket.socket], None]:
     """A renderer that agrees to everything and answers each FRAME with ``frame``, until the client hangs up."""
 
     def answer(connection: socket.socket) -> None:
@@ -51,8 +51,8 @@ def pretend(frame: list[bytes], *, instance: str = "1") -> Callable[[socket.sock
             REGISTER.decode_fields(read)
             connection.sendall(REGISTER.encode_reply(0, []))
             while True:
-                name = decode_request(read, is_long=lambda: True).command.name
-                values = {"send_obj_zip": ("path",), "spawn_object": (instance,), "last_error": ("lamp is broken",)}
+                name = decode_request(read, is_long=lambda: True)[0].name
+                values = {"send_obj_zip": (path,), "spawn_object": (instance,), "last_error": ("lamp is broken",)}
                 values["get_light_type"] = ("light_not_found",)
                 reply = b"".join(frame) if name == "frame" else COMMANDS[name].encode_reply(*values.get(name, ()))
                 connection.sendall(reply)
@@ -113,6 +113,7 @@ OTHER = "not a SAILenv renderer"
         pytest.param(pretend(frame(b"no picture")), OTHER, id="not an image"),
         pytest.param(pretend(frame(BLACK, delta_time=float("nan"))), "lamp is broken", id="a frame marked as failed"),
         pytest.param(pretend([], instance=""), "lamp is broken", id="an object that is not spawned"),
+        pytest.param(pretend([], path=""), "refused the file of", id="an object that is not stored"),
     ],
 )
 def test_a_renderer_that_fails_is_an_error_with_the_reason(answer: Callable[[socket.socket], None], words: str) -> None:
@@ -128,6 +129,14 @@ def test_a_local_renderer_renders_and_ends_with_its_block() -> None:
         assert (target.render(triangle(), [VIEW], size=(8, 8)) < 255).any()
         address = target.address
     assert engine_at(*address, timeout=5) is None
+
+
+def test_a_local_renderer_may_say_other_things_before_its_address() -> None:
+    with answering_once(pretend(frame(BLACK))) as (host, port):
+        says = f"print('an engine that says hello'); print('listening on {host}:{port}', flush=True); input()"
+        with local_renderer([sys.executable, "-c", says]) as target:
+            assert target.address == (host, port)
+            assert (target.render(triangle(), [VIEW], size=(8, 8)) == 0).all()
 
 
 def test_a_local_renderer_ends_when_its_parent_is_killed() -> None:

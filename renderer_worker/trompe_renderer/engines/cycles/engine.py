@@ -20,6 +20,7 @@ from trompe_renderer.engines.surfaces import (
     ContentCache,
     Surface,
     TextureImage,
+    clipping_planes,
     composited,
     rgba_of,
     surfaces_of,
@@ -63,14 +64,16 @@ class CyclesEngine:
         self._kept: ContentCache[str] = ContentCache(self._drop)
 
     def render(self, world: Snapshot, *, width: int, height: int) -> NDArray[np.uint8]:
+        surfaces = list(surfaces_of(world))
         values = {
             "fov": FIELD_OF_VIEW,
+            "clip": clipping_planes(world.camera, [surface.ball for surface in surfaces]),
             "size": [width, height],
             "seed": noise_seed(world),
             "camera": world.camera.tolist(),
             "ambient": world.ambient,
             "lights": [_light(light) for light in world.lights],
-            "items": [self._item(surface) for surface in surfaces_of(world)],
+            "items": [self._item(surface) for surface in surfaces],
         }
         data = self._call("draw", {"world": values})
         self._kept.trim()

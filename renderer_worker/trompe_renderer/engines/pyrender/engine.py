@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_renderer.engines.engine import GBuffer
-from trompe_renderer.engines.pyrender.gbuffer import DrawCall, GBufferPass
+from trompe_renderer.engines.pyrender.gbuffer import GBufferPass
 from trompe_renderer.engines.pyrender.gpu_cache import GpuCache
 from trompe_renderer.engines.pyrender.passes import ObjectRenderer, PyrenderOptions
-from trompe_renderer.engines.pyrender.platform import create_context, pyrender
+from trompe_renderer.engines.pyrender.platform import GL, create_context, pyrender
 from trompe_renderer.engines.surfaces import clipping_planes
 from trompe_renderer.world.snapshot import Matrix, Snapshot, WorldLight
 from trompe_renderer.world.validation import unit_color
@@ -19,14 +19,17 @@ from trompe_shared.geometry import FIELD_OF_VIEW
 
 MAX_LIGHTS: Final = 2
 """Lights of each kind."""
+SOFTWARE: Final = "llvmpipe"
+"""Mesa's renderer on processors; a card's pictures differ from its by a few levels."""
 
 
 class PyrenderEngine:
     """A ``LabellingEngine``. Its OpenGL context lives until the process ends."""
 
     def __init__(self, options: PyrenderOptions) -> None:
-        self.info = EngineInfo("pyrender", version("pyrender"))
         self._context = create_context()
+        driver = GL.glGetString(GL.GL_RENDERER).decode()
+        self.info = EngineInfo("pyrender", version("pyrender"), "" if SOFTWARE in driver else driver)
         self._renderer = ObjectRenderer(options)
         self._gbuffers = GBufferPass()
         self._cache = GpuCache(anisotropy=options.anisotropy)
@@ -48,7 +51,7 @@ class PyrenderEngine:
         poses = {instance.number: instance.pose for instance in before.instances}
         try:
             calls = [
-                DrawCall(self._cache.mesh(i.model), i.number, now @ i.pose, earlier @ poses.get(i.number, i.pose))
+                (self._cache.mesh(i.model), i.number, now @ i.pose, earlier @ poses.get(i.number, i.pose))
                 for i in world.instances
             ]
             return self._gbuffers.draw(calls, width=width, height=height)

@@ -4,7 +4,6 @@ It draws the same geometry at pixel centres without blending, so labels are exac
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -48,14 +47,8 @@ void main() {
 """
 
 
-@dataclass(frozen=True)
-class DrawCall:
-    """A pyrender mesh with its instance's number; ``now`` and ``earlier`` (4, 4) transform object to clip space."""
-
-    mesh: Any
-    number: int
-    now: Matrix
-    earlier: Matrix
+DrawCall = tuple[Any, int, Matrix, Matrix]
+"""A pyrender mesh, its instance's number, and the transforms from object to clip space, now and earlier."""
 
 
 class GBufferPass:
@@ -69,9 +62,9 @@ class GBufferPass:
     def draw(self, calls: Iterable[DrawCall], *, width: int, height: int) -> GBuffer:
         """Draw ``calls`` through the camera in their matrices."""
         self._prepare((width, height))
-        for call in calls:
-            self._program.use(now=call.now, earlier=call.earlier, number=call.number, size=np.array([width, height]))
-            for primitive in call.mesh.primitives:
+        for mesh, number, now, earlier in calls:
+            self._program.use(now=now, earlier=earlier, number=number, size=np.array([width, height]))
+            for primitive in mesh.primitives:
                 self._program.use(cutoff=INVISIBLE if isinstance(primitive, BlendedPrimitive) else CUTOFF)
                 _draw(primitive)
         GL.glUseProgram(0)

@@ -22,7 +22,6 @@ from trompe_renderer.engines.surfaces import (
     rgba_of,
     sphere_around,
     surfaces_of,
-    towards,
 )
 from trompe_renderer.world.snapshot import Sky, Snapshot, WorldLight
 from trompe_renderer.world.validation import unit_color
@@ -97,7 +96,11 @@ class ThreeEngine:
             "radius": radius,
             "items": [self._item(surface) for surface in surfaces],
             "ambient": world.ambient,
-            "suns": [_light(each) | {"towards": towards(each)} for each in world.lights if each.kind == "Directional"],
+            "suns": [
+                _light(each) | {"towards": [-x for x in each.direction]}
+                for each in world.lights
+                if each.kind == "Directional"
+            ],
             "lamps": [_light(each) | {"position": each.position} for each in world.lights if each.kind == "Point"],
             "background": background,
         }
