@@ -27,7 +27,8 @@ from trompe_server.surrogate import textures_of
 from trompe_server.surrogate.calibration import build_surrogate
 from trompe_server.system.memory import keep_freed_memory
 from trompe_shared.comparison import grouped
-from trompe_shared.object3d import Object3D, Part
+from trompe_shared.object3d import Object3D
+from trompe_shared.wavefront import Part
 
 TEXTURE_SIDES = (256, 512, 1024, 2048, 4096)
 IMAGE_SIDES = (64, 128, 224, 362, 512)

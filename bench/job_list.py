@@ -18,7 +18,7 @@ from trompe_server.queue.claims import Claims, Ending
 from trompe_server.queue.store import JobStore
 from trompe_server.queue.tables import jobs, labels
 from trompe_server.storage.database import write
-from trompe_shared.api import JobRequest, JobSpec, JobState, Needs, Progress
+from trompe_shared.api import JobRequest, JobSpec, JobState, Needs
 
 BATCH = 1000
 CALLS = 50
@@ -29,7 +29,6 @@ LEAST = len(STATES) * (CALLS + 1)
 def fill(store: JobStore, count: int) -> None:
     """Make ``count`` jobs: 96 % have succeeded, 1 % each have failed, were cancelled, are n.a., are queued."""
     spec = JobSpec.of("mug", label="mug").model_dump(mode="json")
-    progress = Progress().model_dump(mode="json")
     for first in range(0, count, BATCH):
         rows, pairs = [], []
         for number in range(first + 1, min(first + BATCH, count) + 1):
@@ -48,12 +47,8 @@ def fill(store: JobStore, count: int) -> None:
                     "labels": mine,
                     "created": float(number),
                     "finished": float(number) if state != JobState.queued else None,
-                    "progress": progress,
-                    "done": 0,
                     "attempts": 1,
-                    "lost": 0,
                     "events": 0,
-                    "cancel_requested": False,
                     "artifacts": ["result.json"],
                 }
             )

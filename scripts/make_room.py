@@ -17,10 +17,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from objects.brushes import clouds, mix, rgb, smooth, wood
-from objects.mesh import Texels
+from objects.mesh import Array, Texels
 
 from trompe_renderer.check.probes import FACES
-from trompe_shared.object3d import encode_png, load_object, pack_zip
+from trompe_shared.local_files import pack_zip
+from trompe_shared.object3d import encode_png, load_object
 from trompe_shared.shipped import shipped_objects
 
 FOLDER: Final = Path(__file__).parents[1] / "renderer_worker" / "trompe_renderer" / "world" / "room_01"
@@ -31,7 +32,6 @@ WINDOW: Final = ((-0.6, 0.6), (0.95, 2.05))
 RUG_TOP: Final = 0.013
 TABLE_TOP: Final = RUG_TOP + 0.74
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 

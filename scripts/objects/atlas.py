@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from objects.mesh import Patch, Texels
-from trompe_shared.object3d import pack_zip
+from objects.mesh import Array, Materials, Patch, Texels
+from trompe_shared.local_files import pack_zip
 
 SIDE: Final = 512
 """Width and height of every texture, texels."""
@@ -19,8 +19,6 @@ MARGIN: Final = 2
 """Texels around each rectangle that repeat its edge, so that filtering does not bleed."""
 CREASE: Final = 52.0
 """Faces that meet at a larger angle (degrees) are shaded as an edge."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ class _Slot:
         return np.stack([self.x + u * self.width, self.y + v * self.height], axis=1) / SIDE
 
 
-def archive(name: str, materials: Mapping[str, Sequence[Patch]]) -> bytes:
+def archive(name: str, materials: Materials) -> bytes:
     """The zip of an object in SAILenv's format; ``materials`` maps material names to their patches.
 
     The object is moved so that the middle of its bounding box is the origin.
@@ -179,7 +177,7 @@ def _normals(height: Array, painted: NDArray[np.bool_]) -> Array:
 # --- the mesh file ---
 
 
-def _obj(name: str, materials: Mapping[str, Sequence[Patch]], slots: Mapping[str, list[_Slot]], middle: Array) -> str:
+def _obj(name: str, materials: Materials, slots: Mapping[str, list[_Slot]], middle: Array) -> str:
     patches = [patch for group in materials.values() for patch in group]
     places = [slot for group in slots.values() for slot in group]
     starts = np.cumsum([0, *(len(patch.points) for patch in patches)])

@@ -8,9 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from objects.mesh import Coat, Paint, Texels
-
-Array = NDArray[np.float64]
+from objects.mesh import Array, Coat, Paint, Texels
 
 
 def rgb(code: str) -> Array:

@@ -1,16 +1,12 @@
 """Table lamp, chair and table."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from objects.brushes import clouds, cover, mix, noise, rgb, smooth, wood, woven
-from objects.mesh import Coat, Paint, Patch, Texels, Warp, bevelled_box, cap, curve, moved, revolve
-
-Array = NDArray[np.float64]
-Materials = Mapping[str, Sequence[Patch]]
+from objects.mesh import Array, Coat, Materials, Paint, Patch, Texels, Warp, bevelled_box, cap, curve, moved, revolve
 
 
 def _shift(*offset: float) -> Warp:

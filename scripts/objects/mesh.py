@@ -4,7 +4,7 @@ A patch is seen from outside with s to the right and t up, both in metres, so th
 Objects are built from revolved profiles, caps, swept tubes and bevelled boxes. World: y up, metres, +z is the front.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,6 +62,10 @@ class Patch:
     locate: Callable[[Array, Array], Array]
     paint: Paint
     density: float = 1.0
+
+
+Materials = Mapping[str, Sequence[Patch]]
+"""Patches by the name of their material."""
 
 
 def curve(control: ArrayLike, samples: int) -> Array:

@@ -1,15 +1,9 @@
 """Mug, bottle and teapot: surfaces of revolution, with handles and a spout."""
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
-from numpy.typing import NDArray
 
 from objects.brushes import clouds, cover, letters, mix, noise, rgb, smooth, star
-from objects.mesh import Coat, Patch, Texels, cap, curve, revolve, tube
-
-Array = NDArray[np.float64]
-Materials = Mapping[str, Sequence[Patch]]
+from objects.mesh import Array, Coat, Materials, Texels, cap, curve, revolve, tube
 
 
 def _around(texels: Texels) -> Array:

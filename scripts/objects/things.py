@@ -1,16 +1,12 @@
 """Ball and book."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from objects.brushes import clouds, cover, letters, mix, noise, rgb, smooth, star
-from objects.mesh import Coat, Paint, Patch, Texels, bevelled_box, sheet
-
-Array = NDArray[np.float64]
-Materials = Mapping[str, Sequence[Patch]]
+from objects.mesh import Array, Coat, Materials, Paint, Patch, Texels, bevelled_box, sheet
 
 # --- ball ---
 

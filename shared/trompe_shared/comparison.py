@@ -11,10 +11,15 @@ A configuration is a set of options without object and seed. Its means follow fo
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean, stdev
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
+
+from trompe_shared.api import OPTIONS
 
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
+
+PROBED: Final = {"surrogate", *(name for name, option in OPTIONS.items() if option.part == "views")} - {"held_out"}
+"""Options on which a calibration depends, besides the seed."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,8 @@ def means_of(jobs: Sequence[Job[K]]) -> tuple[list[Mean[K]], set[str]]:
 def _mean(configuration: K, jobs: Sequence[Job[K]]) -> Mean[K]:
     by_object = grouped(jobs, lambda job: job.object).values()
     cost, drop = (fmean(fmean(getattr(job, name) for job in part) for part in by_object) for name in ("cost", "drop"))
-    by_seed = [fmean(job.drop for job in part) for part in grouped(jobs, lambda job: job.seed).values()]
+    seeds = grouped(jobs, lambda job: job.seed).values()  # only whole ones: objects differ more than seeds
+    by_seed = [fmean(job.drop for job in part) for part in seeds if len({job.object for job in part}) == len(by_object)]
     return Mean(configuration, cost, drop, stdev(by_seed) if len(by_seed) > 1 else 0.0)
 
 

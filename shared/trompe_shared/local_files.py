@@ -111,8 +111,8 @@ def _pictures_in(mesh: Path) -> list[str]:
 
 
 def _word(name: str) -> bytes:
-    """Pattern of a file's name that is not the end of a longer name."""
-    return rb"(?<![\w-])" + re.escape(name.lower().encode())
+    """Pattern of a file's name, ASCII letters in lower case, that is not the end of a longer name."""
+    return rb"(?<![\w-])" + re.escape(name.encode().lower())
 
 
 def _maps(folder: Path, mtl: str) -> Iterator[str]:
@@ -202,10 +202,15 @@ def libraries(text: str, files: Collection[str]) -> dict[str, str]:
     beside = [name for name in files if name.lower().endswith(".mtl")]
     found: dict[str, str] = {}
     for written in library_names(text):
-        name = written.replace("\\", "/").rsplit("/", 1)[-1]
+        name = base_name(written)
         if (file := named(name, beside)) is not None:
             found.setdefault(file, written.removesuffix(name) + file)
     return found or {name: name for name in beside}
+
+
+def base_name(path: str) -> str:
+    """The file name at the end of a path with slashes or backslashes."""
+    return path.replace("\\", "/").rsplit("/", 1)[-1]
 
 
 def named(name: str, files: Collection[str]) -> str | None:

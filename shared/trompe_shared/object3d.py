@@ -26,29 +26,8 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from trompe_shared.errors import ObjectError
-from trompe_shared.local_files import files_of, libraries, named, pack_zip, text_of
+from trompe_shared.local_files import base_name, files_of, libraries, named, pack_zip, text_of
 from trompe_shared.wavefront import Part, dissolve, parse_mtl, parse_obj
-
-__all__ = [
-    "MAX_TEXTURE_SIDE",
-    "Material",
-    "Object3D",
-    "Part",
-    "decode_alpha",
-    "decode_rgb",
-    "definition_of",
-    "encode_png",
-    "load_object",
-    "mtl_texts",
-    "object_from_files",
-    "open_image",
-    "pack_zip",
-    "resized",
-    "unpack",
-    "unpacked_size",
-    "unzip",
-    "with_alpha_of",
-]
 
 MAX_ARCHIVE_BYTES: Final = 512 * 2**20
 MAX_MEMBERS: Final = 256
@@ -403,9 +382,9 @@ def _materials_from_json(data: bytes, file: str) -> dict[str, Material]:
         return {
             str(name): Material(
                 str(name),
-                _base(maps["albedo"]),
-                _base(maps["normal"]) if maps.get("normal") else None,
-                _base(maps["metallic"]) if maps.get("metallic") else None,
+                base_name(maps["albedo"]),
+                base_name(maps["normal"]) if maps.get("normal") else None,
+                base_name(maps["metallic"]) if maps.get("metallic") else None,
                 _share(maps.get("opacity")),
             )
             for name, maps in table.items()
@@ -422,8 +401,3 @@ def _share(value: float | None) -> float | None:
     if value is not None and not 0 <= value <= 1:
         raise ValueError(f"the opacity {value} is not from 0 to 1")
     return value if value is None else float(value)
-
-
-def _base(name: str) -> str:
-    """File name without folders; both slashes separate."""
-    return re.split(r"[\\/]", name)[-1]

@@ -29,7 +29,7 @@ def with_preset(options: Mapping[str, Any]) -> dict[str, Any]:
     Raises ``ValueError`` for an unknown preset.
     """
     preset = options.get("preset")
-    if preset is not None and preset not in PRESETS:
+    if preset is not None and preset not in list(PRESETS):
         raise ValueError(f"unknown preset {preset!r}; presets: {', '.join(PRESETS)}")
     others = {name: value for name, value in options.items() if name != "preset"}
     return (dict(PRESETS[preset].options) if preset else {}) | others

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_shared.errors import ObjectError
+from trompe_shared.local_files import base_name
 
 MAX_FACES: Final = 2_000_000
 LARGEST: Final = 1e6
@@ -62,7 +63,7 @@ class Surface:
 
     vertices, normals, faces: as in ``Part``.
     uvs:     as in ``Part``; ``None`` if any corner has none.
-    colours: (V, 3) float32 in [0, 1], as written in the file; ``None`` if any vertex has none.
+    colours: (V, 3) float32 in [0, 1], up to rounding; ``None`` if any vertex has none.
     """
 
     material: str
@@ -156,13 +157,15 @@ def parse_obj(text: str, file: str) -> tuple[Part, ...]:
 
     Raises ``ObjectError`` for an unreadable line, and for a mesh without triangles, without UVs or with absurd numbers.
     """
-    return tuple(_part(surface, file) for surface in parse_surfaces(text, file))
+    return tuple(textured(surface, file) for surface in parse_surfaces(text, file))
 
 
-def _part(surface: Surface, file: str) -> Part:
+def textured(surface: Surface, file: str) -> Part:
+    """The surface as a part. Raises ``ObjectError`` if it has no texture coordinates."""
     if surface.uvs is None:
         raise ObjectError(
-            f"{file!r}, material {surface.material!r}: faces without texture coordinates (vt); unwrap the mesh first."
+            f"{file!r}, material {surface.material!r} has a texture, but faces without texture coordinates (vt); "
+            "unwrap the mesh in a modelling program."
         )
     return Part(surface.material, surface.vertices, surface.normals, surface.uvs, surface.faces)
 
@@ -185,7 +188,14 @@ def parse_surfaces(text: str, file: str) -> tuple[Surface, ...]:
             raise ObjectError(
                 f"{file!r} has a {kind!r} statement with a number beyond {LARGEST:g}; positions are metres."
             )
+    if "colour" in arrays:
+        arrays["colour"] = in_unit(arrays["colour"])
     return tuple(_surface(material, corners, arrays) for material, corners in reader.corners.items())
+
+
+def in_unit(colours: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Colours (V, 3) as written, up to 1 or up to 255, as numbers up to 1; a little more is a rounding error."""
+    return colours / np.float32(255) if colours.max() > 2 else colours
 
 
 def _rows(values: "array[float] | array[int]", width: int) -> NDArray[Any]:
@@ -265,7 +275,7 @@ def parse_mtl(text: str) -> dict[str, dict[str, str]]:
                     f"The MTL scales or moves the texture {name!r} ({words[1].strip()[:80]}), which is not supported; "
                     "apply that to the texture coordinates in a modelling program."
                 )
-            current[keys[words[0].lower()]] = name.replace("\\", "/").rsplit("/", 1)[-1]
+            current[keys[words[0].lower()]] = base_name(name)
     return materials
 
 

@@ -26,7 +26,8 @@ from trompe_server.library import Library
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.errors import ObjectError, ProtocolError, RendererError, SpecError, TrompeError
 from trompe_shared.geometry import Camera, View
-from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files, pack_zip
+from trompe_shared.local_files import pack_zip
+from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files
 from trompe_shared.opacity import opacity_of
 from trompe_shared.sailenv_client import _picture
 

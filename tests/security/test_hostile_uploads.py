@@ -19,7 +19,7 @@ from tests.small_models import OBJ, PICTURE, glb, gltf_buffer, gltf_files, gltf_
 from tests.worker_process import memory
 from trompe_server.formats import import_file, read_object
 from trompe_shared.errors import ObjectError
-from trompe_shared.object3d import pack_zip
+from trompe_shared.local_files import pack_zip
 
 MTL = b"newmtl m\nKd 1 1 1\nmap_Kd t.png\n"
 STL_TEXT = (

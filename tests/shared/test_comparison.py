@@ -57,6 +57,13 @@ def test_the_front_does_not_depend_on_the_order(means: list[Mean[str]], random: 
     assert values[0] == values[1]
 
 
+def test_the_deviation_is_over_seeds_with_all_objects() -> None:
+    jobs = [job("easy", "a", 1, 0.9), job("hard", "a", 1, 0.1), job("easy", "a", 1, 0.7, seed=1)]
+    assert means_of(jobs)[0][0].spread == 0
+    (mean,), _ = means_of([*jobs, job("hard", "a", 1, 0.1, seed=1)])
+    assert mean.spread == pytest.approx(0.1 / 2**0.5)
+
+
 def test_means_are_over_the_objects_that_all_configurations_have() -> None:
     means, common = means_of([*HARD_AND_EASY, job("other", "short", 10, 0.0)])
     assert common == {"easy", "hard"}
@@ -88,13 +95,13 @@ def test_a_page_and_a_report_show_the_same_front_for_the_same_jobs() -> None:
             probes, calibrate = (100, 8.0) if steps == 10 else (0, 0.5)
             judged = SimpleNamespace(a_drop=drop, views=60)
             phases = {"attack": seconds - calibrate, "calibrate": calibrate}
-            costs = {"seconds": phases, "probe_renders": probes, "surrogate_model": "curve"}
+            costs = {"seconds": phases, "probe_renders": probes, "image_size": (128, 128)}
             asked = {"epsilon": 0.05, "steps": steps, "seed": seed}
             result = SimpleNamespace(held_out=judged, target=judged, **costs)
             entries.append((SimpleNamespace(id="1", object=object), asked, result))
             found = {"held_out_a_drop": drop, "probe_renders": probes, "calibrate_s": calibrate, "seconds": seconds}
             place = {"experiment": "x", "key": "k", "configuration": f"steps {steps}", "state": "succeeded"}
-            options = asked | {"object": object, "surrogate_model": "curve", "views": 60}
+            options = asked | {"object": object, "image_size": "128x128", "views": 60}
             rows.append(ResultRow.model_validate(place | options | found))
     report = [f"{mean.drop:.3f} in {mean.cost:.1f} s" for mean in pareto_front(configurations(rows))]
     page = chart(points_of(entries, differing_options(entries)), measure="A_drop")

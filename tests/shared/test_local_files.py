@@ -39,7 +39,8 @@ SPLIT = {
     "no mtllib": {"m.obj": "", "other.mtl": "map_Kd A.png\nmap_Ks none.png", "a.png": ""},
     "mat_def": {"m.obj": "", "m_mat_def.json": TABLE, "tex/a.png": ""},
     "nothing readable": {"m.gltf": "{"},
-    "PLY": {"m.ply": "ply\ncomment TextureFile A b.png\nend_header", "a b.png": ""},
+    "PLY": {"m.ply": "ply\ncomment TextureFile \u00dcbung.PNG\nend_header", "\u00dcbung.png": ""},
+    "PLY with blanks": {"m.ply": "ply\ncomment TextureFile A b.png\nend_header", "a b.png": ""},
     "FBX": {"m.fbx": 'RelativeFilename: "C:\\x\\Skin.TGA", "beta-a.png"', "tex/skin.tga": "", "beta-a.png": ""},
 }  # fmt: skip
 

@@ -16,7 +16,8 @@ from PIL import Image
 
 from tests.small_models import large_png, zipped
 from trompe_shared.errors import ObjectError
-from trompe_shared.object3d import decode_rgb, encode_png, load_object, object_from_files, pack_zip
+from trompe_shared.local_files import pack_zip
+from trompe_shared.object3d import decode_rgb, encode_png, load_object, object_from_files
 from trompe_shared.wavefront import parse_mtl, parse_obj
 
 MESH = """# a triangle

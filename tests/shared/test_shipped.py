@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trompe_shared.object3d import Object3D, Part, decode_rgb, load_object
+from trompe_shared.object3d import Object3D, decode_rgb, load_object
 from trompe_shared.shipped import ShippedObject, shipped_objects
+from trompe_shared.wavefront import Part
 
 ROOT = Path(__file__).parents[2]
 SIDE = 512

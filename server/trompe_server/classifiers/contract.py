@@ -1,7 +1,7 @@
 """The contract of a white-box network, and its check."""
 
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import torch
 from jaxtyping import Float
@@ -9,6 +9,9 @@ from torch import Tensor, nn
 
 from trompe_server.classifiers import protocol
 from trompe_server.classifiers.fold import accelerate
+
+SAME: Final = 1e-3
+"""Largest difference of a logit of one image in two batches, relative to the largest logit."""
 
 
 class Normalised(nn.Module):
@@ -44,7 +47,10 @@ def sample_images(size: tuple[int, int]) -> Float[Tensor, "2 3 H W"]:
 
 
 def check_contract(network: nn.Module, sample: Float[Tensor, "2 3 H W"], file: str) -> int:
-    """Return the number of classes. Raises ``ClassifierError`` unless the output is finite, differentiable logits."""
+    """Return the number of classes.
+
+    Raises ``ClassifierError`` unless the output is finite, differentiable logits, for each image by itself.
+    """
     images = sample.clone().requires_grad_()
     try:
         logits = network(images)
@@ -54,6 +60,10 @@ def check_contract(network: nn.Module, sample: Float[Tensor, "2 3 H W"], file: s
         raise broken(file, f"its output for two images is {describe_value(logits)}")
     if not torch.isfinite(logits).all():
         raise broken(file, "its output is not finite")
+    with torch.no_grad():
+        difference = (network(sample[1:].repeat(2, 1, 1, 1)) - logits[1]).abs().max()
+    if difference > SAME * logits.abs().max():
+        raise broken(file, "its logits of an image depend on chance or on its batch: call eval() on the network first")
     protocol.refuse_probabilities(logits.detach().cpu().numpy(), file)
     gradient = torch.autograd.grad(logits.max(), images, allow_unused=True)[0] if logits.requires_grad else None
     if gradient is None or not gradient.any():

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import Tensor, nn
 
 from trompe_server.classifiers.contract import Normalised
@@ -14,23 +15,25 @@ from trompe_shared.errors import ClassifierError
 
 
 class _Logits(nn.Module):
-    """A network of transformers that returns its logits alone."""
+    """A network of transformers that returns its logits alone. ``bgr``: whether it takes the channels in that order."""
 
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: nn.Module, *, bgr: bool) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.bgr = network, bgr
 
     def forward(self, images: Tensor) -> Tensor:
-        """(n, 3, H, W), normalised -> logits (n, classes)."""
-        logits: Tensor = self.network(pixel_values=images, return_dict=False)[0]
+        """(n, 3, H, W), RGB, normalised -> logits (n, classes)."""
+        ordered = images.flip(1) if self.bgr else images
+        logits: Tensor = self.network(pixel_values=ordered, return_dict=False)[0]
         return logits
 
 
 def load_huggingface(model: str) -> NamedNetwork:
     """The image classifier in the repository ``model`` (ORG/MODEL) of the hub.
 
-    Image size and normalisation come from ``preprocessor_config.json``, class names from ``config.json``. Raises
-    ``ClassifierError`` if transformers or a file is missing, and for a network that classifies no images.
+    Image size, normalisation and order of channels come from ``preprocessor_config.json``, class names from
+    ``config.json``. The network computes in single precision. Raises ``ClassifierError`` if transformers or a file is
+    missing, and for a network that classifies no images.
     """
     settings = _settings(model)
     folder = hub_file(model, "config.json", extra="hf").parent
@@ -39,14 +42,15 @@ def load_huggingface(model: str) -> NamedNetwork:
     try:
         network = transformers.AutoModelForImageClassification.from_pretrained(
             folder, use_safetensors=True, trust_remote_code=False, local_files_only=True
-        )
+        ).float()
     except Exception as error:  # what a repository contains decides its kind
         raise ClassifierError(
             f"{model!r} cannot be loaded as an image classifier ({type(error).__name__}: {str(error)[:300]}). Give a "
             "repository of transformers' image classifiers with safetensors, or a .pt2 file."
         ) from error
     labels = network.config.id2label
-    whole = Normalised(_Logits(network), mean=_statistic(settings, "mean", 0.0), std=_statistic(settings, "std", 1.0))
+    mean, std = _normalisation(settings)
+    whole = Normalised(_Logits(network, bgr=bool(settings.get("do_flip_channel_order"))), mean=mean, std=std)
     return NamedNetwork(whole, _image_size(settings, model), [labels[index] for index in range(len(labels))])
 
 
@@ -67,10 +71,22 @@ def _settings(model: str) -> Mapping[str, Any]:
     return settings
 
 
-def _statistic(settings: Mapping[str, Any], which: str, default: float) -> tuple[float, ...]:
-    """Mean or std of the three channels."""
-    given = settings.get(f"image_{which}") if settings.get("do_normalize", True) else None
-    return tuple(given or [default] * 3)
+def _normalisation(settings: Mapping[str, Any]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Mean and standard deviation of the three channels of images in [0, 1] that have the same effect as ``settings``.
+
+    transformers multiplies pixels in [0, 255] by ``rescale_factor`` (1 / 255), subtracts 1 (``rescale_offset``),
+    normalises, and divides by the standard deviation once more (``include_top``). Its processor that flips channels
+    never normalises, whatever the settings.
+    """
+    rescaled = settings.get("do_rescale", True)
+    white = 255 * (settings.get("rescale_factor") or 1 / 255) if rescaled else 255.0
+    black = -1.0 if rescaled and settings.get("rescale_offset") else 0.0
+    mean, std, divisor = np.zeros(3), np.ones(3), settings.get("image_std") or 1.0
+    if settings.get("do_normalize", True) and "do_flip_channel_order" not in settings:
+        mean, std = mean + (settings.get("image_mean") or 0.0), std * divisor
+    if settings.get("include_top"):
+        std = std * divisor
+    return tuple(((mean - black) / white).tolist()), tuple((std / white).tolist())
 
 
 def _image_size(settings: Mapping[str, Any], model: str) -> tuple[int, int]:

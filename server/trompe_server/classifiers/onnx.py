@@ -1,8 +1,9 @@
 """Classifiers from ``.onnx`` files, run by onnxruntime: scores only, no gradients."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import onnxruntime
@@ -19,6 +20,9 @@ from trompe_server.classifiers.protocol import (
     refuse_probabilities,
 )
 from trompe_shared.errors import ClassifierError
+
+_WEIGHTS_APART: Final = re.compile("external data|GetFileLength", re.IGNORECASE)
+"""onnxruntime's words, new and old, for a missing file of weights."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,11 @@ def _session(path: Path, device: str) -> Any:
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:
+        if _WEIGHTS_APART.search(str(error)):
+            raise ClassifierError(
+                f"{path.name!r} keeps its weights in another file, which is not here. Write one file: "
+                "torch.onnx.export(..., external_data=False)."
+            ) from error
         raise broken(path.name, f"onnxruntime cannot read it ({str(error)[:300]})") from error
 
 

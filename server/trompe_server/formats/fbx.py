@@ -1,6 +1,6 @@
 """FBX: mesh and materials through assimp's command line as OBJ, in metres.
 
-A repaint replaces textures only, beside the FBX or inside a binary one.
+A repaint replaces textures only, beside the FBX and inside a binary one.
 """
 
 import re
@@ -17,9 +17,10 @@ import numpy as np
 from trompe_server.formats.assembly import assemble, repainted, safe_name
 from trompe_server.formats.fbx_tree import MAGIC, Tree, parse_tree
 from trompe_server.formats.pictures import decode
-from trompe_server.formats.upload import Upload, base_name
+from trompe_server.formats.upload import Upload
 from trompe_server.formats.wavefront import complete, dissolved
 from trompe_shared.errors import ObjectError
+from trompe_shared.local_files import base_name, named
 from trompe_shared.object3d import Object3D, object_from_files, with_alpha_of
 
 CENTIMETRE: Final = 0.01
@@ -44,15 +45,12 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
     original, tree = read(upload), _tree(upload.data)
     changed = repainted(original, painted)
     beside, inside = upload.flat(), tree.pictures() if tree is not None else {}
-    homeless = sorted(name for name in changed if name not in beside and name not in inside)
-    if homeless:
+    pictures = {**beside, **inside}
+    if homeless := sorted(changed.keys() - pictures.keys()):
         raise ObjectError(f"The FBX has plain colours in place of the textures {homeless}; take the GLB.")
-    pngs = {
-        name: with_alpha_of(rgb, decode(beside.get(name, inside.get(name, b"")), name)[1])
-        for name, rgb in changed.items()
-    }
-    files: dict[str, bytes] = {name: png for name, png in pngs.items() if name in beside}
-    if tree is not None and files.keys() != pngs.keys():
+    pngs = {name: with_alpha_of(rgb, decode(pictures[name], name)[1]) for name, rgb in changed.items()}
+    files = {found: png for name, png in pngs.items() if (found := named(name, beside)) is not None}
+    if tree is not None and pngs.keys() & inside.keys():
         files[base_name(upload.main)] = tree.with_pictures({**pngs}).to_bytes()
     return upload.with_flat(files) if files else upload
 
@@ -62,12 +60,12 @@ def _tree(data: bytes) -> Tree | None:
 
 
 def read(upload: Upload) -> Object3D:
-    """Read an FBX and the textures beside it. Raises ``ObjectError``."""
+    """Read an FBX and its textures; one inside counts more than a file beside it. Raises ``ObjectError``."""
     scale, tree = unit(upload.data), _tree(upload.data)
     beside = {name: data for name, data in upload.flat().items() if not name.lower().endswith((".obj", ".mtl"))}
     inside = tree.pictures() if tree is not None else {}
     bare = upload.data if tree is None or not inside else tree.with_pictures(dict.fromkeys(inside)).to_bytes()
-    obj = object_from_files(dissolved(complete({**inside, **beside, **_converted(bare)})))
+    obj = object_from_files(dissolved(complete({**beside, **inside, **_converted(bare)})))
     parts = [replace(part, vertices=part.vertices * np.float32(scale)) for part in obj.parts]
     images = {name: obj.files[name] for m in obj.materials.values() for name in (m.albedo, m.normal) if name}
     return assemble(safe_name(upload.stem), parts, obj.materials, images)

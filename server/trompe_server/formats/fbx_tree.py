@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
-from trompe_server.formats.upload import base_name
 from trompe_shared.errors import ObjectError
+from trompe_shared.local_files import base_name
 
 MAGIC: Final = b"Kaydara FBX Binary  \0\x1a\0"
 MAX_DEPTH: Final = 32
@@ -40,10 +40,14 @@ class Tree:
     footer: bytes
 
     def pictures(self) -> dict[str, bytes]:
-        """The image files inside, by their names in materials."""
-        return {
-            name: content.properties[5:] for video in self._videos() for name, content in [_picture(video)] if content
-        }
+        """The image files inside, by their names in materials. Raises ``ObjectError`` for two of one name."""
+        found: dict[str, bytes] = {}
+        for name, content in map(_picture, self._videos()):
+            if content is not None and found.setdefault(name, data := content.properties[5:]) != data:
+                raise ObjectError(
+                    f"The FBX holds two pictures called {name!r}; rename one of them and export it again."
+                )
+        return found
 
     def with_pictures(self, pictures: dict[str, bytes | None]) -> "Tree":
         """The tree with other image files; ``None`` removes a file."""

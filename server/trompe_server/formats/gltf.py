@@ -18,12 +18,12 @@ from trompe_server.formats.pictures import (
     decode,
     metallic_smoothness,
     scaled_normals,
-    shrink,
     tinted,
 )
 from trompe_server.formats.unwrap import Unwrapped, bake, unwrap
-from trompe_server.formats.upload import Upload, base_name
+from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
+from trompe_shared.local_files import base_name
 from trompe_shared.object3d import Material as Maps
 from trompe_shared.object3d import Object3D, encode_png, with_alpha_of
 from trompe_shared.wavefront import Part
@@ -55,7 +55,6 @@ class Model:
     """A glTF file as an object, with the origin of each texture and part."""
 
     container: Container
-    max_texture: int | None
     files: dict[str, bytes] = field(default_factory=dict)
     slots: dict[Slot, str] = field(default_factory=dict)
     """File name of each slot's texture."""
@@ -116,7 +115,7 @@ class Model:
             picture = flat_picture(factor.tolist(), size)
         slot = self._slot(index, unwrapped=True)
         alpha = None if slot.alpha is None else np.full(size, 255, np.uint8)
-        png = _albedo_png(shrink(picture, self.max_texture), alpha, slot)
+        png = _albedo_png(picture, alpha, slot)
         self.slots[slot] = self._new_file(f"{self._material_name(index)}_albedo.png", png)
 
     def _material(self, index: int | None) -> Material:
@@ -165,12 +164,11 @@ class Model:
             data = self.container.image_bytes(slot.image)
             name = self._new_file(f"{self._image_name(slot.image)}.png", data)
             rgb, alpha = decode(data, name)
-            if _kept_as_is(slot, data, alpha is not None, shrink(rgb, self.max_texture) is rgb):
+            if _kept_as_is(slot, data, alpha is not None):
                 return name
         if alpha is None and slot.alpha is not None:
             alpha = np.full(rgb.shape[:2], 255, np.uint8)
-        small = shrink(rgb if slot.image is None else tinted(rgb, slot.factor), self.max_texture)
-        self.files[name] = _albedo_png(small, alpha, slot)
+        self.files[name] = _albedo_png(rgb if slot.image is None else tinted(rgb, slot.factor), alpha, slot)
         return name
 
     def _new_file(self, wanted: str, data: bytes) -> str:
@@ -192,9 +190,9 @@ class Model:
         if key not in self._converted:
             data = self.container.image_bytes(image)
             rgb, _ = decode(data, f"{self._image_name(image)} (a normal map)")
-            small = shrink(scaled_normals(rgb, info.scale), self.max_texture)
-            ending = _ending(data) if small is rgb else None
-            kept = data if ending is not None else encode_png(small)
+            scaled = scaled_normals(rgb, info.scale)
+            ending = _ending(data) if scaled is rgb else None
+            kept = data if ending is not None else encode_png(scaled)
             self._converted[key] = self._new_file(f"{self._image_name(image)}.{ending or 'png'}", kept)
         return self._converted[key]
 
@@ -209,7 +207,7 @@ class Model:
         if key not in self._converted:
             pixels = np.full((1, 1, 3), 255, np.uint8)
             if image is not None:
-                pixels = shrink(decode(self.container.image_bytes(image), "metallic map")[0], self.max_texture)
+                pixels, _ = decode(self.container.image_bytes(image), "metallic map")
             converted = metallic_smoothness(pixels, metallic=factors[0], roughness=factors[1])
             flat = f"{safe_name(material.name or 'material')}_metallic"
             stem = flat if image is None else self._image_name(image)
@@ -224,14 +222,14 @@ class Model:
         return part, replace(part, normals=-part.normals, faces=np.ascontiguousarray(part.faces[:, ::-1]))
 
 
-def read(upload: Upload, max_texture: int | None = None) -> Object3D:
+def read(upload: Upload) -> Object3D:
     """Read a .gltf or .glb file. Raises ``ObjectError``."""
-    return load(upload, max_texture).object()
+    return load(upload).object()
 
 
-def load(upload: Upload, max_texture: int | None = None) -> Model:
+def load(upload: Upload) -> Model:
     """As ``read``, with the origin of textures and parts."""
-    model = Model(open_container(upload), max_texture)
+    model = Model(open_container(upload))
     model.add()
     if not model.parts:
         raise ObjectError("The glTF's scene has no triangles; export a scene with a mesh.")
@@ -255,10 +253,10 @@ def _ending(data: bytes) -> str | None:
     return "png" if data[:4] == b"\x89PNG" else "jpg" if data[:3] == b"\xff\xd8\xff" else None
 
 
-def _kept_as_is(slot: Slot, data: bytes, has_alpha: bool, full_size: bool) -> bool:
+def _kept_as_is(slot: Slot, data: bytes, has_alpha: bool) -> bool:
     """Whether an image file can serve unchanged."""
     alpha_fits = not has_alpha if slot.alpha is None else slot.alpha == KEPT
-    return _ending(data) == "png" and full_size and slot.factor == (1.0, 1.0, 1.0) and alpha_fits
+    return _ending(data) == "png" and slot.factor == (1.0, 1.0, 1.0) and alpha_fits
 
 
 def _albedo_png(rgb: NDArray[np.uint8], alpha: NDArray[np.uint8] | None, slot: Slot) -> bytes:

@@ -1,8 +1,8 @@
 """Replace the base colour textures of a glTF file and keep the rest byte for byte.
 
 A texture replaces its image if nothing else uses that image; otherwise it becomes a new image. A colour factor already
-in the texture becomes 1. A mesh without texture coordinates gets those of its paint: its vertices are split at seams,
-its triangles stay.
+in the texture becomes 1. A painted material loses its colours of the older kind (specular-glossiness). A mesh without
+texture coordinates gets those of its paint: its vertices are split at seams, its triangles stay.
 """
 
 import base64
@@ -24,6 +24,7 @@ from trompe_server.formats.gltf_write import Json, Writer, append, glb
 from trompe_server.formats.pictures import Pixels, decode
 from trompe_server.formats.unwrap import Unwrapped
 from trompe_server.formats.upload import Upload
+from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D, with_alpha_of
 
 
@@ -54,15 +55,11 @@ class _Repainting:
         else:
             _, alpha = decode(self._model.container.image_bytes(image), "the image")
             png = with_alpha_of(rgb, alpha)
-            if self._editor.serves_only(image, self._materials) and self._is_first_of(image):
+            if self._editor.serves_only(image, self._materials):
                 self._editor.replace_image(image, png)
                 self._point_to(None)
             else:
                 self._point_to(self._editor.add_texture(png, self._texture_entry()))
-
-    def _is_first_of(self, image: int) -> bool:
-        """Whether this is the first slot of its image, which may replace it."""
-        return next(slot for slot in self._model.slots if slot.image == image) == self._slot
 
     def _texture_entry(self) -> Json:
         material = self._editor.document["materials"][self._materials[0]]
@@ -81,6 +78,7 @@ class _Repainting:
                     self._editor.document["meshes"][mesh]["primitives"][primitive]["material"] = fresh
 
     def _paint(self, material: Json, texture: int | None) -> None:
+        self._editor.drop_extension(SPECULAR_GLOSSINESS, material, self._editor.document.get("materials", []))
         pbr = material.setdefault("pbrMetallicRoughness", {})
         if texture is not None:
             info = pbr.setdefault("baseColorTexture", self._placement(material))
@@ -95,10 +93,14 @@ class _Repainting:
         return copy.deepcopy({key: info[key] for key in ("texCoord", "extensions") if key in info})
 
     def _wrap(self, rgb: Pixels) -> None:
-        """Give the unwrapped primitives a copy of the material with the texture."""
+        """Give the unwrapped primitives a copy of the material with the texture.
+
+        Raises ``ObjectError`` if other maps of the material use the texture coordinates that are replaced.
+        """
         slot, document = self._slot, self._editor.document
         own = slot.unwrapped is not None and slot.unwrapped >= 0
         material = copy.deepcopy(document["materials"][slot.unwrapped]) if own else {}
+        mapped = any(_texture_uses(material, ""))
         texture = self._editor.add_texture(with_alpha_of(rgb, None), {})
         self._paint(material, texture)
         index = self._editor.add("materials", material)
@@ -106,6 +108,8 @@ class _Repainting:
         for (mesh, number), shape in self._model.shapes.items():
             if shape.cut is not None and shape.material == wanted:
                 primitive = document["meshes"][mesh]["primitives"][number]
+                if mapped and "TEXCOORD_0" in primitive["attributes"]:
+                    raise ObjectError("The glTF has vertex colours and other maps on one material; take the GLB.")
                 self._editor.cut_open(primitive, shape, shape.cut)
                 primitive["material"] = index
 
@@ -217,11 +221,14 @@ class _Editor(Writer):
         primitive["attributes"]["TEXCOORD_0"] = self.add_uvs(cut.uvs)
         primitive["indices"] = self.add_corners(cut.faces)
         primitive["mode"] = 4
-        if _extensions(primitive).pop(DRACO, None) is not None:
-            _keep(primitive, "extensions", primitive["extensions"])
-            primitives = [each for mesh in self.document["meshes"] for each in mesh["primitives"]]
-            if not any(DRACO in _extensions(each) for each in primitives):
-                self._unlist({DRACO})
+        self.drop_extension(DRACO, primitive, [each for mesh in self.document["meshes"] for each in mesh["primitives"]])
+
+    def drop_extension(self, name: str, entry: Json, alike: list[Json]) -> None:
+        """Remove an extension from ``entry``, and from the file's lists if then none of ``alike`` has it."""
+        if _extensions(entry).pop(name, None) is not None:
+            _keep(entry, "extensions", entry["extensions"])
+            if not any(name in _extensions(each) for each in alike):
+                self._unlist({name})
 
     def _gather(self, index: int, source: NDArray[np.int64]) -> int:
         accessor = self.document["accessors"][index]
@@ -246,7 +253,7 @@ class _Editor(Writer):
         upload = self._container.upload
         if self._extra:
             self.add("buffers", {"byteLength": len(self._extra), "uri": _data_uri(self._extra, _BYTES)})
-        if self.binary:
+        if self.binary != self._binary_before:
             self.document["buffers"][0]["byteLength"] = len(self.binary)
         same = self.document == self._before  # as if unpainted, if a new image has the length of the old one
         if same and self.binary == self._binary_before and self._files == upload.files:
@@ -266,6 +273,8 @@ class _Editor(Writer):
 _BYTES: Final = "application/octet-stream"
 DRACO: Final = "KHR_draco_mesh_compression"
 """Holds a compressed copy of a primitive."""
+SPECULAR_GLOSSINESS: Final = "KHR_materials_pbrSpecularGlossiness"
+"""Holds colours that some viewers show in place of the base colour."""
 
 
 def _dumped(document: Json, before: bytes) -> bytes:

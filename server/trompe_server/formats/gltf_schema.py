@@ -33,8 +33,6 @@ class _Part(BaseModel):
 
 
 class Asset(_Part):
-    """Version of the file."""
-
     version: str
 
 
@@ -46,8 +44,6 @@ class Buffer(_Part):
 
 
 class BufferView(_Part):
-    """A range of a buffer."""
-
     buffer: Index
     byte_offset: Size = 0
     byte_length: Size
@@ -76,8 +72,6 @@ class Sparse(_Part):
 
 
 class Accessor(_Part):
-    """Numbers in a buffer view."""
-
     buffer_view: Index | None = None
     byte_offset: Size = 0
     component_type: Literal[5120, 5121, 5122, 5123, 5125, 5126]
@@ -117,14 +111,10 @@ class Node(_Part):
 
 
 class Scene(_Part):
-    """Roots of a tree of nodes."""
-
     nodes: tuple[Index, ...] = ()
 
 
 class Image(_Part):
-    """An image file in a buffer view, a data URI or a file."""
-
     uri: str | None = None
     buffer_view: Index | None = None
     mime_type: str | None = None
@@ -132,8 +122,6 @@ class Image(_Part):
 
 
 class Texture(_Part):
-    """An image with a sampler."""
-
     source: Index | None = None
     sampler: Index | None = None
     webp: Index | None = Field(default=None, validation_alias=AliasPath("extensions", "EXT_texture_webp", "source"))
@@ -213,8 +201,6 @@ class Material(_Part):
 
 
 class Document(_Part):
-    """A glTF file."""
-
     asset: Asset
     extensions_required: tuple[str, ...] = ()
     scene: Index | None = None

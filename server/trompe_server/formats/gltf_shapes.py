@@ -192,7 +192,9 @@ def _vertex_colours(container: Container, primitive: Primitive) -> NDArray[np.fl
 
 def placed(shape: Shape, matrix: Matrix, material: str) -> Part:
     """The transformed shape of an instance, with its own texture coordinates or those of its unwrapping."""
-    shape = _with_uvs(shape)
+    if (cut := shape.cut) is not None:
+        normals = None if shape.normals is None else shape.normals[cut.source]
+        shape = replace(shape, vertices=shape.vertices[cut.source], normals=normals, uvs=cut.uvs, faces=cut.faces)
     assert shape.uvs is not None
     moved = shape.vertices @ matrix[:3, :3].T + matrix[:3, 3]
     check_numbers(moved, "The glTF")
@@ -201,15 +203,6 @@ def placed(shape: Shape, matrix: Matrix, material: str) -> Part:
     if shape.normals is None:
         return _faceted(material, vertices[faces], shape.uvs[faces])
     return Part(material, vertices, _transformed(shape.normals, matrix), shape.uvs, faces)
-
-
-def _with_uvs(shape: Shape) -> Shape:
-    """The shape, split at seams if it was unwrapped."""
-    cut = shape.cut
-    if cut is None:
-        return shape
-    normals = None if shape.normals is None else shape.normals[cut.source]
-    return replace(shape, vertices=shape.vertices[cut.source], normals=normals, uvs=cut.uvs, faces=cut.faces)
 
 
 def _transformed(normals: NDArray[np.float32], matrix: Matrix) -> NDArray[np.float32]:

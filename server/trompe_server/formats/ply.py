@@ -23,8 +23,9 @@ from trompe_server.formats.assembly import (
 )
 from trompe_server.formats.upload import Upload, refusing
 from trompe_shared.errors import ObjectError
+from trompe_shared.local_files import base_name
 from trompe_shared.object3d import Material, Object3D, decode_alpha, encode_png, with_alpha_of
-from trompe_shared.wavefront import MAX_FACES, Part, Surface, smooth_normals
+from trompe_shared.wavefront import MAX_FACES, Part, Surface, in_unit, smooth_normals
 
 MATERIAL: Final = "surface"
 WHITE: Final = (1.0, 1.0, 1.0)
@@ -61,7 +62,7 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
         return Upload(upload.main, {**upload.files, texture: with_alpha_of(rgb, alpha)}, upload.packed)
     (part,) = original.parts
     place = free_name(name, upload.flat())
-    return upload.with_flat({upload.main.rsplit("/", 1)[-1]: _written(part, place), place: encode_png(rgb)})
+    return upload.with_flat({base_name(upload.main): _written(part, place), place: encode_png(rgb)})
 
 
 def read(upload: Upload) -> Object3D:
@@ -173,7 +174,10 @@ def _surface(data: bytes, header: _Header) -> Surface:
         if values is not None:
             check_numbers(values, "The PLY")
     if normals is None or not np.isfinite(normals).all():
-        normals = smooth_normals(vertices, np.arange(len(vertices)), faces)
+        positions, index = vertices, np.arange(len(vertices))
+        if split:
+            positions, index = np.unique(vertices, axis=0, return_inverse=True)
+        normals = smooth_normals(positions, index, faces)
     return Surface(MATERIAL, vertices, normals, faces.astype(np.int32), uvs, colours)
 
 
@@ -186,8 +190,7 @@ def _colours(values: Any) -> NDArray[np.float32] | None:
     colours = _floats(values)
     if colours is None:
         return None
-    whole = values.dtype.kind in "iu" or colours.max() > 1.0
-    return np.nan_to_num(colours[:, :3] / 255 if whole else colours[:, :3])
+    return np.nan_to_num(colours[:, :3] / 255 if values.dtype.kind in "iu" else in_unit(colours[:, :3]))
 
 
 def _check_faces(faces: NDArray[np.int64], count: int) -> None:

@@ -8,31 +8,26 @@ from typing import Final
 from trompe_server.formats import fbx, gltf, gltf_repaint, ply, stl, wavefront
 from trompe_server.formats.upload import Upload, is_litter
 from trompe_shared.errors import ObjectError
+from trompe_shared.local_files import base_name
 from trompe_shared.object3d import MAX_ARCHIVE_BYTES, Object3D, definition_of, unpack
-
-
-def _reduced(read: Callable[[Upload], Object3D]) -> Callable[[Upload, int | None], Object3D]:
-    """``read``, and reduce the textures afterwards."""
-    return lambda upload, max_texture: wavefront.shrunk(read(upload), max_texture)
 
 
 @dataclass(frozen=True)
 class Format:
-    """endings: of the mesh file; one without gets the last. read: also takes the longest side of a texture. Both raise
-    ``ObjectError``."""
+    """endings: of the mesh file; one without gets the last. read, repaint: raise ``ObjectError``."""
 
     name: str
     endings: tuple[str, ...]
-    read: Callable[[Upload, int | None], Object3D]
+    read: Callable[[Upload], Object3D]
     repaint: Callable[[Upload, Object3D], Upload]
 
 
 FORMATS: Final = (
-    Format("obj", (".obj",), _reduced(wavefront.read), wavefront.repaint),
+    Format("obj", (".obj",), wavefront.read, wavefront.repaint),
     Format("gltf", (".gltf", ".glb"), gltf.read, gltf_repaint.repaint),
-    Format("fbx", (".fbx",), _reduced(fbx.read), fbx.repaint),
-    Format("ply", (".ply",), _reduced(ply.read), ply.repaint),
-    Format("stl", (".stl",), _reduced(stl.read), stl.repaint),
+    Format("fbx", (".fbx",), fbx.read, fbx.repaint),
+    Format("ply", (".ply",), ply.read, ply.repaint),
+    Format("stl", (".stl",), stl.read, stl.repaint),
 )
 """In order of precedence for archives with meshes of several formats."""
 
@@ -69,7 +64,7 @@ def read_object(data: bytes, *, name: str, max_texture: int | None = None) -> Im
     """
     upload, found = _opened(data, name)
     sailenv = found.name == "obj" and definition_of(upload.flat()) is not None
-    return Imported(found.read(upload, max_texture), "sailenv" if sailenv else found.name)
+    return Imported(wavefront.shrunk(found.read(upload), max_texture), "sailenv" if sailenv else found.name)
 
 
 def repaint_file(data: bytes, painted: Object3D, *, name: str) -> Exported:
@@ -86,8 +81,7 @@ def _opened(data: bytes, name: str) -> tuple[Upload, Format]:
     if data[:2] == b"PK":
         return _in_archive(unpack(data))
     found = _recognised(data, name)
-    main = name if name.lower().endswith(found.endings) else f"{name or 'object'}{found.endings[-1]}"
-    main = main.replace("\\", "/").rsplit("/", 1)[-1]
+    main = base_name(name if name.lower().endswith(found.endings) else f"{name or 'object'}{found.endings[-1]}")
     return Upload(main, {main: data}, packed=False), found
 
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 from urllib.parse import unquote
 
 from trompe_shared.errors import ObjectError
-from trompe_shared.local_files import named
-from trompe_shared.object3d import pack_zip
+from trompe_shared.local_files import base_name, named, pack_zip
 
 
 @dataclass(frozen=True)
@@ -72,11 +71,6 @@ class Upload:
     def to_bytes(self) -> bytes:
         """The bytes to send back: the mesh file if it came and stays alone, otherwise a zip."""
         return self.data if not self.packed and len(self.files) == 1 else pack_zip(self.files)
-
-
-def base_name(path: str) -> str:
-    """The file name at the end of a path with slashes or backslashes."""
-    return path.replace("\\", "/").rsplit("/", 1)[-1]
 
 
 def is_litter(path: str) -> bool:

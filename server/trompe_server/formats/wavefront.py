@@ -21,7 +21,7 @@ from trompe_shared.object3d import (
     object_from_files,
     with_alpha_of,
 )
-from trompe_shared.wavefront import Part, Surface, obj_text, parse_mtl, parse_surfaces
+from trompe_shared.wavefront import Part, Surface, obj_text, parse_mtl, parse_surfaces, textured
 
 
 def read(upload: Upload) -> Object3D:
@@ -49,7 +49,9 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
 
 
 def shrunk(obj: Object3D, side: int | None) -> Object3D:
-    """``obj`` with maps of at most ``side`` texels a side; reduced maps become PNGs."""
+    """``obj`` with maps of at most ``side`` texels a side, of any size for ``None``; reduced maps become PNGs."""
+    if side is None:
+        return obj
     files = dict(obj.files)
     for name in obj.maps:
         rgb, alpha = decode(files[name], name)
@@ -162,7 +164,7 @@ class _Completion:
                 f"{sorted(maps) or 'none'}."
             )
         if "albedo" in maps[surface.material]:
-            self._keep(surface)
+            self._parts.append(textured(surface, self._mesh))
             return
         part, picture = painted_flat(surface, self._colour(surface))
         self._rewritten |= surface.uvs is None or surface.colours is not None
@@ -170,14 +172,6 @@ class _Completion:
         name = free_name(f"{safe_name(surface.material)}_albedo.png", self._files)
         self._files[name] = encode_png(picture)
         self._libraries = {k: _with_map(text, surface.material, name) for k, text in self._libraries.items()}
-
-    def _keep(self, surface: Surface) -> None:
-        if surface.uvs is None:
-            raise ObjectError(
-                f"{self._mesh!r}, material {surface.material!r} has a texture, but faces without texture coordinates "
-                "(vt); unwrap the mesh in a modelling program."
-            )
-        self._parts.append(Part(surface.material, surface.vertices, surface.normals, surface.uvs, surface.faces))
 
     def _colour(self, surface: Surface) -> Sequence[float]:
         """Linear colour of a material in the MTL; white for vertex colours."""

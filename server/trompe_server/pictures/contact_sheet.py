@@ -61,18 +61,6 @@ def extremes(hardness: Float[np.ndarray, " n"], directions: Float[np.ndarray, "n
     return [int(index) for index in order if index in {*hard, *easy}]
 
 
-def hardest_and_easiest(
-    recognised: Sequence[int], after: Sequence[Verdict], cameras: Sequence[Camera], k: int
-) -> list[int]:
-    """At most ``k`` views of those ``recognised`` before: the hardest to fool and the easiest, from all sides.
-
-    after, cameras: of all views.
-    """
-    confidences = [after[index].confidence * (1 if after[index].correct else -1) for index in recognised]
-    directions = np.array([spherical(cameras[index].azimuth, cameras[index].elevation) for index in recognised])
-    return [recognised[index] for index in extremes(np.array(confidences), directions, k)]
-
-
 def _spread(ranked: NDArray[np.int64], directions: Float[np.ndarray, "n 3"], k: int) -> list[int]:
     """The first of ``ranked``, then each time the one farthest from those chosen."""
     nearness = np.full(len(ranked), -np.inf)
@@ -93,7 +81,7 @@ def views_sheet(
     title: str,
     distinct: Sequence[int] | None = None,
 ) -> Image.Image:
-    """The contact sheet of the views recognised before, or of representative ones if none is.
+    """The contact sheet of views recognised before, the hardest to fool and the easiest, else of representative ones.
 
     images (N, H, W, 3), verdicts: of all views, before and after. distinct: indices of the distinct views, by default
     all.
@@ -101,7 +89,10 @@ def views_sheet(
     (before, after), (old, new) = images, verdicts
     own = range(len(old)) if distinct is None else distinct
     recognised = [k for k in own if old[k].correct]
-    shown = hardest_and_easiest(recognised, new, cameras, VIEWS) or [own[k] for k in representative(len(own), VIEWS)]
+    confidences = np.array([new[k].confidence * (1 if new[k].correct else -1) for k in recognised])
+    directions = np.array([spherical(cameras[k].azimuth, cameras[k].elevation) for k in recognised])
+    extreme = [recognised[k] for k in extremes(confidences, directions, VIEWS)]
+    shown = extreme or [own[k] for k in representative(len(own), VIEWS)]
     fooled, which = sum(not new[k].correct for k in recognised), "" if len(own) == len(old) else "distinct "
     facts = f"Recognised before in {len(recognised)} of {len(own)} {which}views; {fooled} of these are fooled."
     if recognised:

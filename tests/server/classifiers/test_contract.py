@@ -3,8 +3,6 @@
 import io
 import json
 import os
-import subprocess
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -145,12 +143,13 @@ def white_box(path: Path | str) -> NetworkClassifier:
 
 
 @pytest.fixture(
+    scope="module",
     params=[
         *("fake", "pt2", "tiny", "resized", "score based"),
         *("onnx", "onnx with a batch of 1", "onnx with a batch of 4"),
-    ]
+    ],
 )
-def classifier(request: pytest.FixtureRequest, tmp_path: Path) -> Classifier:
+def classifier(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Classifier:
     if request.param == "fake":
         return fake_classifier()
     if request.param == "resized":
@@ -162,7 +161,7 @@ def classifier(request: pytest.FixtureRequest, tmp_path: Path) -> Classifier:
     if request.param == "pt2":
         return load_classifier(request.getfixturevalue("pt2"))
     batches: dict[str, int | str] = {"onnx": "n", "onnx with a batch of 1": 1, "onnx with a batch of 4": 4}
-    return load_classifier(write_onnx(tmp_path / "net.onnx", batch=batches[request.param]))
+    return load_classifier(write_onnx(tmp_path_factory.mktemp("onnx") / "net.onnx", batch=batches[request.param]))
 
 
 def test_every_classifier_gives_float32_logits_for_any_number_of_images(classifier: Classifier) -> None:
@@ -379,6 +378,18 @@ def test_logits_without_a_gradient_are_the_same(function: Callable[[Any, Tensor]
         pytest.param(Around(lambda net, x: net(x) / 0), {}, "not finite", id="not finite"),
         pytest.param(Around(lambda net, x: (5 * net(x)).round()), {}, "no gradient in the image", id="rounded"),
         pytest.param(Around(lambda net, x: net(x).detach()), {}, "no gradient in the image", id="detached"),
+        pytest.param(
+            Around(lambda net, x: nn.functional.dropout(net(x), training=True)),
+            {},
+            r"chance .* call eval\(\)",
+            id="dropout",
+        ),
+        pytest.param(
+            Around(lambda net, x: nn.functional.batch_norm(net.body[0](x), None, None, training=True).mean((2, 3))),
+            {},
+            r"its batch: call eval\(\) on the network first",
+            id="statistics of the batch",
+        ),
     ],
 )
 def test_an_exported_network_that_breaks_the_contract_is_refused(
@@ -539,6 +550,16 @@ def test_an_onnx_network_that_breaks_the_contract_is_refused(
         load_onnx(write_onnx(tmp_path / "net.onnx", **options))
 
 
+def test_an_onnx_network_whose_weights_are_elsewhere_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    file = write_onnx(tmp_path / "net.onnx")
+    options: dict[str, Any] = {"save_as_external_data": True, "location": "net.onnx.data", "size_threshold": 0}
+    onnx.save(onnx.load(file), file, **options)
+    assert load_onnx(file).n_classes == 7
+    (tmp_path / "net.onnx.data").unlink()
+    with pytest.raises(ClassifierError, match=r"'net.onnx' keeps its weights in another file.*external_data=False"):
+        load_onnx(file)
+
+
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
@@ -561,8 +582,8 @@ def test_what_cannot_be_loaded_is_refused_with_the_reason(
 
 
 def test_inspect_prints_one_line_of_json(pt2: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = [sys.executable, "-m", "trompe_server.classifiers.inspect", str(pt2)]
-    (line,) = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout.splitlines()
+    assert inspect.main([str(pt2)]) == 0
+    (line,) = capsys.readouterr().out.splitlines()
     assert json.loads(line) == {"white_box": True, "image_size": [*SIZE], "n_classes": 7, "classes": None}
     (tmp_path / "bad.pt2").write_bytes(b"no")
     assert inspect.main([str(tmp_path / "bad.pt2")]) == 1

@@ -310,22 +310,56 @@ def test_a_vision_transformer_by_name_is_attacked_end_to_end(
     assert after < before
 
 
-def test_a_repository_of_transformers_is_a_white_box(hub: Callable[[str], Path]) -> None:
+LABELS: Final = {0: "tench, Tinca tinca", 1: "mug", 2: "lamp"}
+
+
+def vision_transformer(folder: Path, dtype: torch.dtype = torch.float32) -> Any:
+    """A small network of transformers for 32 x 32 images with random weights, saved to ``folder`` in ``dtype``."""
     transformers = pytest.importorskip("transformers")
     torch.manual_seed(0)
-    labels = {0: "tench, Tinca tinca", 1: "mug", 2: "lamp"}
     shape = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 4, "intermediate_size": 64}
-    config = transformers.ViTConfig(**shape, image_size=32, patch_size=8, id2label=labels)
-    network = transformers.ViTForImageClassification(config).eval()
-    folder = hub("org/model")
+    config = transformers.ViTConfig(**shape, image_size=32, patch_size=8, id2label=LABELS)
+    network = transformers.ViTForImageClassification(config).eval().to(dtype)
     network.save_pretrained(folder)
+    return network.float()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16], ids=str)
+def test_a_repository_of_transformers_is_a_white_box(hub: Callable[[str], Path], dtype: torch.dtype) -> None:
+    folder = hub("org/model")
+    network = vision_transformer(folder, dtype)
     its = {"do_normalize": True, "image_mean": [0.5, 0.4, 0.3], "image_std": [0.5, 0.6, 0.7]}
     (folder / "preprocessor_config.json").write_text(json.dumps(its | {"size": {"height": 32, "width": 32}}))
     classifier, images = white_box("hf:org/model"), random_images(32, 2)
-    assert (classifier.image_size, classifier.classes) == ((32, 32), tuple(labels.values()))
+    assert (classifier.image_size, classifier.classes) == ((32, 32), tuple(LABELS.values()))
     expected = of_normalised(lambda x: network(x).logits, images, its["image_mean"], its["image_std"])
     torch.testing.assert_close(classifier.scores(images), expected, atol=1e-5, rtol=1e-4)
     assert classifier_file("hf:org/model") == folder / "model.safetensors"
+
+
+@pytest.mark.parametrize(
+    ("processor", "settings"),
+    [
+        pytest.param("ViT", {"rescale_factor": 1 / 100}, id="another range"),
+        pytest.param("ViT", {"do_rescale": False, "do_normalize": False}, id="0 to 255"),
+        pytest.param("MobileViT", {"do_center_crop": False}, id="BGR"),
+        pytest.param("EfficientNet", {"image_std": [0.5, 0.6, 0.7]}, id="divided twice"),
+        pytest.param("EfficientNet", {"rescale_offset": True, "rescale_factor": 1 / 127.5}, id="-1 to 1"),
+    ],
+)
+@pytest.mark.usefixtures("models")
+def test_pixels_become_the_input_that_transformers_makes(
+    processor: str, settings: dict[str, Any], hub: Callable[[str], Path]
+) -> None:
+    folder = hub("org/model")
+    network = vision_transformer(folder)
+    theirs = getattr(pytest.importorskip("transformers"), f"{processor}ImageProcessor")
+    its = theirs(size={"height": 32, "width": 32}, **settings)
+    its.save_pretrained(folder)
+    image = np.random.default_rng(0).integers(0, 256, (1, 32, 32, 3), np.uint8)
+    with torch.no_grad():
+        expected = network(its(Image.fromarray(image[0]), return_tensors="pt").pixel_values).logits
+    np.testing.assert_allclose(white_box("hf:org/model").predict(image), expected, atol=1e-5, rtol=1e-4)
 
 
 def test_a_repository_with_a_pickle_is_refused(hub: Callable[[str], Path]) -> None:

@@ -15,13 +15,14 @@ from hypothesis import strategies as st
 from tests.small_models import corners, painted, refusal, same_paint, with_picture_inside
 from trompe_server.formats import FORMATS, import_file, read_object, repaint_file, repaint_limited, write_glb
 from trompe_server.formats.fbx import unit
-from trompe_server.formats.fbx_tree import MAGIC, parse_tree
+from trompe_server.formats.fbx_tree import MAGIC, Node, Tree, parse_tree
 from trompe_server.formats.pictures import cutout_alpha, encode_srgb, linear_rgb, tinted
 from trompe_server.formats.unwrap import unwrap
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.errors import ObjectError
 from trompe_shared.geometry import Camera, View
-from trompe_shared.object3d import Object3D, decode_alpha, decode_rgb, encode_png, load_object, pack_zip, unpack
+from trompe_shared.local_files import pack_zip
+from trompe_shared.object3d import Object3D, decode_alpha, decode_rgb, encode_png, load_object, unpack
 from trompe_shared.wavefront import Part, obj_text, parse_obj
 
 PICTURE = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(8, 8, 3)
@@ -205,13 +206,17 @@ def test_a_bare_obj_is_grey_and_comes_back_with_its_texture() -> None:
     assert sorted(unpack(out)) == ["red_albedo.png", "t.mtl", "t.obj"]
 
 
-def test_colours_of_an_objs_vertices_are_baked() -> None:
-    lines = [f"v {x:g} {y:g} {z:g} {abs(x):g} {abs(y):g} {abs(z):g}" for x, y, z in ball().vertices]
+@pytest.mark.parametrize("scale", [1, 255])
+def test_colours_of_an_objs_vertices_are_baked(scale: int) -> None:
+    colours = np.round(scale * np.abs(ball().vertices), 6).tolist()
+    points = zip(ball().vertices.tolist(), colours, strict=True)
+    lines = [f"v {x:g} {y:g} {z:g} {r:g} {g:g} {b:g}" for (x, y, z), (r, g, b) in points]
     faces = [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in ball().faces]
     obj, _ = comes_back("\n".join(lines + faces).encode(), "ball.obj")
     (image,) = obj.textures.values()
     assert image.reshape(-1, 3).max(axis=0).min() > 230
     assert image.reshape(-1, 3).min(axis=0).max() < 25
+    assert ((image > 25) & (image < 230)).mean() > 0.5
 
 
 def test_a_texture_without_texture_coordinates_is_refused() -> None:
@@ -236,11 +241,11 @@ def test_smaller_textures_come_back_at_their_size_and_other_maps_at_their_own(mu
 # FBX
 
 
-def fbx_of(materials: str, folder: Path) -> bytes:
-    """An FBX of the square, as assimp writes it."""
+def fbx_of(materials: str, folder: Path, *, kind: str = "fbxa") -> bytes:
+    """An FBX of the square, as assimp writes it: in text, or in binary (``fbx``)."""
     (folder / "t.obj").write_text(OBJ)
     (folder / "t.mtl").write_text(materials)
-    subprocess.run(["assimp", "export", "t.obj", "t.fbx", "-ffbxa"], cwd=folder, check=True, capture_output=True)
+    subprocess.run(["assimp", "export", "t.obj", "t.fbx", f"-f{kind}"], cwd=folder, check=True, capture_output=True)
     return (folder / "t.fbx").read_bytes()
 
 
@@ -253,6 +258,33 @@ def test_an_fbx_comes_back_as_it_was_with_another_texture_file(picture: str, tmp
     assert [name for name, data in unpack(out).items() if files[name] != data] == ["red.png"]
     np.testing.assert_allclose(np.ptp(corners(obj).reshape(-1, 3), axis=0), [unit(files["t.fbx"])] * 2 + [0], rtol=1e-6)
     assert picture in refusal(files["t.fbx"], "t.fbx")
+
+
+@needs_assimp
+@pytest.mark.parametrize("beside", [None, "red.png", "Red.PNG"])
+def test_a_picture_inside_an_fbx_is_painted_there_and_beside(beside: str | None, tmp_path: Path) -> None:
+    plain = fbx_of("newmtl red\nmap_Kd red.png\n", tmp_path, kind="fbx")
+    inside = with_picture_inside(parse_tree(plain), encode_png(PICTURE))
+    files = {"t.fbx": inside} | ({beside: encode_png(255 - PICTURE)} if beside else {})
+    obj, out = comes_back(pack_zip(files), "t.zip")
+    assert (obj.textures["red.png"] == PICTURE).all()
+    after = unpack(out)
+    new = painted(obj).textures["red.png"]
+    for data in (*parse_tree(after["t.fbx"]).pictures().values(), *(after[name] for name in files if name != "t.fbx")):
+        assert (decode_rgb(data, "red.png") == new).all()
+
+
+def test_two_pictures_of_one_name_inside_an_fbx_are_refused() -> None:
+    def video(picture: bytes) -> Node:
+        name = Node(b"RelativeFilename", 1, b"S\0\0\0\0C:\\a\\x.png", None)
+        return Node(b"Video", 0, b"", (name, Node(b"Content", 1, b"R\0\0\0\0" + picture, None)))
+
+    def pictures(*contents: bytes) -> dict[str, bytes]:
+        return Tree(7400, (Node(b"Objects", 0, b"", tuple(map(video, contents))),), b"").pictures()
+
+    assert pictures(b"one", b"one") == {"x.png": b"one"}
+    with pytest.raises(ObjectError, match=r"two pictures called 'x\.png'; rename one"):
+        pictures(b"one", b"two")
 
 
 @needs_assimp
@@ -396,8 +428,20 @@ def test_a_texture_that_a_ply_names_is_the_only_thing_that_changes(mesh: bytes) 
     assert part.normals.tolist() == [[0, 0, 1]] * 4
 
 
-@pytest.mark.parametrize(("scale", "kind"), [(1, "float"), (255, "float"), (255, "uchar"), (1, "double")])
-def test_colours_of_a_ply_are_those_of_its_numbers(scale: int, kind: str) -> None:
+def test_normals_of_a_ply_are_smooth_across_the_seams_of_its_texture() -> None:
+    roof = "0 0 0, 0 0 1, 1 1 0, -1 1 0"
+    faces = "3 0 1 2 6 0 0 1 0 1 1, 3 1 0 3 6 0 0.5 1 0.5 1 1"
+    files = {"t.ply": ply(roof, faces, corners="texcoord", texture="a.png"), "a.png": encode_png(PICTURE)}
+    (part,) = read_object(pack_zip(files), name="t.zip").obj.parts
+    ridge = part.vertices[:, 1] == 0
+    assert ridge.sum() == 4
+    np.testing.assert_allclose(np.abs(part.normals[ridge]), np.tile([0, 1, 0], (4, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("scale", "kind"), [(1, "float"), (255, "float"), (255, "uchar"), (1, "double"), (1.0000001, "double")]
+)
+def test_colours_of_a_ply_are_those_of_its_numbers(scale: float, kind: str) -> None:
     rows = ", ".join(f"{point} {scale} 0 0" for point in SQUARE.split(", "))
     data = ply(rows, "4 0 1 2 3", columns="red green blue")
     for name in (b"red", b"green", b"blue"):

@@ -21,7 +21,8 @@ from trompe_server.formats.gltf_container import split_glb
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.errors import ObjectError
 from trompe_shared.geometry import Camera, View
-from trompe_shared.object3d import Object3D, decode_rgb, encode_png, load_object, pack_zip, unpack
+from trompe_shared.local_files import pack_zip
+from trompe_shared.object3d import Object3D, decode_rgb, encode_png, load_object, unpack
 
 Json = dict[str, Any]
 Pixels = NDArray[np.uint8]
@@ -285,8 +286,11 @@ def test_what_cannot_be_shown_is_refused_with_a_reason() -> None:
 # What comes back
 
 
-def test_an_unchanged_object_gives_the_same_bytes() -> None:
-    data = textured(factor=[0.5, 1.0, 1.0, 1.0]).to_glb()
+@pytest.mark.parametrize("end", [b"", b"!"], ids=["padded buffer", "buffer without padding"])
+def test_an_unchanged_object_gives_the_same_bytes(end: bytes) -> None:
+    scene = textured(factor=[0.5, 1.0, 1.0, 1.0])
+    scene.data += end
+    data = scene.to_glb()
     assert repainted(data, read(data)) == data
 
 
@@ -395,6 +399,29 @@ def test_an_image_that_is_more_than_a_base_colour_is_left_alone() -> None:
         decode_rgb(chunk[view["byteOffset"] : view["byteOffset"] + view["byteLength"]], "x").tolist()
         == GRADIENT.tolist()
     )
+
+
+def test_colours_of_the_older_kind_go_with_the_first_paint() -> None:
+    older = "KHR_materials_pbrSpecularGlossiness"
+    scene = textured(extensions={older: {"diffuseTexture": {"index": 0}}, "other": {}})
+    scene.document["extensionsUsed"] = [older, "other"]
+    document, _ = contents(painted_over(scene)[1])
+    assert document["materials"][0]["extensions"] == {"other": {}}
+    assert document["extensionsUsed"] == ["other"]
+
+    scene.material(extensions={older: {}})
+    document, _ = contents(painted_over(scene)[1])
+    assert document["extensionsUsed"] == [older, "other"]
+
+
+def test_paint_of_vertices_beside_other_maps_is_refused() -> None:
+    scene = Scene()
+    shade = scene.accessor(np.linspace(0, 1, 12, dtype="<f4").reshape(4, 3))
+    scene.square(scene.material(emissiveTexture={"index": scene.texture(GRADIENT)}), COLOR_0=shade)
+    data = scene.to_glb()
+    assert repainted(data, read(data)) == data
+    with pytest.raises(ObjectError, match="vertex colours and other maps on one material; take the GLB"):
+        repainted(data, painted(read(data)))
 
 
 def test_alpha_of_the_image_is_kept_whatever_it_means() -> None:
