@@ -1,10 +1,12 @@
 """Small attacks on a square, 32 x 32 pixels, with the fake classifier."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import settings
 from torch import Tensor
@@ -47,6 +49,15 @@ def surrogate_of(
 ) -> Surrogate:
     geometry = prepare_geometry(obj, views, size=size, sampling=sampling or SamplingModel())
     return diffuse_surrogate(geometry, views, **options)
+
+
+@contextmanager
+def default_sampling() -> Iterator[None]:
+    """Calibrations with the default sampling: its search takes four times as long as the rest of a small job."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("trompe_server.surrogate.calibration.find_sampling", lambda _: SamplingModel())
+        patch.setattr("trompe_server.surrogate.calibration.find_physics", lambda best, *_: best)
+        yield
 
 
 _RANDOM: Final = np.random.default_rng(0)

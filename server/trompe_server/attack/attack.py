@@ -14,6 +14,7 @@ docs/library.md has the whole example, with a target renderer.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import get_args
 
 from jaxtyping import Bool
 from torch import Tensor
@@ -22,7 +23,7 @@ from trompe_server.attack.backgrounds import Backgrounds
 from trompe_server.attack.budget import Box, Budget
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Objective, Textures, members_of
-from trompe_server.attack.optimiser import OPTIMISERS, Iterate
+from trompe_server.attack.optimiser import Iterate
 from trompe_server.attack.perception import perceptual_bounds
 from trompe_server.attack.search import Search, finished
 from trompe_server.attack.state import AttackState
@@ -90,8 +91,8 @@ def attack(
     total = state.step + steps if total_steps is None else total_steps
     if state.step + steps > total:
         raise SpecError(f"Steps up to {state.step + steps} were asked for, but total_steps is {total}.")
-    if optimiser not in OPTIMISERS:
-        raise SpecError(f"Unknown optimiser {optimiser!r}; choose one of {', '.join(OPTIMISERS)}.")
+    if optimiser not in get_args(OptimiserName):
+        raise SpecError(f"Unknown optimiser {optimiser!r}; choose one of {', '.join(get_args(OptimiserName))}.")
     members = members_of(classifier, goal)
     wanted = movable(surrogate, budget, masks) if texels is None else texels
     state, moving = _in_blocks(state, {name: mask.to(device) for name, mask in wanted.items()}, surrogate, budget)

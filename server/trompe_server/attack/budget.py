@@ -36,7 +36,7 @@ class Budget:
 
     epsilon: largest change of a texel's channel. alpha: size of one step. epsilon_view: largest change of a pixel of
     the surrogate's images (the paper's view constraint), if any. perceptual: bound each texel by ``perceptual_bounds``.
-    Raises ``SpecError`` unless 0 < alpha <= epsilon <= 1 and 0 < epsilon_view <= 1.
+    Raises ``SpecError`` unless 0 < alpha <= epsilon <= 1, epsilon is at least 1/255, and 0 < epsilon_view <= 1.
     """
 
     epsilon: float
@@ -49,6 +49,11 @@ class Budget:
             raise SpecError(
                 "epsilon and alpha must satisfy 0 < alpha <= epsilon <= 1, "
                 f"got alpha={self.alpha}, epsilon={self.epsilon}."
+            )
+        if self.levels < 1:
+            raise SpecError(
+                f"epsilon must be at least 1/255, one level of an 8-bit texture; got {self.epsilon:g}: "
+                "use 0.004 or more."
             )
         if self.epsilon_view is not None and not 0 < self.epsilon_view <= 1:
             raise SpecError(f"epsilon_view must be in (0, 1], got {self.epsilon_view}; omit it for no bound.")

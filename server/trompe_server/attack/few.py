@@ -65,6 +65,7 @@ def few_texels(
     ``attack``; ``on_step`` reports the trials' steps. Deterministic. Raises ``SpecError`` if ``keep`` is out of range
     or leaves no texel.
     """
+    textures = {name: texture.to(surrogate.device) for name, texture in textures.items()}
     canvas = surrogate.canvas(textures, {name: texture[..., 0] >= 0 for name, texture in textures.items()})
     objective = Objective(textures, surrogate, members_of(classifier, goal), goal, masks, canvas)
     if masks is not None:

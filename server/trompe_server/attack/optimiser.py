@@ -8,7 +8,7 @@
 Textures are one flat tensor (texels or blocks of them, 3). One without gradient does not move.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -47,40 +47,19 @@ def step_factor(done: int, length: int) -> float:
     return 2 * (end - done - 0.5) / (end - begin)
 
 
-def _at_iterate(point: Iterate, factor: float, box: Box) -> Flat:
-    return point.delta
+def gradient_at(optimiser: OptimiserName, point: Iterate, factor: float, box: Box) -> Flat:
+    """The change at which a step of ``step_factor`` takes its gradient."""
+    return point.delta if optimiser == "pgd" else box.ascend(point.delta, _momentum(point), MOMENTUM * factor)
 
 
-@dataclass(frozen=True)
-class Optimiser:
-    """An update rule. Both functions take the ``step_factor`` and return new tensors.
-
-    step: the next iterate, from this one and the gradient. gradient_at: the change at which the gradient is taken.
-    """
-
-    step: Callable[[Iterate, Flat, float, Box], Iterate]
-    gradient_at: Callable[[Iterate, float, Box], Flat] = _at_iterate
-
-
-def _pgd(point: Iterate, gradient: Flat, factor: float, box: Box) -> Iterate:
-    return replace(point, delta=box.ascend(point.delta, gradient))
-
-
-def _nesterov(point: Iterate, gradient: Flat, factor: float, box: Box) -> Iterate:
+def moved(optimiser: OptimiserName, point: Iterate, gradient: Flat, factor: float, box: Box) -> Iterate:
+    """The next iterate, in new tensors, after a step of ``step_factor``."""
+    if optimiser == "pgd":
+        return replace(point, delta=box.ascend(point.delta, gradient))
     size = max(float(gradient.abs().sum()), TINY)
     mean = _momentum(point).mul(MOMENTUM).add_(gradient, alpha=1 / size)
     return replace(point, delta=box.ascend(point.delta, mean, factor), momentum=mean)
 
 
-def _ahead(point: Iterate, factor: float, box: Box) -> Flat:
-    return box.ascend(point.delta, _momentum(point), MOMENTUM * factor)
-
-
 def _momentum(point: Iterate) -> Tensor:
     return torch.zeros_like(point.delta) if point.momentum is None else point.momentum
-
-
-OPTIMISERS: Final[Mapping[OptimiserName, Optimiser]] = {
-    "pgd": Optimiser(_pgd),
-    "nesterov": Optimiser(_nesterov, _ahead),
-}

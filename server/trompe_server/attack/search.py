@@ -22,7 +22,7 @@ from trompe_server.attack.backgrounds import Backgrounds
 from trompe_server.attack.budget import Box
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Evaluation, Flat, Objective
-from trompe_server.attack.optimiser import OPTIMISERS, Iterate, Memory, step_factor
+from trompe_server.attack.optimiser import Iterate, Memory, gradient_at, moved, step_factor
 from trompe_server.attack.view_budget import ViewBudget
 from trompe_server.image_pipelines import Drawn, ImagePipeline
 from trompe_shared.api import OptimiserName
@@ -91,7 +91,7 @@ class Search:
         from_start = torch.zeros(sum(map(len, batches)), dtype=torch.long, device=point.delta.device)
         known = point.memory.get(RESUME, from_start)
         resume = torch.cat([known, from_start[len(known) :]])
-        change = OPTIMISERS[self.optimiser].gradient_at(point, step_factor(step, self.total), self.box)
+        change = gradient_at(self.optimiser, point, step_factor(step, self.total), self.box)
         drawn = self._drawn(batches, step)
         found = self._objective_at(point, step).evaluate(change, drawn, resume <= step)
         memory = {
@@ -135,9 +135,9 @@ class Search:
         """The iterate after ``step``; the same one for a zero gradient."""
         gradient = found.gradient.mul_(self.movable)
         if len(gradient) and any(gradient.aminmax()):  # gradient.any() would take four times as long
-            moved = OPTIMISERS[self.optimiser].step(point, gradient, step_factor(step, self.total), self.box)
-            delta = moved.delta if self.view_budget is None else self.view_budget.project(moved.delta)
-            point = replace(moved, delta=delta)
+            point = moved(self.optimiser, point, gradient, step_factor(step, self.total), self.box)
+            if self.view_budget is not None:
+                point = replace(point, delta=self.view_budget.project(point.delta))
         masked = self.objective.masks is not None
         return self._no_worse(point) if masked and step + 1 == self.total else point
 

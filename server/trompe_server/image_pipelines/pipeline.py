@@ -86,28 +86,20 @@ class ImagePipeline:
         if spared < self.spared:
             return {}
         found = {}
-        for (name, field), (used, share) in zip(_OPERATIONS.items(), drawn, strict=True):
-            chance, between = (self.mirrored, (1, 1)) if name == "mirrored" else (self.often, getattr(self, field))
+        for name, (used, share) in zip(_OPERATIONS, drawn, strict=True):
+            given = getattr(self, name.split()[0])
+            chance, between = (given, (1, 1)) if name == "mirrored" else (self.often, given)
             if between and used < chance:
                 low, high = between
                 found[name] = low + (high - low) * share
         return found
 
 
-_OPERATIONS: Final = {
-    "zoom": "zoom",
-    "shift of rows": "shift",
-    "shift of columns": "shift",
-    "mirrored": "mirrored",
-    "resize": "resize",
-    "blur": "blur",
-    "gamma": "gamma",
-    "gain": "gain",
-    "filmic": "filmic",
-    "noise": "noise",
-    "jpeg": "jpeg",
-}
-"""Operations in their order, each with its field of ``ImagePipeline``."""
+_OPERATIONS: Final = (
+    *("zoom", "shift of rows", "shift of columns", "mirrored"),
+    *("resize", "blur", "gamma", "gain", "filmic", "noise", "jpeg"),
+)
+"""Operations in their order; the first word is the field of ``ImagePipeline``."""
 
 
 @dataclass(frozen=True)

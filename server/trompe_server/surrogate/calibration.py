@@ -42,6 +42,9 @@ NOISE_AMPLITUDE: Final = 0.1
 TRIAL_VIEWS: Final = 4
 """Number of views for trying hypotheses and colour models."""
 
+GOLDEN: Final = 0.618034
+"""Golden ratio: the fractional parts of its multiples are spread evenly, however many they are."""
+
 KEPT_BYTES: Final = 2**29
 """Bytes of operators kept from earlier hypotheses."""
 
@@ -366,7 +369,7 @@ class _Trial:
         device: torch.device,
     ) -> None:
         self.obj, self.ask, self.backdrops, self.tone_map, self.device = obj, ask, backdrops, tone_map, device
-        self.index = sorted({round(k) for k in np.linspace(0, len(views) - 1, TRIAL_VIEWS + 2)[1:-1]})
+        self.index = _from_all_sides([view.camera for view in views])
         self.views, self.clean = tuple(views[k] for k in self.index), clean[self.index]
         repainted = painted_noise(obj, generator)
         self.images = ask(repainted, self.views)
@@ -449,6 +452,19 @@ class _Trial:
         while len(self.visible) > KEPT_RASTERS:
             del self.visible[next(iter(self.visible))]
         return self.visible[key]
+
+
+def _from_all_sides(cameras: Sequence[Camera]) -> list[int]:
+    """Indices of ``TRIAL_VIEWS`` of the ``cameras``, or of all if they are fewer, ascending.
+
+    One from each part of the azimuths, each at another elevation: even steps through a grid would meet one column only.
+    """
+    around = sorted(range(len(cameras)), key=lambda k: cameras[k].azimuth % 360)
+    chosen = []
+    for number, part in enumerate(np.array_split(around, min(TRIAL_VIEWS, len(cameras))), 1):
+        upwards = sorted(part.tolist(), key=lambda k: cameras[k].elevation)
+        chosen.append(upwards[int(number * GOLDEN % 1 * len(upwards))])
+    return sorted(chosen)
 
 
 _COLOURS: Final = ("encoding", "filtered", "mips", "slope", "edges")

@@ -13,11 +13,9 @@ from typing import Final
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.autograd import Function
-from torch.autograd.function import FunctionCtx
 
 from trompe_server.surrogate.blocks import halvings, means
-from trompe_server.surrogate.pyramid import MipChain, read_texels, round_level_
+from trompe_server.surrogate.pyramid import Linear, MipChain, read_texels, round_level_
 from trompe_server.surrogate.shading import decode
 
 REACH: Final = 0.1
@@ -117,7 +115,7 @@ class Canvas:
                 self.sheets, torch.split(values, self.counts), torch.split(self.source, self.counts), strict=True
             )
             values = torch.cat([sheet.light(part, source) for sheet, part, source in parts])
-        texels: Tensor = _ReadCanvas.apply(values, self)  # type: ignore[no-untyped-call]
+        texels: Tensor = Linear.apply(self.forward, lambda each: [self.transpose(each)], values)  # type: ignore[no-untyped-call]
         return texels
 
     def forward(self, values: Float[Tensor, "texels 3"]) -> Float[Tensor, "reads 3"]:
@@ -134,19 +132,6 @@ class Canvas:
 
     def _split(self, reads: Float[Tensor, "reads 3"]) -> tuple[Tensor, ...]:
         return torch.split(reads, [sheet.tiles.n_reads for sheet in self.sheets])
-
-
-class _ReadCanvas(Function):
-    """``Canvas.read`` as an autograd function."""
-
-    @staticmethod
-    def forward(ctx: FunctionCtx, values: Tensor, canvas: Canvas) -> Tensor:
-        ctx.canvas = canvas  # type: ignore[attr-defined]
-        return canvas.forward(values.detach())
-
-    @staticmethod
-    def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[Tensor, None]:
-        return ctx.canvas.transpose(gradient), None  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True)

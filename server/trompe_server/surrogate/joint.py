@@ -24,21 +24,18 @@ def joined(parts: Sequence[Surrogate]) -> "AnySurrogate":
 
 @dataclass(frozen=True)
 class JointCanvas:
-    """Canvases with the same moving texels, for different reads."""
+    """Canvases with the same moving texels, for different reads; the interface of ``Canvas``."""
 
     canvases: tuple[Canvas, ...]
 
     @property
     def source(self) -> Float[Tensor, "texels 3"]:
-        """See ``Canvas``."""
         return self.canvases[0].source
 
     def join(self, tables: Sequence[Tensor]) -> Tensor:
-        """See ``Canvas.join``."""
         return self.canvases[0].join(tables)
 
     def split(self, values: Tensor) -> list[Tensor]:
-        """See ``Canvas.split``."""
         return self.canvases[0].split(values)
 
     def read(self, values: Float[Tensor, "texels 3"]) -> Float[Tensor, "reads 3"]:
@@ -91,7 +88,6 @@ class JointSurrogate:
     def canvas(
         self, textures: Mapping[str, Float[Tensor, "H W 3"]], moving: Mapping[str, Bool[Tensor, "h w"]]
     ) -> JointCanvas:
-        """See ``Surrogate.canvas``."""
         return JointCanvas(tuple(part.canvas(textures, moving) for part in self._readers))
 
     def render(
@@ -104,12 +100,10 @@ class JointSurrogate:
     def colours(
         self, texels: Float[Tensor, "texels 3"], batch: int
     ) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 3"]]:
-        """See ``Surrogate.colours``."""
         number, own = self._places[batch]
         return self.parts[number].colours(texels[self._reads[number]], own)
 
     def spread(self, pixels: Float[Tensor, "pixels 3"], batch: int) -> Float[Tensor, "texels 3"]:
-        """See ``Surrogate.spread``."""
         number, own = self._places[batch]
         total = pixels.new_zeros(max(reads.stop for reads in self._reads), 3)
         total[self._reads[number]] = self.parts[number].spread(pixels, own)
@@ -122,9 +116,13 @@ class JointSurrogate:
 
     @cached_property
     def footprint(self) -> Mapping[str, float]:
-        """See ``Surrogate.footprint``: the geometric mean over the parts."""
-        logs = [{name: math.log(size) for name, size in part.footprint.items()} for part in self.parts]
-        return {name: math.exp(sum(each[name] for each in logs) / len(logs)) for name in self.textures}
+        """Texels that a pixel reads of each texture: the geometric mean over the views of all parts."""
+        found = {}
+        for name in self.textures:
+            weights = [float(part.level_weights[name].sum()) for part in self.parts]
+            logs = [weight * math.log(part.footprint[name]) for weight, part in zip(weights, self.parts, strict=True)]
+            found[name] = math.exp(sum(logs) / (sum(weights) or 1))
+        return found
 
     @cached_property
     def spare_levels(self) -> Mapping[str, int]:

@@ -4,7 +4,7 @@ Large levels are computed, read and dropped in bands of rows within the processo
 memory latency does not dominate the cost of a step.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -61,25 +61,32 @@ def read_texels(
 
     rounded: round each level to 8 bits; the gradient ignores the rounding.
     """
-    texels: Tensor = _ReadTexels.apply(chains, rounded, *textures)  # type: ignore[no-untyped-call]
-    return texels
 
-
-class _ReadTexels(Function):
-    """``read_texels`` as an autograd function."""
-
-    @staticmethod
-    def forward(ctx: FunctionCtx, chains: Sequence["MipChain"], rounded: bool, *textures: Tensor) -> Tensor:
-        ctx.chains = chains  # type: ignore[attr-defined]
+    def read(*textures: Tensor) -> Tensor:
         pairs = zip(chains, textures, strict=True)
         return torch.cat([part for chain, texture in pairs for part in chain.read(texture, rounded=rounded)])
 
+    def spread(gradient: Tensor) -> list[Tensor]:
+        parts = iter(torch.split(gradient, [len(level) for chain in chains for level in chain.reads]))
+        return [chain.spread([next(parts) for _ in chain.sizes]) for chain in chains]
+
+    texels: Tensor = Linear.apply(read, spread, *textures)  # type: ignore[no-untyped-call]
+    return texels
+
+
+class Linear(Function):
+    """A linear map of tensors as an autograd function; its transpose gives the gradient of each."""
+
+    @staticmethod
+    def forward(
+        ctx: FunctionCtx, read: Callable[..., Tensor], spread: Callable[[Tensor], Sequence[Tensor]], *tensors: Tensor
+    ) -> Tensor:
+        ctx.spread = spread  # type: ignore[attr-defined]
+        return read(*tensors)
+
     @staticmethod
     def backward(ctx: FunctionCtx, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        chains: Sequence[MipChain] = ctx.chains  # type: ignore[attr-defined]
-        counts = [len(level) for chain in chains for level in chain.reads]
-        parts = iter(torch.split(gradient, counts))
-        return (None, None, *(chain.spread([next(parts) for _ in chain.sizes]) for chain in chains))
+        return (None, None, *ctx.spread(gradient))  # type: ignore[attr-defined]
 
 
 def mip_chains(layout: MipLayout, reads: Reads) -> list["MipChain"]:

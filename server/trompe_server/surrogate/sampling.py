@@ -233,11 +233,9 @@ class FilteredGather:
     share: Float[Tensor, "pixels 1"]
 
     def forward(self, texels: Float[Tensor, "texels 3"]) -> Float[Tensor, "pixels 3"]:
-        """See ``Gather``."""
         return self.filter.forward(self.inner.forward(texels).mul_(self.coverage)).mul_(self.share)
 
     def transpose(self, pixels: Float[Tensor, "pixels 3"]) -> Float[Tensor, "texels 3"]:
-        """See ``Gather``."""
         return self.inner.transpose(self.filter.transpose(pixels * self.share).mul_(self.coverage))
 
     @property

@@ -66,8 +66,9 @@ class ViewBatch:
     sub_pixels: "ViewBatch | None" = None
 
     def of(self, images: Shaped[Tensor, "views H W ..."]) -> Shaped[Tensor, "pixels ..."]:
-        """Values (pixels, ...) of the images of all views at the object pixels of this batch."""
-        return images[self.views.start : self.views.stop].flatten(0, 2).index_select(0, self.pixel)
+        """Values (pixels, ...) of the images of all views, on any device, at the object pixels of this batch."""
+        some = images[self.views.start : self.views.stop].to(self.pixel.device)
+        return some.flatten(0, 2).index_select(0, self.pixel)
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ class Geometry:
 
     def values(self, textures: Mapping[str, Float[Tensor, "H W 3"]]) -> Float[Tensor, "texels 3"]:
         """``texels`` of sRGB ``textures`` by name: encoded, or linear if the sampling model filters light."""
-        ordered = [textures[name] for name in self.textures]
+        ordered = [textures[name].to(self.device) for name in self.textures]
         if self.sampling.filtered == "linear":
             return self.texels([decode(texture) for texture in ordered])
         return self.texels(ordered, rounded=self.sampling.mips == "rounded")
@@ -469,12 +470,18 @@ class Surrogate:
     @cached_property
     def _level_shares(self) -> Mapping[str, Float[Tensor, " levels"]]:
         """Shares of each texture's mip levels in its reads, by weight; all of the finest for an unseen texture."""
+        return {
+            name: each / each.sum() if each.any() else torch.eye(1, len(each))[0]
+            for name, each in self.level_weights.items()
+        }
+
+    @cached_property
+    def level_weights(self) -> Mapping[str, Float[Tensor, " levels"]]:
+        """Total weight of the reads of each texture's mip levels in the pixels of all views, on the CPU."""
         geometry = self.geometry
         by_level = iter(torch.split(self._read_weights()[:, 0].cpu(), [len(level) for level in geometry.reads]))
         weights = [torch.stack([next(by_level).sum() for _ in sizes]) for sizes in geometry.layout.sizes]
-        finest = [torch.eye(1, len(each))[0] for each in weights]
-        shares = [each / each.sum() if each.any() else one for each, one in zip(weights, finest, strict=True)]
-        return dict(zip(geometry.textures, shares, strict=True))
+        return dict(zip(geometry.textures, weights, strict=True))
 
     def spread(self, pixels: Float[Tensor, "pixels 3"], batch: int) -> Float[Tensor, "texels 3"]:
         """Weighted sums of a batch's ``pixels`` at each texel read: the transpose of the texels' gathering."""

@@ -153,6 +153,12 @@ def test_an_impossible_budget_is_refused(epsilon: float, alpha: float) -> None:
         Budget(epsilon, alpha)
 
 
+@pytest.mark.parametrize("epsilon", [0.0001, 0.0039])
+def test_a_budget_of_less_than_one_level_is_refused(epsilon: float) -> None:
+    with pytest.raises(SpecError, match=f"epsilon must be at least 1/255, .*; got {epsilon}: use 0.004 or more"):
+        Budget(epsilon, epsilon)
+
+
 @pytest.mark.parametrize("epsilon_view", [0.0, -0.1, 1.1, float("nan")])
 def test_an_impossible_view_budget_is_refused(epsilon_view: float) -> None:
     with pytest.raises(SpecError, match=r"epsilon_view must be in \(0, 1\]"):

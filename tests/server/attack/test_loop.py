@@ -226,8 +226,9 @@ def test_texels_that_may_not_all_move_or_whose_images_are_bounded_move_alone(fin
 
 
 def test_an_attack_without_a_visible_texel_ends_at_once() -> None:
-    with pytest.raises(SpecError, match=r"epsilon=0.0001. Come closer by `distance`, or raise `epsilon`"):
-        run(budget=Budget(0.0001, 0.0001))
+    far = surrogate_of(SQUARE, [View(Camera(5.0, 0, 0))])
+    with pytest.raises(SpecError, match=r"epsilon=0.004. Come closer by `distance`, or raise `epsilon`"):
+        run(far, budget=Budget(0.004, 0.004))
 
 
 # The pool: each step evaluates some of the views

@@ -1,6 +1,7 @@
 """The update rules, each on a small scene and against its formula."""
 
 from itertools import pairwise
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ from hypothesis import strategies as st
 
 from tests.attack_runs import EPS, SMALL, SQUARE, mean_loss, random_state, run, steps_of
 from trompe_server.attack import AttackState, Budget, save_state, start
-from trompe_server.attack.optimiser import OPTIMISERS, ROUND, step_factor
+from trompe_server.attack.optimiser import ROUND, step_factor
 from trompe_server.surrogate import textures_of
+from trompe_shared.api import OptimiserName
 
-every_optimiser = pytest.mark.parametrize("optimiser", OPTIMISERS)
+every_optimiser = pytest.mark.parametrize("optimiser", get_args(OptimiserName))
 
 
 @every_optimiser

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
-from tests.attack_runs import surrogate_of
-from tests.surfaces import object_of, quad
+from tests.attack_runs import default_sampling, surrogate_of
+from tests.surfaces import object_of, quad, with_alpha
+from trompe_server.attack import grid_views
 from trompe_server.renderers import SailenvTarget
 from trompe_server.storage.arrays import pack_arrays
 from trompe_server.surrogate import SamplingModel, Surrogate, prepare_geometry, textures_of
@@ -37,7 +37,7 @@ from trompe_server.surrogate.tone import ToneMap, measure_tone_map
 from trompe_shared.api import SurrogateModel
 from trompe_shared.errors import SpecError
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import Object3D, encode_png, object_from_files
+from trompe_shared.object3d import Object3D
 from trompe_shared.opacity import opacity_of
 from trompe_shared.shipped import shipped_objects
 
@@ -122,7 +122,7 @@ Usual = Callable[[SurrogateModel], Calibration]
 @pytest.fixture(scope="module")
 def usual(mug: Object3D) -> Usual:
     """The calibration of the mug in ``USUAL`` for a wanted model, made once."""
-    return cache(lambda wanted: found(mug, USUAL, wanted))
+    return cache(default_sampling()(lambda wanted: found(mug, USUAL, wanted)))
 
 
 @pytest.fixture(scope="module")
@@ -192,16 +192,40 @@ def test_a_view_in_which_hardly_anything_changes_does_not_outweigh_all_others(mu
     assert fidelity.explained[0] > -1
 
 
+def grid(azimuths: int | None, elevations: int) -> list[View]:
+    return grid_views(
+        distance=0.3, elevation=(0, 50), azimuths=azimuths, elevations=elevations, background=(255, 255, 255)
+    )
+
+
 BOTH_SIDES = [View(Camera(0.4, azimuth, 10)) for azimuth in (0, 40, 180, -40, 200, 160)]
 
 
-def test_a_target_that_shows_both_sides_of_a_sheet_is_understood() -> None:
+@pytest.mark.parametrize("views", [pytest.param(BOTH_SIDES, id="few"), pytest.param(grid(None, 10), id="paper's grid")])
+def test_a_target_that_shows_both_sides_of_a_sheet_is_understood(views: Sequence[View]) -> None:
     texture = np.random.default_rng(0).integers(40, 216, (96, 96, 3), dtype=np.uint8)
     truth = SamplingModel(cull=False)
-    calibration = found(object_of(quad(texture)), KnownTarget(truth), "curve", views=BOTH_SIDES)
+    calibration = found(object_of(quad(texture)), KnownTarget(truth), "curve", views=views)
     assert calibration.sampling == truth
     assert len(calibration.fidelity.correlation) == 4
     assert min(calibration.fidelity.correlation) > 0.98
+
+
+@pytest.mark.parametrize(("azimuths", "elevations"), [(None, 10), (None, 8), (3, 13), (5, 5), (8, 8), (12, 1)])
+def test_trial_views_look_from_all_sides_of_a_grid(mug: Object3D, azimuths: int | None, elevations: int) -> None:
+    trial: list[View] = []
+
+    def ask(_: Object3D, views: Sequence[View]) -> Image8:
+        trial.extend(views)
+        return np.zeros((len(views), *SIZE, 3), np.uint8)
+
+    views = grid(azimuths, elevations)
+    calibrate(mug, views, ask(mug, views), ask, wanted="diffuse", generator=np.random.default_rng(0))
+    cameras = [view.camera for view in trial[len(views) :]]
+    assert len(cameras) == TRIAL_VIEWS
+    around = sorted(camera.azimuth % 360 for camera in cameras)
+    assert np.diff([*around, around[0] + 360]).max() <= 180
+    assert np.ptp([camera.elevation for camera in cameras]) >= (20 if elevations > 1 else 0)
 
 
 def test_what_changes_where_the_surrogate_sees_no_object_counts_against_it(mug: Object3D, usual: Usual) -> None:
@@ -272,6 +296,7 @@ def test_a_bias_between_those_that_are_tried_is_read_off_a_parabola() -> None:
     assert found.but(bias=0.0) == SamplingModel()
 
 
+@default_sampling()
 def test_two_probes_a_view_are_taken_where_they_are_good_enough(mug: Object3D, usual: Usual) -> None:
     asked = Asked(USUAL)
     calibration = found(mug, asked, "auto")
@@ -386,6 +411,7 @@ def test_noise_that_all_images_of_a_view_share_disturbs_no_fidelity(mug: Object3
 
 
 @pytest.mark.parametrize("wanted", ["diffuse", "calibrated", "curve"])
+@default_sampling()
 def test_the_model_that_was_asked_for_is_taken_whatever_it_is_worth(mug: Object3D, wanted: SurrogateModel) -> None:
     asked = Asked(KnownTarget(SamplingModel(), affine=wanted == "diffuse"))
     calibration = found(mug, asked, wanted)
@@ -405,11 +431,12 @@ def test_the_probes_are_the_targets_own_images_in_the_order_of_greys_and_views(m
         assert (probe == USUAL(painted_grey(mug, grey), VIEWS)).all()
 
 
-def test_one_view_is_enough(mug: Object3D) -> None:
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_views_are_enough_and_all_are_tried(mug: Object3D, count: int) -> None:
     asked = Asked(USUAL)
-    calibration = found(mug, asked, "curve", views=VIEWS[:1])
-    assert calibration.renders == asked.images - 1
-    assert len(calibration.fidelity.error) <= 1
+    calibration = found(mug, asked, "curve", views=VIEWS[:count])
+    assert calibration.renders == asked.images - count
+    assert len(calibration.fidelity.error) == count
     assert calibration.fidelity.good_enough
 
 
@@ -468,8 +495,7 @@ def test_painting_grey_or_noise_keeps_the_object(mug: Object3D) -> None:
 def test_painting_grey_or_noise_keeps_what_is_cut_out() -> None:
     opacity = (np.indices((24, 40)).sum(axis=0) % 5 * 60).astype(np.uint8)
     obj = object_of(quad(np.full((24, 40, 3), 100, np.uint8)))
-    picture = Image.fromarray(np.dstack([obj.textures["m0.png"], opacity]))
-    obj = object_from_files({**obj.files, "m0.png": encode_png(picture)})
+    obj = with_alpha(obj, "m0.png", opacity)
     for painted in (painted_grey(obj, 77), painted_noise(obj, np.random.default_rng(3))):
         kept = opacity_of(painted.files["m0.png"])
         assert kept is not None

@@ -36,7 +36,7 @@ MODELS = {
 }
 
 
-@pytest.fixture(params=SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+@pytest.fixture(scope="module", params=SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
 def obj(request: pytest.FixtureRequest) -> Object3D:
     """Two squares, one with a texture of the size in question."""
     random = np.random.default_rng(0)
@@ -44,7 +44,7 @@ def obj(request: pytest.FixtureRequest) -> Object3D:
     return object_of(quad(images[0]), quad(images[1], z=-0.1))
 
 
-@pytest.fixture(params=MODELS.values(), ids=list(MODELS))
+@pytest.fixture(scope="module", params=MODELS.values(), ids=list(MODELS))
 def surrogate(request: pytest.FixtureRequest, obj: Object3D) -> Surrogate:
     return surrogate_of(obj, VIEWS, size=(48, 48), sampling=request.param)
 

@@ -23,7 +23,7 @@ from trompe_shared.object3d import Object3D
 
 SIZE = (64, 64)
 VIEWS = [
-    View(Camera(0.16 + 0.002 * k, 30.0 * k, 5.0 * k - 25), Light(10.0 * k, 50), (20 * k, 0, 255)) for k in range(12)
+    View(Camera(0.16 + 0.004 * k, 60.0 * k, 10.0 * k - 25), Light(20.0 * k, 50), (40 * k, 0, 255)) for k in range(6)
 ]
 MODELS = [
     pytest.param(SamplingModel(), id="encoded"),

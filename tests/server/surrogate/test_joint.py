@@ -10,6 +10,7 @@ import torch
 from tests.attack_runs import LABEL, SQUARE, SURROGATE, VIEWS, objective_of, random_state, run, surrogate_of
 from trompe_server.attack import Backgrounds, Budget, Goal, movable
 from trompe_server.surrogate import AnySurrogate, SamplingModel, Surrogate, diffuse_surrogate, joined, textures_of
+from trompe_shared.geometry import Camera, View
 
 LINEAR = SamplingModel(filtered="linear", samples="centre", lod="area")
 
@@ -51,6 +52,15 @@ def test_parts_with_one_geometry_share_their_texels(parts: Sequence[Surrogate]) 
         part, first = parts[views.start // 12], views.start // 12 * 12
         own = part.batches.index(range(views.start - first, views.stop - first))
         torch.testing.assert_close(joint.render(joint.texels(textures), batch), part.render(part.texels(textures), own))
+
+
+def test_parts_count_for_a_footprint_as_much_as_they_see_of_the_texture() -> None:
+    """The second square of two, which the first part does not see."""
+    others = [View(Camera(distance, 0, 0, centre=(0.0, 0.0, 9.0))) for distance in (0.6, 0.9)]
+    joint, whole = joined([SURROGATE, surrogate_of(SQUARE, others)]), surrogate_of(SQUARE, [*VIEWS, *others])
+    assert joint.footprint == pytest.approx(whole.footprint)
+    assert joint.footprint["m1.png"] > 1.5
+    assert joined([SURROGATE, SURROGATE]).footprint["m1.png"] == 1
 
 
 def test_one_part_is_itself_and_twice_the_same_takes_the_same_steps(parts: Sequence[Surrogate]) -> None:

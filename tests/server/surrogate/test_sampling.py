@@ -8,16 +8,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
-from tests.surfaces import object_of, quad
+from tests.surfaces import object_of, quad, with_alpha
 from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate import pyramid as module
 from trompe_server.surrogate.pyramid import mip_chains, mip_layout, read_texels
 from trompe_server.surrogate.sampling import Gather
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, View
-from trompe_shared.object3d import Object3D, encode_png, object_from_files
+from trompe_shared.object3d import Object3D
 
 Image8 = NDArray[np.uint8]
 MODELS = [
@@ -220,19 +219,12 @@ def test_two_repetitions_look_like_the_texture_twice() -> None:
     torch.testing.assert_close(repeated, twice, atol=2e-3, rtol=0)
 
 
-def cut(obj: Object3D, name: str, opacity: Image8) -> Object3D:
-    """``obj`` with an alpha channel (H, W), of the texture's size, in one of its albedo files."""
-    picture = Image.fromarray(obj.textures[name])
-    picture.putalpha(Image.fromarray(opacity))
-    return object_from_files({**obj.files, name: encode_png(picture)})
-
-
 @pytest.mark.parametrize("model", MODELS, ids=repr)
 def test_where_alpha_is_below_one_half_what_lies_behind_is_read(model: SamplingModel) -> None:
     front, back = quad(np.full((64, 64, 3), 50, np.uint8), z=0.02), quad(np.full((8, 8, 3), 150, np.uint8))
     opacity = np.full((64, 64), 255, np.uint8)
     opacity[:, :32] = 0
-    obj, views = cut(object_of(front, back), "m0.png", opacity), [View(Camera(0.5, 0, 0))]
+    obj, views = with_alpha(object_of(front, back), "m0.png", opacity), [View(Camera(0.5, 0, 0))]
     geometry, _ = reading(obj, model, views)
     values = read_values(obj, model, views)[0][:, 0]
     left, right = (
@@ -245,7 +237,7 @@ def test_where_alpha_is_below_one_half_what_lies_behind_is_read(model: SamplingM
 
 def test_a_sheet_that_is_all_cut_out_leaves_every_number_as_if_it_were_not_there() -> None:
     back, sheet = quad(noise(16, 16)), quad(noise(8, 8), z=0.02)
-    with_it, alone = cut(object_of(back, sheet), "m1.png", np.zeros((8, 8), np.uint8)), object_of(back)
+    with_it, alone = with_alpha(object_of(back, sheet), "m1.png", np.zeros((8, 8), np.uint8)), object_of(back)
     first, second = (reading(obj)[0].batches[0] for obj in (with_it, alone))
     assert torch.equal(first.pixel, second.pixel)
     assert all(
@@ -260,7 +252,7 @@ def test_alpha_is_read_at_the_level_that_the_pixel_reads() -> None:
     views = [View(Camera(2.0, 0, 0))]
     whole, striped, faint = (
         len(reading(each, views=views)[0].batches[0].pixel)
-        for each in (obj, cut(obj, "m0.png", opacity), cut(obj, "m0.png", 255 - opacity))
+        for each in (obj, with_alpha(obj, "m0.png", opacity), with_alpha(obj, "m0.png", 255 - opacity))
     )
     assert striped == whole
     assert faint == 0
