@@ -84,9 +84,13 @@ def new_key() -> str:
 
 def submit(spec: JobSpec | JudgementSpec, *, key: str) -> Request[Job]:
     """Submit a job; the same ``key`` makes one job. The queue's options of a plain spec have their defaults."""
-    headers = {"Idempotency-Key": key}
     path = "/v1/judgements" if isinstance(spec, JudgementSpec) else "/v1/jobs"
-    return Request("POST", path, _reader(Job), headers=headers, json=spec.model_dump_json())
+    return Request("POST", path, _reader(Job), headers=_keyed(key), json=spec.model_dump_json())
+
+
+def _keyed(key: str) -> dict[str, str]:
+    """The header of an idempotency key. Headers are ASCII: other keys are percent-encoded."""
+    return {"Idempotency-Key": key if key.isascii() else quote(key)}
 
 
 def jobs(wanted: list[tuple[str, str]], *, limit: int, cursor: str | None = None) -> Request[JobList]:
@@ -103,8 +107,7 @@ def cancel(job_id: str) -> Request[Job]:
 
 
 def retry(job_id: str, *, key: str) -> Request[Job]:
-    headers = {"Idempotency-Key": key}
-    return Request("POST", f"{_job_path(job_id)}/retry", _reader(Job), headers=headers, job_id=job_id)
+    return Request("POST", f"{_job_path(job_id)}/retry", _reader(Job), headers=_keyed(key), job_id=job_id)
 
 
 def delete(job_id: str) -> Request[None]:

@@ -5,26 +5,14 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from trompe_client._job import JobHandle
 from trompe_client._progress import Show
 from trompe_shared.api import Event, JobSpec, Progress, Result
 from trompe_shared.errors import SpecError
 
-__all__ = ["TRACKERS", "MlflowRun", "Run", "tracked"]
-
-
-class Run(Protocol):
-    """The record of one job in a tracker."""
-
-    def progress(self, progress: Progress) -> None:
-        """Log a point of the curves; a step's second report changes nothing."""
-        ...
-
-    def end(self, result: Result | None, folder: Path | None = None) -> None:
-        """Log the figures and the files in ``folder``, and end the run; without a ``result`` it has failed."""
-        ...
+__all__ = ["TRACKERS", "MlflowRun", "tracked"]
 
 
 class MlflowRun:
@@ -47,7 +35,7 @@ class MlflowRun:
             self._client.log_param(self._id, key, str(value)[:LONGEST])
 
     def progress(self, progress: Progress) -> None:
-        """Log loss and share of fooled views of a new step."""
+        """Log loss and share of fooled views of a new step; a step's second report changes nothing."""
         if progress.step is None or progress.step <= self._step:
             return
         self._step = progress.step
@@ -56,7 +44,7 @@ class MlflowRun:
                 self._client.log_metric(self._id, key, value, step=progress.step)
 
     def end(self, result: Result | None, folder: Path | None = None) -> None:
-        """Log the numbers of the result and the files, and end the run."""
+        """Log the numbers and the files in ``folder``, and end the run; without a ``result`` it has failed."""
         for key, value in _flat({} if result is None else result.model_dump(mode="json", exclude={"spec"})):
             if isinstance(value, int | float):
                 self._client.log_metric(self._id, key, value)

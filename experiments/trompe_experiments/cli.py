@@ -15,9 +15,10 @@ from trompe_client.cli.output import console, say
 from trompe_client.tracking import TRACKERS
 from trompe_experiments.about import estimated_seconds, in_words, write_about
 from trompe_experiments.design import experiment_file, load_experiment, shipped_experiments
-from trompe_experiments.plan import Plan, plan_experiment
+from trompe_experiments.plan import Plan, plan_experiment, word
 from trompe_experiments.service import Service
-from trompe_shared.api import JudgementSpec
+from trompe_shared.api import Job, JudgementSpec
+from trompe_shared.comparison import differing_options
 
 if TYPE_CHECKING:
     from trompe_experiments.table import ResultRow
@@ -111,16 +112,28 @@ def _on_server(found: Service, name: str) -> list["ResultRow"]:
     from trompe_experiments.table import ResultRow, RowId
 
     rows = []
-    for job in found.jobs(name):
-        if isinstance(job.spec, JudgementSpec):
-            continue
-        place = RowId(experiment=name, key=job.id)
+    jobs = [job for job in found.jobs(name) if not isinstance(job.spec, JudgementSpec)][::-1]
+    shown = differing_options([(job.attack.object, job.attack.options()) for job in jobs])
+    for job in jobs:
+        spec, own = job.attack, job.names
+        place = RowId(experiment=name, key=job.id, configuration=_configuration(job, shown))
+        told: dict[str, Any] = {"state": job.state.value, "job": job.id, "object": own.get(spec.object, spec.object)}
         if job.state.final and "result.json" in job.artifacts:
-            rows.append(ResultRow.of_result(place, found.result(job.id), state=job.state.value, job=job.id))
+            rows.append(ResultRow.of_result(place, found.result(job.id), **told))
         else:
+            told["classifier"] = own.get(spec.victim.classifier, spec.victim.classifier)
             said = job.error or f"{job.progress.phase}, {job.progress.fraction:.0%}"
-            rows.append(ResultRow.of_spec(place, job.spec, state=job.state.value, job=job.id, error=said))
-    return rows[::-1]
+            rows.append(ResultRow.of_spec(place, spec, error=said, **told))
+    return rows
+
+
+def _configuration(job: Job, options: Sequence[str]) -> str:
+    """The ``options`` of a job but its seed, stored things by their names."""
+    asked = job.attack.options()
+    text = ", ".join(f"{option} {word(asked[option])}" for option in options if option != "seed")
+    for stored, name in job.names.items():
+        text = text.replace(stored, name)
+    return text
 
 
 @experiment.command()

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Final, Literal
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from trompe_shared.api import OPTIONS, JudgementRequest
+from trompe_shared.api import ADVERSARIAL, OPTIONS, JudgementRequest
 from trompe_shared.errors import SpecError
 from trompe_shared.faults import Fault, faults_of
 from trompe_shared.presets import with_preset
@@ -96,12 +96,16 @@ def _grid(options: Options) -> Options:
 
 
 def _judgement(options: Options) -> Options:
-    """Checked as those of a judgement of any two objects."""
+    """Checked as those of a judgement of any two objects by one network in one renderer."""
     known = _known(options, allowed=JUDGED, elsewhere=OF_JOBS)
     try:
-        JudgementRequest.of("mug", "mug", label="mug", **known)
+        asked = JudgementRequest.of("mug", "mug", label="mug", **known)
     except SpecError as error:
         raise ValueError(str(error)) from error
+    if asked.suite is not None or len(asked.renderers) > 1:
+        raise ValueError(
+            "a judgement here has one network and one renderer: leave out `suite`, name one of `renderers`"
+        )
     return known
 
 
@@ -144,6 +148,11 @@ class Experiment(_Schema):
     )
     artifacts: list[str] = Field(default_factory=list, description="files of each job to keep; * and ? match")
     folder: Path = Path()
+
+    @property
+    def kept(self) -> list[str]:
+        """Patterns of the files to keep: ``artifacts``, and with a judgement the painted objects."""
+        return self.artifacts + ([f"*{ADVERSARIAL}.zip"] if self.judgement is not None else [])
 
 
 def shipped_experiments() -> dict[str, Path]:

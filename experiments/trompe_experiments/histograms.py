@@ -39,14 +39,14 @@ def prediction_histograms(rows: Sequence[ResultRow], predictions: Sequence[Predi
 
 
 def _bars(axes: Axes, predictions: Sequence[PredictionRow]) -> None:
-    counts = {
-        name: {p.moment: p.count for p in group} for name, group in grouped(predictions, lambda p: _short(p)).items()
-    }
-    own = list(dict.fromkeys(_short(p) for p in predictions if p.true_class))
-    others = sorted((name for name in counts if name not in own), key=lambda name: -sum(counts[name].values()))
-    shown = [*own, *others[:TOP]]
-    rest = {moment: sum(counts[name].get(moment, 0) for name in others[TOP:]) for moment in ("before", "after")}
-    bars = [(name + (" (true class)" if name in own else ""), counts[name]) for name in shown]
+    names = {p.class_index: _short(p) for p in predictions}  # two classes may share a name
+    by_class = grouped(predictions, lambda p: p.class_index)
+    counts = {index: {p.moment: p.count for p in group} for index, group in by_class.items()}
+    own = list(dict.fromkeys(p.class_index for p in predictions if p.true_class))
+    others = sorted((index for index in counts if index not in own), key=lambda index: -sum(counts[index].values()))
+    rest = {moment: sum(counts[index].get(moment, 0) for index in others[TOP:]) for moment in ("before", "after")}
+    bars = [(f"{names[index]} (true class)", counts[index]) for index in own]
+    bars += [(names[index], counts[index]) for index in others[:TOP]]
     bars += [(f"{len(others) - TOP} others", rest)] if len(others) > TOP else []
     for k, (_, count) in enumerate(bars):
         axes.barh(k - 0.2, count.get("before", 0), height=0.38, color=BLUE)

@@ -15,7 +15,7 @@ from trompe_experiments.plan import Plan, Row
 from trompe_experiments.service import Service
 from trompe_experiments.table import RowId, job_key, read_table, write_table
 from trompe_server.formats import import_file
-from trompe_shared.api import ADVERSARIAL, AS_RENDERED, JobRequest, JudgementRequest, Manifest, levels_within
+from trompe_shared.api import ADVERSARIAL, AS_RENDERED, JobRequest, Manifest, levels_within
 from trompe_shared.comparison import grouped
 from trompe_shared.errors import SpecError
 from trompe_shared.object3d import Object3D, load_object
@@ -23,7 +23,7 @@ from trompe_shared.shipped import shipped_objects
 
 JUDGEMENTS: Final = "judgements.csv"
 NOTHING, NOISE = "no change", "noise"
-"""What is judged beside the painted objects: the object itself, and random noise within the budget."""
+"""What is judged beside the painted objects: the object itself, and random noise within the first job's epsilon."""
 
 HALF_SIZE, JPEG = "half size", "JPEG 30"
 
@@ -80,8 +80,8 @@ def judge_all(
 ) -> list[JudgedRow]:
     """Judge all painted objects in ``folder``, and write the table. Rows of equal judgements are kept.
 
-    seconds: of each job, by key. show: gets a line before each judgement. Raises ``ClientError``, and ``SpecError``
-    for a judgement without figures.
+    seconds: of each job, by key. show: gets a line before each judgement, and for each painting that is missing.
+    Raises ``ClientError``, and ``SpecError`` for a judgement without figures.
     """
     path, options = folder / JUDGEMENTS, json.dumps(plan.experiment.judgement, sort_keys=True)
     known = {row.key: row for row in read_table(path, JudgedRow, optional=True)}
@@ -90,6 +90,9 @@ def judge_all(
         for place, after in _judged(own, folder):
             key = job_key(place.experiment, own[0].request.spec(), place.key, options)
             if key not in known:
+                if after is None:
+                    show(f"no painting of {name}, {place.configuration} in {str(folder)!r}")
+                    continue
                 show(f"judging {name}, {place.configuration}")
                 manifest = _judgement(plan, own[0], after, service, key=key)
                 known[key] = JudgedRow.of(place, name, manifest, seconds.get(place.key))
@@ -109,16 +112,16 @@ def noised(obj: Object3D, epsilon: float, *, seed: int) -> Object3D:
     return obj.with_textures({name: noisy(image) for name, image in obj.textures.items()})
 
 
-def _judged(rows: Sequence[Row], folder: Path) -> Iterator[tuple[RowId, Upload | str]]:
-    """What to judge of one object: the object itself, with noise, and painted by each job that has a painting."""
+def _judged(rows: Sequence[Row], folder: Path) -> Iterator[tuple[RowId, Upload | str | None]]:
+    """What to judge of one object: the object itself, with noise, and painted by each job; ``None`` without a file."""
     first = rows[0]
     given, request = first.attack.options["object"], first.request
     for case in (NOTHING, NOISE):
         place = first.place.model_copy(update={"case": case, "configuration": case, "key": f"{first.key} {case}"})
         yield place, given if case == NOTHING else _noise(given, request)
     for row in rows:
-        for file in sorted((folder / "jobs" / row.key).glob(f"*{ADVERSARIAL}.zip")):
-            yield row.place, Upload(file.name, file)
+        file = min((folder / "jobs" / row.key).glob(f"*{ADVERSARIAL}.zip"), default=None)
+        yield row.place, None if file is None else Upload(file.name, file)
 
 
 def _noise(given: Upload | str, request: JobRequest) -> Upload:
@@ -130,22 +133,11 @@ def _noise(given: Upload | str, request: JobRequest) -> Upload:
 
 
 def _judgement(plan: Plan, row: Row, after: Upload | str, service: Service, *, key: str) -> Manifest:
-    """Judge ``after`` as the jobs of its object were asked to: by their network, distance, elevation, background."""
+    """Judge ``after`` as the jobs of its object were asked to; see ``Row.judgement``."""
 
     def stored(given: Upload | str) -> str:
         return service.store(given) if isinstance(given, Upload) else given
 
-    asked = row.request
-    request = JudgementRequest.of(
-        stored(row.attack.options["object"]),
-        stored(after),
-        label=asked.goal.label,
-        networks=[stored(row.attack.options.get("classifier", asked.victim.classifier))],
-        epsilon=asked.paint.epsilon,
-        distance=asked.views.distance,
-        elevation=asked.views.elevation,
-        background=asked.views.background[0],
-        priority="sweep",
-        **(plan.experiment.judgement or {}),
-    )
-    return service.judge(request, key=key)
+    before, network = stored(row.attack.options["object"]), stored(row.network)
+    options = plan.experiment.judgement or {}
+    return service.judge(row.judgement(options, before=before, after=stored(after), network=network), key=key)

@@ -13,7 +13,7 @@ from matplotlib.ticker import LogFormatter
 from trompe_experiments.markdown import figure_words, markdown_table
 from trompe_experiments.style import GREY, INK, Drawing, drawing, look
 from trompe_experiments.table import ResultRow
-from trompe_shared.comparison import Job, Mean, charged, grouped, means_of, pareto_front
+from trompe_shared.comparison import PROBED, Job, Mean, charged, grouped, means_of, pareto_front
 
 Cost = Literal["seconds", "evaluations", "delta_e", "dissimilarity"]
 Place = tuple[str, str]
@@ -52,7 +52,7 @@ def _place(row: ResultRow) -> Place:
 
 def _job(row: ResultRow, cost: float, drop: float) -> Job[Place]:
     calibration = (row.probe_renders or 0, row.calibrate_s or 0.0)
-    same_probes = (row.object, row.surrogate_model, row.views, row.seed)
+    same_probes = (row.object, row.image_size, row.views, row.seed, *(getattr(row, name) for name in PROBED))
     return Job(row.object, _place(row), row.seed, cost, drop, calibration, same_probes)
 
 

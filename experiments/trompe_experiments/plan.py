@@ -1,17 +1,20 @@
 """Jobs of an experiment, each with a key that is the same at every run."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
+from pydantic import BaseModel
+
 from trompe_client._plan import AttackPlan, Read, Upload, plan_attack, source_of
 from trompe_experiments.asset_objects import asset_objects
 from trompe_experiments.design import AssetsFolder, Experiment, expanded
 from trompe_experiments.table import RowId, job_key
-from trompe_shared.api import JobRequest
+from trompe_shared.api import JobRequest, JudgementRequest
+from trompe_shared.comparison import grouped
 from trompe_shared.errors import ObjectError, SpecError
 from trompe_shared.local_files import CLASSIFIER_SUFFIXES, LOOKED_UP, PICTURE_SUFFIXES
 from trompe_shared.presets import with_preset
@@ -42,6 +45,28 @@ class Row:
         """The job, with file names in place of files."""
         return self.attack.request({})
 
+    @property
+    def network(self) -> Upload | str:
+        """The attacked network."""
+        found: Upload | str = self.attack.options.get("classifier", self.request.victim.classifier)
+        return found
+
+    def judgement(self, options: Options, *, before: str, after: str, network: str) -> JudgementRequest:
+        """A judgement with the job's label, budget, cameras and background. Raises ``SpecError``."""
+        asked = self.request
+        return JudgementRequest.of(
+            before,
+            after,
+            label=asked.goal.label,
+            networks=[network],
+            epsilon=asked.paint.epsilon,
+            distance=asked.views.distance,
+            elevation=asked.views.elevation,
+            background=asked.views.background[0],
+            priority="sweep",
+            **options,
+        )
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -71,20 +96,40 @@ def plan_experiment(experiment: Experiment) -> Plan:
         series = " x ".join(grid) if len(experiment.grid) > 1 else ""
         combinations = [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
         for name, chosen, (case, variation) in product(objects, combinations, cases.items()):
-            configuration = ", ".join([*([case] if case else []), *(f"{k} {_word(v)}" for k, v in chosen.items())])
+            configuration = ", ".join([*([case] if case else []), *(f"{k} {word(v)}" for k, v in chosen.items())])
             place = RowId(experiment=experiment.name, key="", series=series, case=case, configuration=configuration)
             options = dict(experiment.base) | objects[name] | with_preset(chosen) | dict(variation)
             seeds = options.pop("seeds", experiment.seeds)
             rows += [_row(place, name, options | {"seed": seed}, files) for seed in seeds]
+    if experiment.judgement is not None:
+        for name, own in grouped(rows, lambda row: row.object).items():
+            _check_judgement(name, own, experiment.judgement)
     return Plan(experiment, tuple(rows))
 
 
-def _word(value: Any) -> str:
+def _check_judgement(name: str, rows: Sequence[Row], options: Options) -> None:
+    """Raises ``SpecError`` if the jobs of an object cannot be judged, all by one judgement."""
+    if len({row.network for row in rows}) > 1:
+        raise SpecError(
+            f"The judgement of {name} needs one `classifier` for all its jobs: give it in `base` or of the object."
+        )
+    given = rows[0].attack.options["object"]
+    if not isinstance(given, Upload) and given not in shipped_objects():
+        raise SpecError(f"A judgement needs the file of {name} for its noise: give it as `file`.")
+    try:
+        rows[0].judgement(options, before=name, after=name, network="tiny")
+    except SpecError as error:
+        raise SpecError(f"The judgement of {name}: {error}") from error
+
+
+def word(value: Any) -> str:
     """A value for legends."""
     if value is None:
         return "none"
-    if isinstance(value, list):
-        return " + ".join(map(_word, value))
+    if isinstance(value, list | tuple):
+        return " + ".join(map(word, value))
+    if isinstance(value, BaseModel):
+        return str(value.model_dump(exclude_defaults=True))
     if isinstance(value, float):
         return f"{value:.3g}"
     return name_of(str(value))
@@ -148,8 +193,8 @@ class _Files:
         self.sha256 = cache(Upload.sha256)
 
     def path(self, text: str) -> Path:
-        """A path of the experiment's file, relative to its folder."""
-        return self._folder / expanded(text)
+        """A path of the experiment's file: relative to its folder, after a variable to the working folder."""
+        return (Path.cwd() if text.startswith("$") else self._folder) / expanded(text)
 
     def _read(self, kind: str, source: str | Path) -> Upload | str:
         """See ``trompe_client._plan.Read``. Objects are names unless they are paths."""

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
-from trompe_client.tracking import Run
+from trompe_client.tracking import MlflowRun
 from trompe_experiments.about import in_words
 from trompe_experiments.plan import Row
 from trompe_experiments.run import Finished, Show
@@ -72,8 +72,8 @@ class _Display:
 class Tracked:
     """A display whose jobs are runs of a tracker too. Finished jobs of an earlier run are not logged again."""
 
-    def __init__(self, display: Show, new_run: Callable[[str, JobSpec], Run]) -> None:
-        self._display, self._new_run, self._runs = display, new_run, dict[str, Run]()
+    def __init__(self, display: Show, new_run: Callable[[str, JobSpec], MlflowRun]) -> None:
+        self._display, self._new_run, self._runs = display, new_run, dict[str, MlflowRun]()
 
     def begin(self, *, total: int, done: int) -> None:
         self._display.begin(total=total, done=done)
@@ -87,7 +87,7 @@ class Tracked:
         del self._runs[row.key]
         self._display.end(row, finished)
 
-    def _run(self, row: Row) -> Run:
+    def _run(self, row: Row) -> MlflowRun:
         if row.key not in self._runs:
             name = "  ".join(filter(None, (row.place.experiment, row.object, row.place.configuration)))
             self._runs[row.key] = self._new_run(name, row.request)

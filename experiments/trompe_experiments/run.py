@@ -14,7 +14,7 @@ from typing import Final, Protocol
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict
 
-from trompe_client._errors import APIError
+from trompe_client._errors import BadRequest, Conflict, NotFound
 from trompe_client._plan import Upload
 from trompe_experiments.plan import Plan, Row, name_of
 from trompe_experiments.service import Service
@@ -80,8 +80,9 @@ class Show(Protocol):
 def run_experiment(plan: Plan, service: Service, folder: Path, *, show: Show, retry_failed: bool = False) -> Rows:
     """Run the jobs of ``plan`` without a result in ``folder``, and write the tables; returns all rows of the results.
 
-    Failed jobs are submitted again only with ``retry_failed``. A stopped run continues at the next call. Raises
-    ``ServerUnreachable``, and ``SpecError`` while another run uses ``folder``.
+    Failed jobs are submitted again only with ``retry_failed``. A stopped run continues at the next call. A job that the
+    server refuses becomes a row; raises ``ClientError`` for any other fault, and ``SpecError`` while another run uses
+    ``folder``.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -118,11 +119,11 @@ def _follow(
                 if upload not in ids:
                     ids[upload] = service.store(upload)
             job = service.submit(row.attack.request(ids), _submission_key(row, known.get(row.key)))
-        except APIError as error:
+        except (BadRequest, NotFound, Conflict) as error:
             yield row, Finished(state=REFUSED, job="", error=str(error)), {}
             continue
         if job.state.final:
-            yield row, *_fetch(row, job, service, plan.experiment.artifacts)
+            yield row, *_fetch(row, job, service, plan.experiment.kept)
         else:
             waiting[row.key] = row, job
     while waiting:
@@ -131,7 +132,7 @@ def _follow(
             job = service.job(before.id)
             show.look(row, job)
             if job.state.final:
-                yield row, *_fetch(row, job, service, plan.experiment.artifacts)
+                yield row, *_fetch(row, job, service, plan.experiment.kept)
             else:
                 waiting[key] = row, job  # behind the jobs not polled yet
         if waiting:
@@ -217,12 +218,12 @@ def write_tables(plan: Plan, known: Mapping[str, Finished], folder: Path) -> Row
 
 
 def _result_row(row: Row, finished: Finished) -> ResultRow:
+    name = {"object": row.object}
     if finished.row is not None:
-        kept: ResultRow = finished.row.model_copy(update=row.place.model_dump())
+        kept: ResultRow = finished.row.model_copy(update=row.place.model_dump() | name)
         return kept
+    ended = name | {"state": finished.state, "job": finished.job}
     if finished.result is not None:
-        return ResultRow.of_result(row.place, finished.result, state=finished.state, job=finished.job)
-    names = {"object": row.object, "classifier": name_of(row.request.victim.classifier)}
-    return ResultRow.of_spec(
-        row.place, row.request.spec(), state=finished.state, job=finished.job, error=finished.error, **names
-    )
+        return ResultRow.of_result(row.place, finished.result, **ended)
+    classifier = name_of(row.request.victim.classifier)
+    return ResultRow.of_spec(row.place, row.request.spec(), error=finished.error, classifier=classifier, **ended)

@@ -1,7 +1,6 @@
 """Results on the terminal: one experiment, or two compared."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import stdev
 from typing import Final
@@ -19,6 +18,8 @@ FIGURES: Final = ("target_a_drop", "held_out_a_drop", "transfer_gap", "texels_al
 CHANGED: Final = 0.1
 """Smallest difference of ``a_drop`` that is counted."""
 Setting = tuple[str, ...]
+Pair = tuple[list[ResultRow], list[ResultRow]]
+"""Rows of one setting in two experiments."""
 
 
 def read_results(folder: str | Path) -> list[ResultRow]:
@@ -45,23 +46,7 @@ def failures(rows: Iterable[ResultRow]) -> list[str]:
     return [f"{row.object}  {row.configuration}  seed {row.seed}: {row.state}: {row.error}" for row in failed]
 
 
-@dataclass(frozen=True)
-class Difference:
-    """One setting in two experiments: means of the figures over seeds; n.a. is ``None``."""
-
-    object: str
-    classifier: str
-    configuration: str
-    before: Mapping[str, float | None]
-    after: Mapping[str, float | None]
-
-    def change(self, figure: str) -> float | None:
-        """After minus before."""
-        old, new = self.before[figure], self.after[figure]
-        return None if old is None or new is None else new - old
-
-
-def compared(first: str | Path, second: str | Path) -> list[Difference]:
+def compared(first: str | Path, second: str | Path) -> list[Pair]:
     """The settings that two experiments share. Raises ``SpecError`` if there are none."""
     found = differences(read_results(first), read_results(second))
     if not found:
@@ -72,29 +57,26 @@ def compared(first: str | Path, second: str | Path) -> list[Difference]:
     return found
 
 
-def differences(first: Sequence[ResultRow], second: Sequence[ResultRow]) -> list[Difference]:
+def differences(first: Sequence[ResultRow], second: Sequence[ResultRow]) -> list[Pair]:
     """The settings in both, in the order of the first."""
     old, new = grouped(first, _setting), grouped(second, _setting)
-    return [
-        Difference(
-            rows[0].object,
-            rows[0].classifier,
-            rows[0].configuration,
-            {figure: _average(rows, figure) for figure in FIGURES},
-            {figure: _average(new[setting], figure) for figure in FIGURES},
-        )
-        for setting, rows in old.items()
-        if setting in new
-    ]
+    return [(rows, new[setting]) for setting, rows in old.items() if setting in new]
 
 
-def comparison_table(found: Sequence[Difference]) -> RenderableType:
+def change(pair: Pair, figure: str) -> float | None:
+    """Mean of a figure after minus before; ``None`` if either is n.a."""
+    before, after = (_average(rows, figure) for rows in pair)
+    return None if before is None or after is None else after - before
+
+
+def comparison_table(found: Sequence[Pair]) -> RenderableType:
     """A line for each shared setting with all figures before and after; then a summary."""
     table = _table([figure.replace("_a_drop", " A_drop").replace("_", " ") for figure in FIGURES])
-    for each in found:
-        cells = [f"{figure_words(each.before[name])} > {figure_words(each.after[name])}" for name in FIGURES]
-        table.add_row(each.object, each.classifier, each.configuration, *cells)
-    changes = [change for each in found if (change := each.change("target_a_drop")) is not None]
+    for before, after in found:
+        first = before[0]
+        cells = [f"{_mean(before, name)} > {_mean(after, name)}" for name in FIGURES]
+        table.add_row(first.object, first.classifier, first.configuration, *cells)
+    changes = [changed for pair in found if (changed := change(pair, "target_a_drop")) is not None]
     larger, smaller = sum(c >= CHANGED for c in changes), sum(c <= -CHANGED for c in changes)
     summary = f"target A_drop: {larger} of {len(changes)} larger by {CHANGED:g} or more, {smaller} smaller"
     if changes:

@@ -31,6 +31,7 @@ ATTACK: Final[dict[str, Any]] = {"steps": 25, "pool": 80, "held_out": 30, "backg
 """Options of the attacks."""
 ARCHIVE: Final = f"{ADVERSARIAL}.zip"
 """End of the name of an attack's archive."""
+LABELS: Final = "labels.csv"
 COLUMNS: Final = (
     *("file", "split", "label", "object", "variant", "epsilon"),
     *("distance", "azimuth", "elevation", "light_azimuth", "light_elevation"),
@@ -82,7 +83,8 @@ def export_variants(
 
     ``objects/NAME-SEED.zip`` are SAILenv archives; ``train/LABEL/`` and ``test/LABEL/`` hold pictures of the variants
     and of the unpainted objects, rendered by ``target`` from different random cameras and lights; ``labels.csv`` lists
-    the pictures. An object that the network does not recognise has no variants. Raises ``SpecError``.
+    the pictures, and those that it listed before are deleted. An object that the network does not recognise has no
+    variants. Raises ``SpecError``.
     """
     unknown = sorted(set(names) - set(shipped_objects()))
     if unknown:
@@ -97,13 +99,25 @@ def export_variants(
     )
     rows = run_experiment(plan_experiment(experiment), service, out, show=show)
     (out / "objects").mkdir(exist_ok=True)
-    with (out / "labels.csv").open("w", newline="", encoding="utf-8") as file:
+    _delete_pictures(out)
+    with (out / LABELS).open("w", newline="", encoding="utf-8") as file:
         labels = csv.writer(file, lineterminator="\n")
         labels.writerow(COLUMNS)
         for name in chosen:
             for variant in (clean(name), *_variants(name, out, rows)):
                 labels.writerows(_write_pictures(variant, target, out, views=views, size=size, seed=seed))
     return rows
+
+
+def _delete_pictures(out: Path) -> None:
+    """Delete the pictures of an earlier export into ``out``, whose splits may differ."""
+    if not (out / LABELS).exists():
+        return
+    with (out / LABELS).open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            picture = (out / row.get("file", "")).resolve()
+            if picture.is_file() and picture.is_relative_to(out.resolve()):
+                picture.unlink()
 
 
 def _variants(name: str, out: Path, rows: Sequence[ResultRow]) -> Iterator[Variant]:

@@ -52,7 +52,7 @@ from trompe_shared.api import (
     WorkerInfo,
 )
 from trompe_shared.faults import faults_of
-from trompe_shared.object3d import pack_zip
+from trompe_shared.local_files import pack_zip
 
 NOW = datetime(2025, 1, 2, 3, 4, tzinfo=UTC)
 SPEC = JobSpec.of("mug", label="mug")

@@ -1,9 +1,12 @@
-"""What both clients promise, over the fake server of these tests and over a real ``trompe serve``."""
+"""What both clients promise, over a fake and a real ``trompe serve``, and the quickstart over the real one."""
 
 import asyncio
 import inspect
 import json
+import re
 import secrets
+import subprocess
+import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from tests.documentation import blocks, readers_environment
 from trompe_client import (
     AsyncClient,
     AsyncJobHandle,
@@ -25,10 +29,11 @@ from trompe_client import (
 from trompe_shared.api import MANIFEST, MANIFEST_PAGE, JobRequest, JobSpec, JobState, Manifest
 from trompe_shared.errors import SpecError
 
-FEW: dict[str, Any] = {"grid": True, "azimuths": 2, "elevations": 1, "held_out": 1, "steps": 1}
+FEW: dict[str, Any] = {"grid": True, "azimuths": 2, "elevations": 1, "held_out": 1, "steps": 1, "surrogate": "diffuse"}
 """Options of a job of seconds."""
 ENDLESS = FEW | {"steps": 10_000, "epsilon": 0.004}
 """With so little that it does not win all views and end early."""
+QUICKSTART = {heading: code for language in ("python", "sh") for heading, code in blocks("quickstart.md", language)}
 
 
 class Blocking:
@@ -215,3 +220,41 @@ def test_both_clients_have_the_same_methods_with_the_same_arguments(blocking: ty
 
 def test_both_clients_are_made_alike() -> None:
     assert str(inspect.signature(Client)) == str(inspect.signature(AsyncClient))
+
+
+def test_the_quickstart_starts_the_service_that_these_tests_start() -> None:
+    assert [code for _, code in blocks("quickstart.md", "sh")][:2] == [
+        "pip install 'trompe[server]'\n",
+        "trompe serve\n",
+    ]
+
+
+def run(command: list[str], folder: Path, server: str) -> str:
+    """What a program prints that is run in ``folder`` as a reader would, with ``server`` in the environment."""
+    environment = readers_environment(TROMPE_SERVER=server)
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=240
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_quickstart_in_python_runs(service: str, tmp_path: Path) -> None:
+    said = run([sys.executable, "-W", "error", "-c", QUICKSTART["Python"]], tmp_path, service)
+    assert re.fullmatch(r"recognised in \d+% of the views before, in \d+% after\n", said)
+    assert (tmp_path / "out-python" / "mug-adversarial.zip").is_file()
+
+
+@pytest.mark.thorough
+def test_the_quickstart_on_the_command_line_runs(service: str, tmp_path: Path) -> None:
+    said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["Command line"]], tmp_path, service)
+    assert "target (own views)" in said
+    assert (tmp_path / "out-cli" / "mug-adversarial.zip").is_file()
+
+
+@pytest.mark.thorough
+def test_the_quickstart_with_curl_runs(service: str, tmp_path: Path) -> None:
+    said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["curl"]], tmp_path, service)
+    assert "event: progress" in said
+    assert (tmp_path / "out-curl" / "mug-adversarial.zip").read_bytes()[:2] == b"PK"
+    assert '"texels_altered"' in (tmp_path / "out-curl" / "result.json").read_text()

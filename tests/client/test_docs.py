@@ -4,8 +4,6 @@ import csv
 import json
 import re
 import shlex
-import subprocess
-import sys
 from importlib.resources import files
 from pathlib import Path
 
@@ -14,49 +12,9 @@ from click.testing import CliRunner
 
 import trompe_client
 from tests.client.conftest import FakeServer, zipped
-from tests.documentation import DOCS, blocks, readers_environment
+from tests.documentation import DOCS, blocks
 from trompe_client.cli import main
 from trompe_client.cli.group import EXITS, OWN
-
-QUICKSTART = {heading: code for language in ("python", "sh") for heading, code in blocks("quickstart.md", language)}
-
-
-def run(command: list[str], folder: Path, server: str) -> str:
-    """What a program prints that is run in ``folder`` as a reader would, with ``server`` in the environment."""
-    environment = readers_environment(TROMPE_SERVER=server)
-    done = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=240
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_the_quickstart_starts_the_service_that_these_tests_start() -> None:
-    assert [code for _, code in blocks("quickstart.md", "sh")][:2] == [
-        "pip install 'trompe[server]'\n",
-        "trompe serve\n",
-    ]
-
-
-def test_the_quickstart_in_python_runs(service: str, tmp_path: Path) -> None:
-    said = run([sys.executable, "-W", "error", "-c", QUICKSTART["Python"]], tmp_path, service)
-    assert re.fullmatch(r"recognised in \d+% of the views before, in \d+% after\n", said)
-    assert (tmp_path / "out-python" / "mug-adversarial.zip").is_file()
-
-
-@pytest.mark.thorough
-def test_the_quickstart_on_the_command_line_runs(service: str, tmp_path: Path) -> None:
-    said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["Command line"]], tmp_path, service)
-    assert "target (own views)" in said
-    assert (tmp_path / "out-cli" / "mug-adversarial.zip").is_file()
-
-
-@pytest.mark.thorough
-def test_the_quickstart_with_curl_runs(service: str, tmp_path: Path) -> None:
-    said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["curl"]], tmp_path, service)
-    assert "event: progress" in said
-    assert (tmp_path / "out-curl" / "mug-adversarial.zip").read_bytes()[:2] == b"PK"
-    assert '"texels_altered"' in (tmp_path / "out-curl" / "result.json").read_text()
 
 
 @pytest.fixture

@@ -56,14 +56,18 @@ def test_errors_are_values(client: Client, server: FakeServer) -> None:
     assert failed.error.job_id == failed.job.id
 
 
-def test_the_same_batch_again_finds_its_jobs(client: Client, server: FakeServer, working: list[str]) -> None:
+@pytest.mark.parametrize("batch", ["b", "größe"])
+def test_the_same_batch_again_finds_its_jobs(
+    batch: str, client: Client, server: FakeServer, working: list[str]
+) -> None:
     def ids(**options: Any) -> dict[int, str]:
         return {outcome.index: outcome.job.id for outcome in client.map(GRID, **options) if outcome.job}
 
-    first = ids(batch="b")
-    assert ids(batch="b") == first
+    first = ids(batch=batch)
+    assert len(first) == len(GRID)
+    assert ids(batch=batch) == first
     assert len(server.jobs) == len(GRID)
-    assert [job.id for job in client.jobs(labels={BATCH: "b"})] == list(server.jobs)[::-1]
+    assert [job.id for job in client.jobs(labels={BATCH: batch})] == list(server.jobs)[::-1]
     assert not set(ids().values()) & set(first.values())
 
 

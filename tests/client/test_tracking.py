@@ -43,11 +43,14 @@ def test_an_attack_logs_parameters_curves_result_and_files(mlflow: Mock, server:
     assert (tmp_path / "out" / "result.json").exists()
 
 
-def test_a_failed_job_is_a_failed_run(mlflow: Mock, server: FakeServer, tmp_path: Path) -> None:
+def test_a_failed_job_is_a_failed_run_of_a_known_experiment(mlflow: Mock, server: FakeServer, tmp_path: Path) -> None:
+    mlflow.get_experiment_by_name.return_value = Mock(experiment_id="7")
     server.ending = JobState.failed
     assert attacked(server, tmp_path / "out").exit_code == 6
     mlflow.set_terminated.assert_called_once_with(mlflow.create_run.return_value.info.run_id, "FAILED")
     mlflow.log_artifacts.assert_not_called()
+    mlflow.create_experiment.assert_not_called()
+    assert mlflow.create_run.call_args.args == ("7",)
 
 
 def test_without_mlflow_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, server: FakeServer, tmp_path: Path) -> None:
@@ -57,6 +60,7 @@ def test_without_mlflow_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, serv
     assert trompe("attack", "mug", "--label", "0", "--track", "mlflow", "--detach").exit_code == 2
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
 def test_the_real_mlflow_keeps_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mlflow = pytest.importorskip("mlflow")

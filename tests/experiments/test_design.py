@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trompe_client import _plan
@@ -114,6 +114,7 @@ def test_a_minimal_file_is_one_job_with_the_label_of_the_experiment_and_shipped_
     cases=st.integers(0, 3),
     seeds=st.integers(1, 4),
 )
+@settings(max_examples=20)
 def test_every_combination_is_one_job_with_a_key_of_its_own(
     epsilons: list[float], taus: list[float | None], cases: int, seeds: int
 ) -> None:
@@ -222,6 +223,12 @@ def test_assets_give_objects_their_distance_elevations_class_and_background(asse
     assert key(objects={"assets": "$TROMPE_ASSETS", "only": ["pot"]}) == row.key
 
 
+def test_a_relative_folder_of_assets_is_below_the_working_folder(assets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(assets.parent)
+    monkeypatch.setenv("TROMPE_ASSETS", assets.name)
+    assert len(plan_experiment(load_experiment("baselines_real")).rows) == 15
+
+
 def test_files_are_named_by_their_bytes_and_then_by_what_the_server_called_them(assets: Path, tmp_path: Path) -> None:
     classifier = "$TROMPE_ASSETS/classifiers/mobilenet_v2.pt2"
     (tmp_path / "room.png").write_bytes(b"picture")
@@ -264,11 +271,14 @@ def test_what_comes_with_trompe_can_be_planned(name: str, assets: Path) -> None:
         pytest.param({"cases": {"dark": {"seeds": "x"}}}, "'seeds' must be a list", id="seeds of a case"),
         pytest.param({"objects": {"mug": {"distanc": 1}}}, "did you mean 'distance'", id="field of an object"),
         pytest.param({"base": {"preset": "quickest"}}, "presets: fast, balanced, best", id="preset"),
+        pytest.param({"base": {"preset": ["fast"]}}, "presets: fast, balanced, best", id="presets"),
         pytest.param({"grid": {"preset": ["slow"]}}, "unknown preset 'slow'", id="preset in a grid"),
         pytest.param({"base": {"epsilon": "1/0"}}, "base: '1/0' divides by zero", id="fraction"),
         pytest.param({"judgement": {"veiws": 60}}, "judgement: unknown .* did you mean 'views'", id="judgement"),
         pytest.param({"judgement": {"epsilon": 0.1}}, "'epsilon' .* the experiment sets it", id="set for a judgement"),
         pytest.param({"judgement": {"views": 0}}, "views: .* greater than or equal to 1", id="value of a judgement"),
+        pytest.param({"judgement": {"suite": "standard-1"}}, "leave out `suite`", id="suite of a judgement"),
+        pytest.param({"judgement": {"renderers": ["three", "cycles"]}}, "one of `renderers`", id="renderers"),
         pytest.param({"grd": {}}, "unknown key 'grd'; keys: name,", id="part"),
         pytest.param({"name": "no spaces"}, "name", id="name"),
     ],
@@ -281,6 +291,35 @@ def test_mistakes_are_told_with_what_there_is(mistake: dict[str, Any], words: st
 def test_a_job_that_contradicts_itself_is_told_before_anything_is_asked() -> None:
     with pytest.raises(SpecError, match=r"Job mug, alpha 0\.5: .*`alpha` \(0\.5\)"):
         planned(grid={"alpha": [0.5]})
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        pytest.param(
+            {"grid": {"classifier": ["tiny", "net.onnx"]}}, "judgement of mug needs one `classifier`", id="networks"
+        ),
+        pytest.param(
+            {"objects": {"stored": {"label": 0}}},
+            "needs the file of stored for its noise: give it as `file`",
+            id="name",
+        ),
+        pytest.param(
+            {"base": {"background": "room.png"}}, "judgement of mug: .*'room.png' is not a colour", id="background"
+        ),
+    ],
+)
+def test_what_can_never_be_judged_is_told_before_any_job(mistake: dict[str, Any], words: str, tmp_path: Path) -> None:
+    for file in ("net.onnx", "room.png"):
+        (tmp_path / file).write_bytes(b"file")
+    assert planned(**mistake, folder=tmp_path).rows
+    with pytest.raises(SpecError, match=words):
+        planned(**mistake, folder=tmp_path, judgement={"views": 4})
+
+
+def test_a_judgement_may_be_of_several_budgets_and_of_one_network_by_object() -> None:
+    objects = {"mug": {"classifier": "tiny"}, "ball": {"classifier": "timm:resnet50.a1_in1k"}}
+    assert planned(objects=objects, grid={"epsilon": [0.02, 0.05]}, judgement={}).rows
 
 
 def test_what_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

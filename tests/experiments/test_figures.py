@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from matplotlib.patches import Rectangle
 from PIL import Image
 
 from trompe_client.cli import main
@@ -324,10 +325,12 @@ def test_jobs_that_not_every_surrogate_has_are_in_no_comparison_and_one_surrogat
 def test_a_job_that_found_a_calibration_costs_what_it_would_have_cost_without() -> None:
     asked = row(key="a", series="loss", configuration="loss margin", probe_renders=124, calibrate_s=8.0, seconds=20.0)
     found = row(key="b", series="loss", configuration="loss dlr", probe_renders=0, calibrate_s=0.5, seconds=12.0)
-    other = row(
-        key="c", series="pool", configuration="pool 20", views=20, probe_renders=0, calibrate_s=0.5, seconds=9.0
-    )
-    assert [each.cost for each in configurations([asked, found, other])] == [20.0, 19.5, 9.0]
+    differing: list[dict[str, Any]] = [{"views": 20}, {"image_size": "299x299"}, {"renderers": "three"}, {"grid": True}]
+    others = [
+        row(key=str(k), configuration=str(k), probe_renders=0, calibrate_s=0.5, seconds=9.0, **options)
+        for k, options in enumerate(differing)
+    ]
+    assert [each.cost for each in configurations([asked, found, *others])] == [20.0, 19.5, *[9.0] * len(others)]
 
 
 def written(folder: Path, rows: Sequence[ResultRow]) -> Path:
@@ -441,6 +444,18 @@ def test_histograms_show_one_row_of_each_object_and_need_predictions() -> None:
     assert [each.object for each in histogram_rows(grid_rows())] == ["candle", "ewer"]
     with pytest.raises(SpecError, match="No predictions of the target views"):
         prediction_histograms([row()], [])
+
+
+def test_classes_of_one_name_have_bars_of_their_own() -> None:
+    said = [
+        PredictionRow(
+            key="k", views="target", moment=moment, class_index=k, name="crane", true_class=k == 9, count=count
+        )
+        for moment, k, count in (("before", 9, 60), ("after", 9, 6), ("after", 134, 54))
+    ]
+    (panel,) = prediction_histograms([row()], said).panels
+    assert [label.get_text() for label in panel.get_yticklabels()] == ["crane (true class)", "crane"]
+    assert [bar.get_bbox().width for bar in panel.patches if isinstance(bar, Rectangle)] == [60, 6, 0, 54]
 
 
 DOCUMENT = "# Results\n\n<!-- trompe: table_one of experiments/some -->\n<!-- end -->\n\nWords.\n"

@@ -157,14 +157,20 @@ def test_the_suite_runs_what_is_missing_and_keeps_the_order_of_its_cases(tmp_pat
 
 
 def test_an_unforeseen_disturbance_changes_the_judgement_of_the_undisturbed_jobs_object(
-    tmp_path: Path, fake_disturbed: None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(service, "disturbed_renderer", lambda **_: nullcontext(FakeTarget(points=40_000)))
     rows, _ = suite(tmp_path, "quality 30")
     plain, _ = suite(tmp_path / "plain", "as it should be")
     measured, unforeseen = rows
     assert unforeseen.surrogate_a_drop == plain[0].surrogate_a_drop
     assert unforeseen.steps_taken == plain[0].steps_taken
     assert measured.target_a_before is not None
+    assert (unforeseen.surrogate_a_drop, plain[0].target_a_drop) == (0, 1)
+    assert (unforeseen.target_a_drop, unforeseen.transfer_gap) == (0, 0)
+    for name in ("margin_error", "max_view_change", "ssim", "delta_e", "pipeline_drops"):
+        assert getattr(plain[0], name)
+        assert not getattr(unforeseen, name), name
 
 
 def test_a_case_may_have_a_renderer_and_a_network_of_its_own_and_may_fail(
@@ -227,6 +233,13 @@ def test_variants_are_zips_and_labelled_pictures_from_views_that_train_and_test_
         assert row["file"].startswith(f"{row['split']}/ball/")
         with Image.open(out / row["file"]) as picture:
             assert picture.size == SIZE
+    (tmp_path / "kept.png").write_bytes(b"")
+    with (out / "labels.csv").open("a") as table:
+        table.write("../kept.png\n")
+    export_variants(out, service, FakeTarget(), show=Silent(), **asked | {"views": 3})  # type: ignore[arg-type]
+    listed = [row["file"] for row in csv.DictReader((out / "labels.csv").read_text().splitlines())]
+    assert sorted(listed) == sorted(path.relative_to(out).as_posix() for path in out.glob("t*/*/*.png"))
+    assert (tmp_path / "kept.png").exists()
     for file in made:
         painted = load_object(service.artifact(attacked[0].key, "") or b"")
         assert load_object(file.read_bytes()).textures.keys() == painted.textures.keys()

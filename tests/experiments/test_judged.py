@@ -1,6 +1,9 @@
 """Judgements of the results of an experiment: what is judged, with which options, and that rows are kept."""
 
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +24,7 @@ from trompe_shared.errors import SpecError
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
-FILE = {
+FILE: dict[str, Any] = {
     "name": "small",
     "objects": {"mug": {"elevation": [5, 15]}, "ball": {}},
     "base": {"epsilon": 0.05},
@@ -61,14 +64,17 @@ def plan() -> Plan:
     return planned()
 
 
-def judged(plan: Plan, service: JudgingService, folder: Path) -> list[JudgedRow]:
+def judged(
+    plan: Plan, service: JudgingService, folder: Path, show: Callable[[str], None] = lambda _: None
+) -> list[JudgedRow]:
     rows = run_experiment(plan, service, folder, show=Silent())
-    return judge_all(plan, service, folder, seconds={row.key: row.seconds for row in rows}, show=lambda _: None)
+    return judge_all(plan, service, folder, seconds={row.key: row.seconds for row in rows}, show=show)
 
 
-def test_each_object_is_judged_as_it_is_with_noise_and_painted(plan: Plan, tmp_path: Path) -> None:
+@pytest.mark.parametrize("artifacts", [[], ["*-adversarial.zip"]])
+def test_each_object_is_judged_as_it_is_with_noise_and_painted(artifacts: list[str], tmp_path: Path) -> None:
     service = JudgingService()
-    rows = judged(plan, service, tmp_path)
+    rows = judged(planned(artifacts=artifacts), service, tmp_path)
     cases = [NOTHING, NOISE, "weak", "strong"]
     assert [(row.object, row.case) for row in rows] == [(name, case) for name in ("mug", "ball") for case in cases]
     assert [row.seconds for row in rows[:4]] == [None, None, 6.5, 6.5]
@@ -91,6 +97,19 @@ def test_rows_are_kept_and_made_into_a_table_and_a_chart(plan: Plan, tmp_path: P
     assert table[0] == "| method | A_drop | at half size | JPEG 30 | CIEDE2000 | seconds |"
     assert len(table) == 2 + 4
     assert [path.suffix for path in read_data(tmp_path).draw("baselines")] == [".svg", ".png"]
+
+
+def test_where_only_the_tables_were_kept_judgements_stay_and_what_is_missing_is_told(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, again, told = judged(plan, JudgingService(), tmp_path), JudgingService(), list[str]()
+    shutil.rmtree(tmp_path / "jobs")
+    monkeypatch.setattr(JudgingService, "artifact", lambda *_: None)
+    wider = planned(cases={**FILE["cases"], "other": {"steps": 7}})
+    rows = judged(wider, again, tmp_path, told.append)
+    assert [row.key for row in rows] == [row.key for row in first]
+    assert told == [f"no painting of {name}, other in {str(tmp_path)!r}" for name in ("mug", "ball")]
+    assert again.judged == []
 
 
 def test_changed_options_of_the_judgement_judge_everything_again_under_other_keys(plan: Plan, tmp_path: Path) -> None:

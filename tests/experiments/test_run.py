@@ -12,14 +12,16 @@ from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
 from trompe_client import ServerUnreachable
-from trompe_client._errors import BadRequest
+from trompe_client._errors import APIError, BadRequest, ServerFault, TooMany, Unauthorized
 from trompe_client._plan import Upload
+from trompe_client.tracking import MlflowRun
 from trompe_experiments import cli, progress, run
 from trompe_experiments.about import ABOUT, estimated_seconds, write_about
 from trompe_experiments.cli import experiment
@@ -29,7 +31,7 @@ from trompe_experiments.progress import Tracked, experiment_display
 from trompe_experiments.run import run_experiment
 from trompe_experiments.service import Service
 from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, RowId, read_table
-from trompe_experiments.terminal import compared, differences, failures, read_results
+from trompe_experiments.terminal import change, compared, differences, failures, read_results
 from trompe_server import renderers
 from trompe_server.api.examples import RESULT as EXAMPLE
 from trompe_shared.api import Job, JobRequest, JobSpec, JobState, JudgementSpec, Problem, Progress, Result
@@ -299,6 +301,25 @@ def test_a_row_that_the_server_refuses_does_not_stop_the_others(service: FakeSer
     assert "No such class" in rows[0].error
 
 
+@pytest.mark.parametrize(("fault", "status"), [(Unauthorized, 401), (TooMany, 429), (ServerFault, 503)])
+def test_a_fault_of_the_server_stops_the_run_and_leaves_no_row(
+    fault: type[APIError], status: int, service: FakeService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service, "submit", Mock(side_effect=fault(Problem(title="Not now", status=status))))
+    with pytest.raises(fault):
+        ran(plan_of(), service, tmp_path)
+    assert read_table(tmp_path / RESULTS, ResultRow) == []
+
+
+def test_objects_keep_their_own_names_whatever_their_files_are_called(service: FakeService, tmp_path: Path) -> None:
+    for name in ("chair", "table"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "model.obj").write_text(f"o {name}")
+    files = {name: {"file": str(tmp_path / name / "model.obj"), "label": 0} for name in ("chair", "table")}
+    rows, _ = ran(plan_of(objects=files, grid={}), service, tmp_path / "out")
+    assert [row.object for row in rows] == ["chair", "table"]
+
+
 def test_a_file_is_uploaded_once_for_all_jobs(service: FakeService, tmp_path: Path) -> None:
     (tmp_path / "net.onnx").write_bytes(b"network")
     plan = plan_of(base={"classifier": str(tmp_path / "net.onnx"), "queries": 4})
@@ -329,9 +350,9 @@ def test_two_experiments_are_compared_on_what_they_share() -> None:
     old = [row_of(target_a_drop=drop, seed=k) for k, drop in enumerate((0.4, 0.6))] + [row_of(object="chair")]
     new = [row_of(target_a_drop=0.8), row_of(object="lamp", target_a_drop=1.0)]
     (found,) = differences(old, new)
-    assert found.object == "mug"
-    assert found.change("target_a_drop") == pytest.approx(0.3)
-    assert found.change("held_out_a_drop") is None
+    assert {row.object for rows in found for row in rows} == {"mug"}
+    assert change(found, "target_a_drop") == pytest.approx(0.3)
+    assert change(found, "held_out_a_drop") is None
 
 
 def test_experiments_that_share_nothing_are_not_compared(service: FakeService, tmp_path: Path) -> None:
@@ -416,7 +437,7 @@ def test_rows_of_other_jobs_that_nothing_else_is_left_of_are_never_overwritten(
 def test_each_job_is_a_run_of_a_tracker(service: FakeService, tmp_path: Path) -> None:
     runs: dict[str, list[object]] = {}
 
-    class Logged:
+    class Logged(MlflowRun):
         def __init__(self, name: str, spec: JobSpec) -> None:
             self.said = runs[name] = [spec.paint.epsilon]
 
@@ -449,6 +470,23 @@ def test_the_jobs_of_an_experiment_are_found_on_a_server(
     monkeypatch.setattr(cli, "Service", lambda client: service)
     assert "mean of 4 rows: target A_drop 0.35" in invoked("show", "small")
     assert "no job of an experiment 'other'" in invoked("show", "other", status=1)
+
+
+def test_jobs_on_a_server_are_told_apart_by_what_differs_and_stored_files_have_their_names(
+    service: FakeService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored = "0" * 64
+    monkeypatch.setattr(service, "store", lambda upload: stored)
+    (tmp_path / "net.onnx").write_bytes(b"network")
+    grid = {"classifier": [str(tmp_path / "net.onnx")], "elevation": [[0, 10], [0, 20]]}
+    ran(plan_of(objects={"mug": {}, "chair": {}}, grid=grid, seeds=2), service, tmp_path)
+    service.failing, attacks = {"chair"}, service.jobs
+    named = [job.model_copy(update={"names": {stored: "net"}}) for job in attacks("small")]
+    monkeypatch.setattr(service, "jobs", lambda name: named)
+    rows = cli._on_server(service, "small")
+    settings = ["epsilon 0.05, elevation 0 + 10", "epsilon 0.05, elevation 0 + 20"]
+    assert [row.configuration for row in rows] == 2 * [each for each in settings for _ in range(2)]
+    assert [row.classifier for row in rows if row.failed] == ["net"] * 4
 
 
 def displayed(plan: Plan, service: FakeService, folder: Path, **options: Any) -> str:

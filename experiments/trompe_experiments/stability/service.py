@@ -4,6 +4,7 @@ import tempfile
 from contextlib import AbstractContextManager, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any, Final
 
 from trompe_experiments.in_process import Done, run_job
 from trompe_experiments.plan import CASE
@@ -12,11 +13,18 @@ from trompe_experiments.stability.cases import CASES, Case
 from trompe_experiments.stability.disturbed_engine import disturbed_renderer
 from trompe_server.classifiers.tiny import CLASSES
 from trompe_server.job.setup import JobSetup
-from trompe_server.judging.metrics import accuracy
+from trompe_server.judging.metrics import accuracy, transfer_gap
 from trompe_server.renderers import TargetRenderer
 from trompe_shared.api import Job, JobRequest, JobSpec, JobState, Result
 from trompe_shared.errors import TrompeError
 from trompe_shared.object3d import load_object
+
+WITHOUT_IMAGES: Final[dict[str, Any]] = {
+    **dict.fromkeys(("disagreement", "margin_error", "goal_reached", "ssim", "ssim_worst", "delta_e", "delta_e_95")),
+    **dict.fromkeys(("max_view_change", "pixels_beyond_epsilon", "views_beyond_epsilon")),
+    **{name: [] for name in ("views", "held_out_views", "fooled_as", "judges", "image_pipelines", "renderers")},
+}
+"""Fields of a result that were measured on images of the undisturbed target, empty."""
 
 
 class DisturbedService(Service):
@@ -42,10 +50,6 @@ class DisturbedService(Service):
         """See ``Service.result``."""
         return self._results[job]
 
-    def artifact(self, job: str, name: str) -> bytes | None:
-        """See ``Service.artifact``; none are kept."""
-        return None
-
     def classes(self, classifier: str) -> list[str] | None:
         """Class names of the shipped classifier."""
         return list(CLASSES)
@@ -66,7 +70,7 @@ class DisturbedService(Service):
         return self._undisturbed[name]
 
     def _afterwards(self, done: Done, case: Case) -> Result:
-        """Judge the finished object under the disturbance; warnings are those of the undisturbed job."""
+        """Judge the finished object under the disturbance; warnings and surrogate are those of the undisturbed job."""
         setup: JobSetup = done.setup
         judge = setup.classifier if case.classifier is None else case.classifier(setup.members[0])
         painted = setup.obj if done.painted is None else load_object(done.painted)
@@ -75,7 +79,8 @@ class DisturbedService(Service):
             for name, views in (("target", setup.views), ("held_out", setup.held_out)):
                 before, after = (judge.predict(target.render(o, views, size=setup.size)) for o in (setup.obj, painted))
                 shown[name] = accuracy(before, after, setup.labels)
-        return done.result.model_copy(update=shown)
+        gap = transfer_gap(done.result.surrogate, shown["target"])
+        return done.result.model_copy(update=WITHOUT_IMAGES | shown | {"transfer_gap": gap})
 
     def _disturbed(self, case: Case) -> AbstractContextManager[TargetRenderer]:
         return disturbed_renderer(**case.renderer) if case.renderer else nullcontext(self._target)
