@@ -16,7 +16,8 @@ from trompe_server.formats import gltf_write, read_object
 from trompe_server.formats.fbx_tree import Node, Tree
 from trompe_server.formats.gltf_container import BIN_CHUNK
 from trompe_shared.errors import ObjectError
-from trompe_shared.object3d import Object3D, encode_png, pack_zip
+from trompe_shared.local_files import pack_zip
+from trompe_shared.object3d import Object3D, encode_png
 
 Json = dict[str, Any]
 

@@ -2,6 +2,7 @@
 
 TrompeError
 ├── NotFoundError        nothing is stored under this id or name
+│   └── MissingFileError     a job has no such file, or has it no longer
 ├── AmbiguousError       a name or the beginning of an id matches several stored things
 ├── ConflictError        the state of the job does not allow this
 └── ServiceError         the service cannot start or continue: folder in use, child process does not start
@@ -14,6 +15,10 @@ class NotFoundError(TrompeError):
     """Nothing is stored under this id or name."""
 
     code = "not-found"
+
+
+class MissingFileError(NotFoundError, FileNotFoundError):
+    """A job has no such file, or has it no longer."""
 
 
 class AmbiguousError(TrompeError):

@@ -129,19 +129,6 @@ def test_a_revoked_token_is_worthless_within_moments(serve: Serve) -> None:
         assert guest.get("/v1/jobs").status_code == 401
 
 
-def test_streams_end_when_the_server_stops_and_it_stops_at_once(tmp_path: Path) -> None:
-    with Serve(tmp_path / "data") as serve:
-        job = serve.submit("gate")
-        with serve.reader.stream("GET", f"/v1/jobs/{job}/events") as stream:
-            events = stream.iter_lines()
-            next(events)
-            serve.process.send_signal(signal.SIGTERM)
-            rest = list(events)
-        assert not any("succeeded" in line for line in rest)
-        assert serve.process.wait(120) == 0
-        assert "shutdown exceeded" not in serve.log.read_text(), "the server gave up waiting for the stream"
-
-
 def test_a_large_upload_does_not_fill_the_memory_of_the_server(serve: Serve) -> None:
     """200 MiB that are no classifier: they are refused, and on their way they are in files alone."""
 
@@ -173,3 +160,16 @@ def test_the_examples_of_the_documentation_work(serve: Serve, tmp_path: Path) ->
     script = "set -euo pipefail\n" + "\n".join(codes)
     done = subprocess.run(["bash", "-xc", script], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr + done.stdout
+
+
+def test_streams_end_when_the_server_stops_and_it_stops_at_once(serve: Serve) -> None:
+    """The last test here: the server stays stopped."""
+    job = serve.submit("gate")
+    with serve.reader.stream("GET", f"/v1/jobs/{job}/events") as stream:
+        events = stream.iter_lines()
+        next(events)
+        serve.process.send_signal(signal.SIGTERM)
+        rest = list(events)
+    assert not any("succeeded" in line for line in rest)
+    assert serve.process.wait(120) == 0
+    assert "shutdown exceeded" not in serve.log.read_text(), "the server gave up waiting for the stream"

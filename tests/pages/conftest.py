@@ -54,7 +54,7 @@ REPORTED = """
 """
 """Keeps in ``told`` every text that the element shows from now on."""
 
-SMALL = {"grid": True, "azimuths": 3, "elevations": 2, "held_out": 4, "steps": 5}
+SMALL: Any = {"grid": True, "azimuths": 3, "elevations": 2, "held_out": 4, "steps": 5, "surrogate": "diffuse"}
 """A job of some seconds."""
 
 
@@ -141,13 +141,15 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="session")
-def new_service(tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Service]:
-    """Makes a service, to be entered."""
-    return lambda: Service(tmp_path_factory.mktemp("service") / "data", environment={"OMP_NUM_THREADS": "1"})
+def new_service(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Service]:
+    """Makes a service, to be entered, with options of ``trompe serve``."""
+    return lambda *options: Service(
+        tmp_path_factory.mktemp("service") / "data", *options, environment={"OMP_NUM_THREADS": "1"}
+    )
 
 
 @pytest.fixture(scope="session")
-def service(new_service: Callable[[], Service]) -> Iterator[Service]:
+def service(new_service: Callable[..., Service]) -> Iterator[Service]:
     with new_service() as service:
         yield service
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.shared.test_comparison import HARD_AND_EASY
 from trompe_server.pages.chart import Point, chart
 from trompe_server.pages.experiment import differing_options, points_of
-from trompe_shared.comparison import Job
+from trompe_shared.comparison import Job, charged
 
 
 def point(object: str, configuration: str, seconds: float, drop: float) -> Point:
@@ -43,7 +43,7 @@ def test_there_is_no_line_where_no_object_has_all_configurations() -> None:
 def test_a_configuration_is_what_differs_on_the_same_object_but_the_seed() -> None:
     def entry(object: str, label: str, seed: int, tau: float | None) -> Any:
         judged = SimpleNamespace(a_drop=0.5, views=60)
-        costs = {"seconds": {"attack": 9.0}, "probe_renders": 9, "surrogate_model": "curve"}
+        costs = {"seconds": {"attack": 9.0}, "probe_renders": 9, "image_size": (128, 128)}
         result = SimpleNamespace(held_out=judged, target=judged, **costs)
         asked = {"label": label, "epsilon": 0.1, "seed": seed, "tau": tau}
         return SimpleNamespace(id="1", object=object), asked, result
@@ -51,6 +51,20 @@ def test_a_configuration_is_what_differs_on_the_same_object_but_the_seed() -> No
     entries = [entry("mug", "cup", 0, None), entry("mug", "cup", 1, 0.2), entry("pot", "pot", 0, 0.2)]
     found = points_of(entries, differing_options(entries))
     assert [one.job.configuration for one in found] == ["epsilon 0.1, tau –", *["epsilon 0.1, tau 0.2"] * 2]
+
+
+def test_a_job_pays_for_the_calibration_of_a_job_with_the_same_probes_alone() -> None:
+    def entry(renders: int, *, size: int = 128, **options: Any) -> Any:
+        judged = SimpleNamespace(a_drop=0.5, views=60)
+        seconds = {"attack": 9.0, "calibrate": 0.1 * renders}
+        result = SimpleNamespace(
+            held_out=judged, target=judged, seconds=seconds, probe_renders=renders, image_size=(size, size)
+        )
+        asked = {"epsilon": 0.1, "seed": 0, "held_out": 60, "background": ["white"]} | options
+        return SimpleNamespace(id="1", object="mug"), asked, result
+
+    entries = [entry(100), entry(0, held_out=9), entry(0, size=224), entry(0, background=["black"])]
+    assert [job.cost for job in charged(one.job for one in points_of(entries, ["epsilon"]))] == [19.0, 19.0, 9.0, 9.0]
 
 
 @given(

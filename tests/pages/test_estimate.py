@@ -9,7 +9,7 @@ from trompe_server.pages.estimate import estimate
 from trompe_server.pages.results import Outcome
 from trompe_shared.api import Job, JobSpec, JobState
 
-EFFORT: dict[str, Any] = {"pool": 60, "steps": 25, "epsilon": 0.05}
+EFFORT: dict[str, Any] = {"pool": 240, "steps": 25, "epsilon": 0.05}
 START = datetime(2026, 1, 31, tzinfo=UTC)
 
 
@@ -33,7 +33,8 @@ def test_it_tells_the_medians_of_jobs_that_are_alike() -> None:
     "ended",
     [
         pytest.param([], id="no job"),
-        pytest.param([(job(9, pool=240), Outcome(0.9, True))], id="another effort"),
+        pytest.param([(job(9, pool=60), Outcome(0.9, True))], id="another effort"),
+        pytest.param([(job(9, grid=True), Outcome(0.9, True))], id="the grid"),
         pytest.param([(job(9), Outcome(None, False))], id="nothing to attack"),
     ],
 )

@@ -143,7 +143,7 @@ def test_an_object_of_30_megabytes_is_sent_with_its_progress_attacked_and_turned
     expect(page.locator(".turntable figcaption")).to_have_text("In the target renderer")
     assert 500 < (turntables(page)[0].min(axis=2) < 200).sum() < 40_000
 
-    views = {"azimuths": 1, "elevations": 1, "held_out": 1, "surrogate": "diffuse"}
+    views = {"azimuths": 1, "elevations": 1, "held_out": 1}
     job = service.finished(object=page.locator("[name=object]").input_value(), **views)
     page.goto(f"{service.url}/jobs/{job}")
     page.evaluate(REPORTED, "trompe-orbit [role=status]")

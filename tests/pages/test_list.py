@@ -10,13 +10,16 @@ from typing import Any
 import pytest
 
 from tests.server.api.conftest import Api, running
-from trompe_server.api.examples import RESULT
+from trompe_server.api.examples import JOB, RESULT
 from trompe_server.api.services import Services
-from trompe_server.pages.present import _accuracies
+from trompe_server.library.shipped import list_shipped_classifiers
+from trompe_server.pages import routes
+from trompe_server.pages.orbit import orbit
+from trompe_server.pages.present import JobRow, _accuracies
 from trompe_server.pages.routes import follow_list
 from trompe_server.pages.serving import _code
 from trompe_server.settings import Settings
-from trompe_shared.api import JobRequest, JudgementRequest, Result
+from trompe_shared.api import Job, JobRequest, JudgementRequest, Result
 
 JOBS = 120
 TAUS = [None, 0.05, 0.2]
@@ -70,6 +73,53 @@ def test_an_experiment_shows_of_jobs_that_wait_the_options_in_which_they_differ(
     cells = re.findall(r'<td class="number">([^<]*)', page)
     lines = [cells[start : start + len(columns) - 2] for start in range(0, len(cells), len(columns) - 2)]
     assert [line[:3] for line in lines] == [["0.05", "0.2", "2"], ["0.05", "0.05", "1"], ["0.05", "–", "0"]]
+
+
+def test_one_of_several_pages_of_an_experiment_says_that_its_figures_are_of_its_own_jobs(
+    client: Api, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = "Counts, chart and means are of the jobs on this page only"
+    assert told not in client.get("/experiments/few").text
+    monkeypatch.setattr(routes, "EXPERIMENT_PAGE", 2)
+    page = client.get("/experiments/few").text
+    assert f"{told} (2)" in page
+    (older,) = re.findall(r'href="([^"]+)">Older</a>', page)
+    assert f"{told} (1)" in client.get(f"/experiments/few{older}").text
+
+
+def test_a_network_by_name_keeps_its_reference_in_commands_and_forms_also_where_it_is_not_allowed(
+    tmp_path: Path,
+) -> None:
+    request = JobRequest.of("mug", label=["table", MUG], classifier="timm:x")
+    result = RESULT | {"spec": request.spec().model_dump(mode="json")}
+    with running(Settings(data=tmp_path)) as client:
+        job = client.services.store.create(request, names={"timm:x": "x"})[0].id
+        client.end(job, result__json=json.dumps(result).encode())
+        assert "<td>x</td>" in (listed := client.get("/jobs").text)
+        assert "as table or class 5" in listed
+        assert "--classifier timm:x" in client.get(f"/jobs/{job}").text
+        form = client.get("/judgements/new", params={"job": job}).text
+    assert '<option value="timm:x" selected>timm:x<' in form
+    assert re.findall(r'name="label" value="([^"]*)"', form) == ["table", "5"]
+
+
+def test_the_job_s_own_network_is_asked_by_indices_and_others_by_names() -> None:
+    result = Result.model_validate(RESULT | {"spec": RESULT["spec"] | {"victim": {"classifier": "timm:x"}}})
+    given = orbit(result, "1", list_shipped_classifiers())
+    assert given is not None
+    assert [(each["reference"], each["labels"]) for each in given["classifiers"]] == [
+        ("timm:x", [2]),
+        ("tiny", ["mug"]),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("phase", "words"),
+    [("attack-003", "attacking"), ("queued", "opening"), ("showing to resnet-50", "showing to resnet-50")],
+)
+def test_a_phase_is_told_in_words(phase: str, words: str) -> None:
+    job = Job.model_validate(JOB | {"progress": {"phase": phase, "fraction": 0.5}})
+    assert JobRow.of(job, epsilon=None, object="mug", label="mug", classifier="tiny").phase == words
 
 
 @pytest.mark.parametrize(

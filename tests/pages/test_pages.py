@@ -17,7 +17,7 @@ from playwright.sync_api import Browser, BrowserContext, Page, Response, expect
 
 from tests.pages.conftest import LIMIT, REPORTED, Service, drop, held_back, inaccessible, slowed, turntables, width
 from tests.served import wait_until
-from trompe_shared.api import OPTIONS
+from trompe_shared.api import OPTIONS, JobRequest
 
 pytestmark = pytest.mark.timeout(1200)
 
@@ -59,6 +59,8 @@ def test_a_wrong_file_and_a_wrong_class_are_told_in_the_servers_words(
     drop(page, file)
     expect(page.locator('[data-error="object"]')).to_contain_text("zip")
     expect(page.locator("#file-says")).to_contain_text("refused")
+    page.set_input_files("#classifier-file", file)
+    expect(page.locator('[data-error^="victim.classifier"]')).to_contain_text("not a supported classifier")
 
     page.fill("[name='goal.label']", "elephant")
     page.get_by_role("button", name="Submit").click()
@@ -159,6 +161,25 @@ def test_a_new_job_appears_in_the_list_by_itself_with_what_came_of_it_and_is_del
     expect(row).to_have_count(0)
     page.reload()
     expect(row).to_have_count(0)
+
+
+def test_a_row_with_the_focus_is_updated_once_the_focus_leaves_it(service: Service, page: Page) -> None:
+    request = JobRequest.of("mug", label="mug", needs={"gpu": 1000})
+    job = service.store.create(request)[0].id
+    row = page.locator(f"#job-{job}")
+    page.goto(f"{service.url}/jobs")
+    row.get_by_role("checkbox").check()
+    service.store.request_cancel(job)
+    later = service.store.create(request)[0].id
+    expect(page.locator(f"#job-{later}")).to_be_visible()
+    expect(row.locator(".state")).to_have_text("queued")
+
+    page.get_by_label("Find on this page").focus()
+
+    expect(row.locator(".state")).to_have_text("cancelled")
+    expect(row.get_by_role("checkbox")).to_be_checked()
+    page.locator(f"#job-{later}").get_by_role("button", name="Cancel").click()
+    expect(page.locator(f"#job-{later} .state")).to_have_text("cancelled")
 
 
 def test_the_page_of_a_result_says_what_the_result_says_and_gives_it_as_one_zip(
@@ -269,6 +290,20 @@ def test_a_result_is_judged_with_the_form_and_its_page_is_shown(
     expect(shown.get_by_role("cell", name="tiny").first).to_be_visible()
     page.goto(f"{service.url}/jobs")
     expect(page.get_by_role("link", name="judged beside mug").first).to_be_visible()
+
+
+def test_all_classes_of_an_attack_count_in_the_judgement_of_its_result(
+    service: Service, page: Page, faults: list[str]
+) -> None:
+    job = service.store.create(JobRequest.of("mug", label=["mug", 7], needs={"gpu": 1000}))[0].id
+    page.goto(f"{service.url}/judgements/new?job={job}")
+    with page.expect_request("**/v1/judgements") as sent:
+        page.get_by_role("button", name="Judge").click()
+    asked: Any = sent.value.post_data_json
+    assert asked["label"] == ["mug", 7]
+    expect(page.locator(".error:visible")).to_contain_text("no painted object")
+    service.store.request_cancel(job)
+    faults.clear()  # browsers report answers of 409 on the console
 
 
 def test_a_judgement_without_an_object_after_is_refused_beside_its_field(
@@ -416,9 +451,9 @@ def test_a_server_that_restarts_in_mid_job_is_waited_for(service: Service, page:
 
 
 @pytest.fixture(scope="module")
-def guarded(new_service: Callable[[], Service]) -> Iterator[Service]:
-    """A service with a token that may read."""
-    with new_service() as service:
+def guarded(new_service: Callable[..., Service]) -> Iterator[Service]:
+    """A service with a token that may read; it attacks nothing."""
+    with new_service("--workers", "0") as service:
         command = [sys.executable, "-m", "trompe_client.cli", "token", "create", "me", "--right", "read", "--json"]
         made = subprocess.run([*command, "--data", str(service.data)], capture_output=True, text=True, check=True)
         service.token = json.loads(made.stdout)["secret"]

@@ -1,6 +1,5 @@
 """``trompe worker`` as a real process with fake jobs, and the API's side of its queue."""
 
-import signal
 import socket
 import threading
 import time
@@ -13,7 +12,7 @@ from trompe_server.queue.leases import DISPATCHER, end_lease, lease_holder
 from trompe_server.service.dispatch import prepare_data
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import JobArtifacts, job_artifacts, open_folder
-from trompe_shared.api import Job, JobState
+from trompe_shared.api import Job
 from trompe_shared.sailenv import COMMANDS, LIGHT_NOT_FOUND, REGISTER
 
 REGISTER_BYTES: Final = len(REGISTER.encode_request(width=1, height=1, gzip=False))
@@ -76,13 +75,6 @@ class Service(Queue):
             yield running.start()
         finally:
             running.close()
-
-    def kill_worker_in_gate(self, job: str) -> None:
-        """Start a worker and kill it in the middle of ``job``."""
-        with self.worker() as running:
-            wait_until(lambda: self.in_gate(job))
-            running.end(signal.SIGKILL)
-        assert self.state(job).state is JobState.running
 
     def end_silence(self) -> None:
         """Let the lease of a dead or frozen dispatcher be over now, not after its silence."""

@@ -2,8 +2,7 @@
 
 import json
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,8 +23,6 @@ from trompe_server.storage.folders import open_folder
 from trompe_shared.api import JobSpec
 from trompe_shared.errors import RendererError, RendererLostError, SpecError
 
-Running = Callable[..., AbstractContextManager[tuple[str, int]]]
-
 
 @pytest.fixture(autouse=True)
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,15 +31,15 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def sharp(running_worker: Running) -> Iterator[tuple[str, int]]:
-    with running_worker(*SHARP) as address:
-        yield address
+def sharp() -> Iterator[tuple[str, int]]:
+    with started(*SHARP) as running:
+        yield running.address
 
 
 @pytest.fixture(scope="module")
-def flat(running_worker: Running) -> Iterator[tuple[str, int]]:
-    with running_worker(*FLAT) as address:
-        yield address
+def flat() -> Iterator[tuple[str, int]]:
+    with started(*FLAT) as running:
+        yield running.address
 
 
 def pipeline(_spec: JobSpec, **parts: Any) -> Any:

@@ -1,6 +1,7 @@
 """``trompe serve`` with renderers elsewhere: it uses and lists them."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -44,20 +45,17 @@ def test_one_of_them_is_enough_and_none_need_be_known(tmp_path: Path, nobody: in
     assert supervisor(tmp_path, RendererAddresses()).missing() == []
 
 
-def test_workers_of_a_service_without_renderers_use_those_elsewhere(tmp_path: Path, renderer: int, nobody: int) -> None:
-    options = ["--renderers", "0", "--renderer", f"127.0.0.1:{renderer}", "--renderer", f"127.0.0.1:{nobody}"]
-    with Served(tmp_path / "data", *options) as served, Client(served.url) as client:
-        found = {info.address: info.alive for info in client.renderers()}
-        assert found == {f"127.0.0.1:{renderer}": True, f"127.0.0.1:{nobody}": False}
-        assert client.job(served.submit("fine")).wait(120).status.attempts == 1
-        assert b"ready" in client.send(Request("GET", "/readyz", bytes))
-
-
-def test_a_service_whose_renderers_are_all_away_is_not_ready(tmp_path: Path, nobody: int) -> None:
-    options = ["--renderers", "0", "--workers", "0", "--renderer", f"127.0.0.1:{nobody}"]
-    with (
-        Served(tmp_path / "data", *options) as served,
-        Client(served.url) as client,
-        pytest.raises(ServerFault, match="no renderer worker elsewhere answers"),
-    ):
-        client.send(Request("GET", "/readyz", bytes))
+def test_workers_of_a_service_use_renderers_elsewhere_and_it_is_not_ready_once_all_are_away(
+    tmp_path: Path, nobody: int
+) -> None:
+    with ExitStack() as elsewhere:
+        renderer = elsewhere.enter_context(listening())
+        options = ["--renderers", "0", "--renderer", f"127.0.0.1:{renderer}", "--renderer", f"127.0.0.1:{nobody}"]
+        with Served(tmp_path / "data", *options) as served, Client(served.url) as client:
+            found = {info.address: info.alive for info in client.renderers()}
+            assert found == {f"127.0.0.1:{renderer}": True, f"127.0.0.1:{nobody}": False}
+            assert client.job(served.submit("fine")).wait(120).status.attempts == 1
+            assert b"ready" in client.send(Request("GET", "/readyz", bytes))
+            elsewhere.close()
+            with pytest.raises(ServerFault, match="no renderer worker elsewhere answers"):
+                client.send(Request("GET", "/readyz", bytes))

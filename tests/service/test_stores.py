@@ -18,6 +18,7 @@ from tests.service.records import DONE, claim, claims_of, create
 from tests.surfaces import object_of, quad
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.library import Library
+from trompe_server.queue import retention
 from trompe_server.queue.retention import Retention, delete_job
 from trompe_server.queue.store import JobStore
 from trompe_server.storage.database import connect
@@ -25,7 +26,7 @@ from trompe_server.storage.folders import Folder, JobArtifacts, LocalArtifacts, 
 from trompe_server.system.files import exclusive
 from trompe_shared.api import JobState
 from trompe_shared.errors import ClassifierError, SpecError
-from trompe_shared.object3d import pack_zip
+from trompe_shared.local_files import pack_zip
 
 
 @pytest.fixture(scope="session")
@@ -229,7 +230,7 @@ def test_retention_deletes_what_is_old_and_nothing_else(store: JobStore, tmp_pat
     assert files.within("jobs").folders() == sorted([running, queued])
 
 
-def test_retention_goes_on_after_a_job_whose_files_cannot_be_deleted(
+def test_retention_goes_on_after_as_many_jobs_as_it_looks_up_at_once_whose_files_cannot_be_deleted(
     store: JobStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files, stuck, other = open_folder(f"memory://{secrets.token_hex(4)}"), create(store), create(store)
@@ -244,6 +245,7 @@ def test_retention_goes_on_after_a_job_whose_files_cannot_be_deleted(
         remove(self, path, **how)
 
     monkeypatch.setattr(type(files.system), "rm", rm)  # type: ignore[union-attr]
+    monkeypatch.setattr(retention, "BATCH", 1)
     assert Retention(store, files, days=-1 / 86400).run() == 1
     assert store.get(stuck).state is JobState.succeeded
     with pytest.raises(NotFoundError):

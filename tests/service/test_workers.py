@@ -20,12 +20,17 @@ from trompe_server.storage.folders import LocalArtifacts
 from trompe_shared.api import JobState
 
 
-def test_jobs_run_one_after_the_other_and_each_ends_as_its_pipeline_says(service: Service) -> None:
+def test_jobs_run_one_after_the_other_each_as_its_pipeline_says_and_the_worker_ends_with_its_parent(
+    service: Service,
+) -> None:
     labels = ["fine", "hopeless", "broken", "bug", "no object", "flaky renderer"]
     jobs = {label: service.submit(label) for label in labels}
     with service.worker(TROMPE_LOG="json") as running:
         ended = {label: service.ended(job) for label, job in jobs.items()}
         lines = [json.loads(line) for line in running.words().splitlines() if line.startswith("{")]
+        assert running.process.stdin is not None
+        running.process.stdin.close()
+        assert running.process.wait(120) == 0
 
     assert {label: job.state for label, job in ended.items()} == {
         "fine": JobState.succeeded,
@@ -55,13 +60,20 @@ def test_jobs_run_one_after_the_other_and_each_ends_as_its_pipeline_says(service
         assert trace(service.folder(jobs[label])).count("begin attack-001") == 1, "failing phases are not tried again"
 
 
-def test_a_job_whose_worker_is_killed_goes_on_at_its_last_phase(service: Service) -> None:
+def test_a_second_dispatcher_waits_and_takes_over_the_job_of_a_killed_one_at_its_last_phase(service: Service) -> None:
     job, after = service.submit("gate"), service.submit("fine")
-    service.kill_worker_in_gate(job)
-    service.open_gate(job)
-    with service.worker():
-        found = service.ended(job)
-        service.ended(after)
+    with service.worker() as first:
+        wait_until(lambda: service.in_gate(job))
+        with service.worker() as second:
+            assert [(info.alive, info.jobs) for info in service.store.workers()] == [(True, [job])]
+            assert "dispatches the jobs" not in second.words()
+            first.end(signal.SIGKILL)
+            assert service.state(job).state is JobState.running
+            wait_until(lambda: service.state(job).attempts == 2)
+            assert "dispatches the jobs" in second.words()
+            service.open_gate(job)
+            found = service.ended(job)
+            service.ended(after)
 
     assert (found.state, found.attempts) == (JobState.succeeded, 2)
     notes = trace(service.folder(job))
@@ -72,21 +84,6 @@ def test_a_job_whose_worker_is_killed_goes_on_at_its_last_phase(service: Service
     assert [message.split(" ")[0] for message in messages[:2]] == ["queued", "started"]
     assert messages[2] == "its worker or dispatcher died"
     assert "continued by" in messages[3]
-
-
-def test_a_second_dispatcher_waits_and_takes_over_from_one_that_is_gone_for_good(service: Service) -> None:
-    job = service.submit("gate")
-    with service.worker() as first:
-        wait_until(lambda: service.in_gate(job))
-        with service.worker() as second:
-            assert [(info.alive, info.jobs) for info in service.store.workers()] == [(True, [job])]
-            assert "dispatches the jobs" not in second.words()
-            first.end(signal.SIGKILL)
-            wait_until(lambda: service.state(job).attempts == 2)
-            assert "dispatches the jobs" in second.words()
-            service.open_gate(job)
-            found = service.ended(job)
-    assert found.state is JobState.succeeded
 
 
 def test_a_dispatcher_that_was_frozen_leaves_the_jobs_to_the_next_and_waits(service: Service) -> None:
@@ -134,12 +131,12 @@ def test_a_frozen_process_loses_its_job_and_never_replaces_what_a_newer_attempt_
 
 def test_cancelling_stops_a_running_job_within_its_phase_and_a_queued_one_at_once(service: Service) -> None:
     running, queued, after = service.submit("gate"), service.submit("fine"), service.submit("fine")
-    with service.worker() as process:
+    with service.worker(renderers=["--renderers-dns", f"localhost:{service.renderer}"]) as process:
         wait_until(lambda: service.in_gate(running))
         assert service.store.request_cancel(queued).state is JobState.cancelled
         assert service.store.request_cancel(running).state is JobState.running
         assert service.ended(running).state is JobState.cancelled  # its gate is closed: the phase would never end
-        assert service.ended(after).state is JobState.succeeded
+        assert service.ended(after).state is JobState.succeeded, "its renderer is found by a name"
         words = process.words()
 
     assert trace(service.folder(queued)) == []
@@ -161,19 +158,6 @@ def test_a_job_fails_with_a_remedy_where_no_renderer_answers(service: Service) -
         found = service.ended(job)
     assert found.state is JobState.failed
     assert re.search(r"No renderer answers at 127\.0\.0\.1:1.*trompe render", found.error or "", re.DOTALL)
-
-
-def test_renderers_are_found_by_a_name(service: Service) -> None:
-    job = service.submit("fine")
-    with service.worker(renderers=["--renderers-dns", f"localhost:{service.renderer}"]):
-        assert service.ended(job).state is JobState.succeeded
-
-
-def test_a_worker_ends_with_its_parent(service: Service) -> None:
-    with service.worker() as running:
-        assert running.process.stdin is not None
-        running.process.stdin.close()
-        assert running.process.wait(120) == 0
 
 
 def test_workers_of_a_service_are_counted_together_and_those_elsewhere_serve_their_own(

@@ -172,7 +172,12 @@ def read_archive(services: ServicesDep, job: str) -> StreamingResponse:
     found = services.store.get(job)
     if not found.artifacts:
         raise NotFoundError(f"Job {job} is {found.state} and has no artifacts.")
-    parts = zip_stream(services.artifacts(job), found.artifacts, time=found.finished or found.created)
+    artifacts = services.artifacts(job)
+    if gone := set(found.artifacts) - set(artifacts.names()):
+        raise NotFoundError(
+            f"Files of job {job} are no longer in the store: {', '.join(sorted(gone))}. Fetch the others one by one."
+        )
+    parts = zip_stream(artifacts, found.artifacts, time=found.finished or found.created)
     disposition = f'attachment; filename="trompe-{PurePath(job).name}.zip"'
     return StreamingResponse(parts, media_type="application/zip", headers={"Content-Disposition": disposition})
 
@@ -231,10 +236,7 @@ def labels_of(texts: list[str]) -> dict[str, str]:
 
 
 def send(services: Services, request: Request, job: Job, name: str) -> Response:
-    """Answer with a file of a job."""
+    """Answer with a file of a job. Raises ``MissingFileError``."""
     artifacts = services.artifacts(job.id)
-    try:
-        digest = (lasting_digest if job.state.final else digest_of)(artifacts, name)
-        return send_file(request, artifacts, name, digest=digest)
-    except FileNotFoundError as error:
-        raise NotFoundError(f"The file {name!r} of job {job.id} is no longer in the store.") from error
+    digest = (lasting_digest if job.state.final else digest_of)(artifacts, name)
+    return send_file(request, artifacts, name, digest=digest)

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
-from trompe_server.errors import ServiceError
+from trompe_server.errors import NotFoundError, ServiceError
 from trompe_server.executor.port import Ended, Executor
 from trompe_server.queue.claims import Claim, Claims, LostJobError
 from trompe_server.queue.leases import DISPATCHER, end_lease, take_lease
@@ -186,7 +186,7 @@ class Dispatcher:
             return
         try:
             for claim in self._held.values():
-                with suppress(LostJobError):
+                with suppress(LostJobError, NotFoundError):
                     self._claims.give_back(claim)
             forget_workers(self._claims.engine)
             end_lease(self._claims.engine, DISPATCHER, holder=self._name)

@@ -2,7 +2,7 @@
 
 import importlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from typing import Any, Final, TypeVar
@@ -11,7 +11,7 @@ from trompe_server.job.protocol import PhasedJob
 from trompe_server.library import Library
 from trompe_server.queue.claims import Claim
 from trompe_server.renderers.choice import JOB_ENGINES, JobEngines, listed, named
-from trompe_server.renderers.discovery import Address, DiscoveredRenderers, RendererAddresses, engines_at
+from trompe_server.renderers.discovery import DiscoveredRenderers, RendererAddresses, engines_at
 from trompe_server.renderers.protocol import TargetRenderer
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import Folder, JobArtifacts, job_artifacts
@@ -46,8 +46,7 @@ class JobOpener:
         attacked = len(engines.attacked)
         with ExitStack() as opened:
             targets = [
-                opened.enter_context(closing(DiscoveredRenderers(self._renderers, engine, _target)))
-                for engine in engines.all
+                opened.enter_context(closing(DiscoveredRenderers(self._renderers, engine))) for engine in engines.all
             ]
             yield load(self._settings.pipeline)(
                 claim.job.spec,
@@ -60,12 +59,12 @@ class JobOpener:
             )
 
     def _judgement(self, spec: JudgementSpec, artifacts: JobArtifacts) -> PhasedJob:
-        first = self._patiently(self._there)[0]
+        there = self._patiently(self._there)
         job: PhasedJob = load(JUDGEMENTS)(
             spec,
             artifacts=artifacts,
             library=self._library,
-            renderer=first.name,
+            renderer=there[0].named(there),
             opened=self._opened,
             device=self._settings.device,
         )
@@ -75,7 +74,7 @@ class JobOpener:
     def _opened(self, name: str) -> Iterator[TargetRenderer]:
         """The renderers with the engine ``name`` for the block. Raises ``RendererError``."""
         engine = self._patiently(lambda *, late: named(name, "renderers", self._there(late=late)))
-        with closing(DiscoveredRenderers(self._renderers, engine, _target)) as target:
+        with closing(DiscoveredRenderers(self._renderers, engine)) as target:
             yield target
 
     def _engines(self, spec: JobSpec, artifacts: JobArtifacts) -> JobEngines:
@@ -132,11 +131,3 @@ def load(path: str) -> Any:
     """Import ``module:name``. Late, because it imports torch."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)
-
-
-def _target(addresses: Sequence[Address], engine: EngineInfo) -> TargetRenderer:
-    from trompe_server.renderers import RendererPool, SailenvTarget
-
-    if len(addresses) == 1:
-        return SailenvTarget(*addresses[0], engine=engine)
-    return RendererPool(addresses, engine=engine)

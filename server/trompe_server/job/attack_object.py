@@ -81,6 +81,8 @@ def attack_object(
         cameras.sample(VIEWS, generator=np.random.default_rng([seed, stream])) if given is None else given
         for given, stream in ((views, POOL_STREAM), (held_out, HELD_OUT_STREAM))
     )
+    if any(view.backdrop for view in (*first, *others)):
+        raise SpecError("A view has a picture behind the object, which needs a job. Use views with a colour behind it.")
     renderer = JobRenderer(target, target.engine, attacked=True, noise=noise_numbers(target.engine, seed))
     own, unseen = renderer.shown(first), renderer.shown(others, held_out=True)
     budget = budget or Budget(epsilon=0.05, alpha=0.01)

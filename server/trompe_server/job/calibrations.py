@@ -40,10 +40,14 @@ class JobCalibrations:
         """Calibrate the attacked renderer ``number`` by its images of the unpainted object, unless that is done."""
         if self._files.has_calibration(number):
             return
-        name = f"{self._key(number, clean)}.npz"
-        found = self._known(name)
-        if found is None:
+        setup, search, renderer = self._setup, self._search, self._setup.attacked[number]
+        shown, engine = renderer.shown(setup.views), renderer.engine
+        key = calibration_key(setup.obj, shown, clean, engine=engine, wanted=search.surrogate, seed=search.seed)
+        known = self._stored(name := f"{key}.npz", unpack_calibration)
+        if known is None:
             found = self._probe(number, clean, ask)
+        else:
+            found = replace(known, renders=0, reason=f"{known.reason} (known from an earlier job)")
         packed = pack_calibration(found)
         self._files.save_calibration(number, packed)
         if found.renders:
@@ -66,23 +70,6 @@ class JobCalibrations:
             backdrops=setup.backdrops,
             device=setup.device,
         )
-
-    def _key(self, number: int, clean: Image8) -> str:
-        setup, search, renderer = self._setup, self._search, self._setup.attacked[number]
-        return calibration_key(
-            setup.obj,
-            renderer.shown(setup.views),
-            clean,
-            engine=renderer.engine,
-            wanted=search.surrogate,
-            seed=search.seed,
-        )
-
-    def _known(self, name: str) -> Calibration | None:
-        """The stored calibration of an earlier job with the same probes, if any."""
-        if (known := self._stored(name, unpack_calibration)) is None:
-            return None
-        return replace(known, renders=0, reason=f"{known.reason} (known from an earlier job)")
 
     def _stored(self, name: str, unpack: Callable[[bytes], T]) -> T | None:
         """A shared file, marked as used; ``None`` if there is none or it is damaged."""

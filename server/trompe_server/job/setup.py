@@ -167,7 +167,8 @@ def open_setup(
     drawn = partial(drawn_views, distribution, spec.views.background, seed=spec.search.seed)
     views = _grid(spec, framing) if spec.views.grid else drawn(spec.views.count, stream=POOL_STREAM)
     first = _first(spec, len(views), renderers=1 + len(more_targets))
-    pictures = {name: _picture(name, library) for name in spec.views.background if colour_of(name) is None}
+    named = [name for name in spec.views.background if colour_of(name) is None]
+    pictures = {name: fitted(_picture(name, library), classifier.image_size) for name in named}
     return JobSetup(
         obj,
         info.name,
@@ -183,7 +184,7 @@ def open_setup(
             *(_renderer(spec, each, pictures, attacked=True) for each in (target, *more_targets)),
             *(_renderer(spec, each, pictures, attacked=False) for each in judge_targets),
         ),
-        {name: fitted(picture, classifier.image_size) for name, picture in pictures.items()},
+        pictures,
         None if info.format == SAILENV else library.original(spec.object),
         device,
         PIPELINES.get(spec.image_pipeline),

@@ -10,7 +10,7 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any, Final
 
@@ -74,15 +74,6 @@ AS_PREPARED: Final = 1.5
 Ask = Callable[[JobRenderer, Object3D, Sequence[View]], Image8]
 
 
-@dataclass(frozen=True)
-class _Scene:
-    """What the attack's steps look at: all views so far, their backgrounds if several, the texels that may change."""
-
-    surrogate: AnySurrogate
-    backgrounds: Backgrounds | None
-    texels: TexelMasks
-
-
 def open_job(
     spec: JobSpec, *, library: Library, artifacts: Artifacts, target: TargetRenderer, **options: Any
 ) -> "TextureAttack":
@@ -120,7 +111,7 @@ class TextureAttack:
         self._between = time.perf_counter() if began is None else began
         self._stepped: deque[float] = deque(maxlen=RECENT)
         self._next_preview = 0.0
-        self._scenes: dict[tuple[View, ...], _Scene] = {}
+        self._scenes: dict[tuple[View, ...], tuple[AnySurrogate, Backgrounds | None, TexelMasks]] = {}
 
     def phases(self) -> list[str]:
         """See ``PhasedJob.phases``."""
@@ -272,11 +263,11 @@ class TextureAttack:
         self._next_preview = began + (time.perf_counter() - began) / PREVIEWING
 
     def _ascend(self, state: AttackState, steps: int, on_step: Callable[[Step], None]) -> AttackState:
-        setup, search, scene = self.setup, self.spec.search, self._scene()
+        setup, search, (surrogate, backgrounds, texels) = self.setup, self.spec.search, self._scene()
         return attack(
             state,
             self._textures,
-            scene.surrogate,
+            surrogate,
             setup.members,
             goal=setup.goal,
             budget=self.budget,
@@ -284,20 +275,21 @@ class TextureAttack:
             total_steps=search.steps,
             optimiser=search.optimiser,
             masks=self._masks,
-            texels=scene.texels,
+            texels=texels,
             views_per_step=self.spec.views_per_step * len(setup.attacked),
-            backgrounds=scene.backgrounds,
+            backgrounds=backgrounds,
             pipeline=setup.pipeline,
             seed=search.seed,
             on_step=on_step,
         )
 
-    def _scene(self) -> _Scene:
+    def _scene(self) -> tuple[AnySurrogate, Backgrounds | None, TexelMasks]:
+        """What the steps look at: all views so far, their backgrounds if several, the texels that may change."""
         added = self._pool.views if self.setup.further else ()
         if added not in self._scenes:
             parts = [*self._surrogates, *(self._pool.surrogates if added else ())]
             surrogate, backgrounds = joined(parts), self._backgrounds(added)
-            self._scenes = {added: _Scene(surrogate, backgrounds, self._movable(surrogate))}
+            self._scenes = {added: (surrogate, backgrounds, self._movable(surrogate))}
         return self._scenes[added]
 
     def _judge(self, on_progress: OnProgress) -> PhaseReport:

@@ -95,7 +95,7 @@ class _Run:
         for name in self.judged.suite.renderers:
             try:
                 self._again_if_lost(name)
-            except RendererError as error:
+            except (RendererError, SpecError) as error:  # no such renderer, or several
                 self.judged.missing[name] = str(error)
                 self._timed.skip(_rendering(name), *(_showing(name, network) for network in self.judged.judges))
 
@@ -104,6 +104,7 @@ class _Run:
         try:
             self._in_renderer(name)
         except RendererLostError:
+            self._timed.left[_rendering(name)] = 2 * len(self.judged.views)
             self._in_renderer(name)
 
     @cached_property

@@ -4,11 +4,11 @@ On one machine they are files and names (``LocalSources``), in a service stored 
 """
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from trompe_server.classifiers import Classifier, classifier_file, load_classifier
 from trompe_server.formats import import_file
@@ -37,39 +37,15 @@ class JudgedObject:
     shipped: str | None = None
 
 
-class Sources(Protocol):
-    """Resolves the names in a judgement."""
-
-    @property
-    def renderer(self) -> str:
-        """Name of the default renderer."""
-        ...
-
-    def object(self, source: str, role: str) -> JudgedObject:
-        """The object ``before`` or ``after``, as ``role`` says. Raises ``ObjectError``, or ``NotFoundError``."""
-        ...
-
-    def network(self, reference: str, label: Sequence[str | int]) -> tuple[Judge, JudgedNetwork]:
-        """Load a network, with the labels among ``label`` that it knows.
-
-        Raises ``ClassifierError``, and ``LabelError`` if it knows none of them.
-        """
-        ...
-
-    def running(self, name: str) -> AbstractContextManager[TargetRenderer]:
-        """The renderer ``name`` for the block. Raises ``RendererError``."""
-        ...
-
-
 @dataclass(frozen=True)
 class LocalSources:
-    """Paths and names on this machine, for a manifest in ``folder``."""
+    """Paths and names on this machine, for a manifest in ``folder``. renderer: the default one."""
 
     folder: Path
     renderer: str = DEFAULT_ENGINE
 
     def object(self, source: str, role: str) -> JudgedObject:
-        """See ``Sources``; ``role`` is not needed."""
+        """The object ``before`` or ``after``, as ``role`` says. Raises ``ObjectError``."""
         if source in shipped_objects() and not Path(source).exists():
             return _shipped(source)
         name, content = model_file(Path(source))
@@ -78,7 +54,10 @@ class LocalSources:
         return _imported(content.read_bytes(), name, source=self._relative(source))
 
     def network(self, reference: str, label: Sequence[str | int]) -> tuple[Judge, JudgedNetwork]:
-        """See ``Sources``."""
+        """Load a network, with the labels among ``label`` that it knows.
+
+        Raises ``ClassifierError``, and ``LabelError`` if it knows none of them.
+        """
         path = network_file(reference)
         network = load_classifier(reference, classes=None if path is None else classes_beside(path))
         return _judge(network, label, reference, reference if path is None else self._relative(reference), path is None)
@@ -109,17 +88,19 @@ class StoredSources:
     device: str = "cpu"
 
     def object(self, source: str, role: str) -> JudgedObject:
-        """See ``Sources``."""
+        """As of ``LocalSources``; raises ``NotFoundError`` too."""
         original = self.library.original(source)
         if original is None:
             return _shipped(self.library.objects.find(source).name)
         data, filename = original
-        name = f"{role}{Path(filename).suffix.lower()}"
+        if self.library.objects.find(source).id != identity_of(data):  # its textures were reduced
+            data, filename = self.library.object_bytes(source), "object.zip"
+        name = role + re.sub(r"[^a-z0-9.]", "", Path(filename).suffix.lower())
         self.artifacts.write(name, data)
         return _imported(data, filename, source=name)
 
     def network(self, reference: str, label: Sequence[str | int]) -> tuple[Judge, JudgedNetwork]:
-        """See ``Sources``."""
+        """As of ``LocalSources``."""
         info, file = self.library.classifier(reference), self.library.classifier_path(reference)
         network = load_classifier(file, name=info.name, classes=info.classes, device=self.device)
         by_name = network_file(file) is None
@@ -127,8 +108,12 @@ class StoredSources:
         return _judge(network, label, file, shown, by_name)
 
     def running(self, name: str) -> AbstractContextManager[TargetRenderer]:
-        """See ``Sources``."""
+        """The service's renderers called ``name`` for the block. Raises ``RendererError``."""
         return self.opened(name)
+
+
+Sources = LocalSources | StoredSources
+"""Resolves the names in a judgement."""
 
 
 def network_file(reference: str) -> Path | None:

@@ -56,9 +56,8 @@ def suite_of(spec: JudgementSpec, *, renderer: str) -> Suite:
     """
     if spec.suite is None:
         views = VIEWS if spec.views is None else spec.views
-        return Suite(
-            views, spec.seed or 0, None, tuple(spec.renderers) or (renderer,), tuple(spec.networks) or (NETWORK,)
-        )
+        asked, networks = (tuple(dict.fromkeys(names)) for names in (spec.renderers, spec.networks))
+        return Suite(views, spec.seed or 0, None, asked or (renderer,), networks or (NETWORK,))
     if spec.suite not in SUITES:
         raise SpecError(f"There is no suite {spec.suite!r}; choose {', '.join(SUITES)}.")
     suite = SUITES[spec.suite]

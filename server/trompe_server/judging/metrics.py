@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from statistics import NormalDist
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,23 +139,18 @@ def transfer_gap(surrogate: Accuracy | None, target: Accuracy) -> float | None:
     return surrogate.a_drop - target.a_drop
 
 
-class Agreement(NamedTuple):
+def agreement(before: Logits, after: Logits, predicted: Logits, label: Label) -> dict[str, float | None]:
     """Agreement of a surrogate with its target on the classifier's verdicts of the repainted object's own views.
 
+    From logits (views, classes) of the target before and after, and of the surrogate's images after.
     disagreement: share of the views recognised in one and not in the other. margin_error: mean |difference| of the
     margins, as a share of the margin that the attack moved in the target; ``None`` if it moved none.
     """
-
-    disagreement: float
-    margin_error: float | None
-
-
-def agreement(before: Logits, after: Logits, predicted: Logits, label: Label) -> Agreement:
-    """Compare logits (views, classes): of the target before and after, and of the surrogate's images after."""
     clean, true, guess = (margins(logits, label) for logits in (before, after, predicted))
     moved = float((clean - true).mean())
     differ = recognised(after, label) != recognised(predicted, label, like=after)
-    return Agreement(float(differ.mean()), float(np.abs(guess - true).mean()) / moved if moved > 0 else None)
+    error = float(np.abs(guess - true).mean()) / moved if moved > 0 else None
+    return {"disagreement": float(differ.mean()), "margin_error": error}
 
 
 def margins(logits: Logits, label: Label) -> NDArray[np.float64]:
@@ -195,15 +190,9 @@ def camera_and_light(view: View) -> dict[str, Any]:
     return camera | {f"light_{name}": value for name, value in vars(view.light).items()}
 
 
-def fooled_as(before: Logits, after: Logits, label: Label) -> dict[int, int]:
-    """``predicted_classes`` after the attack, of the views recognised before it and not after."""
-    return predicted_classes(after[recognised(before, label) & ~recognised(after, label, like=before)])
-
-
-def predicted_classes(logits: Logits) -> dict[int, int]:
-    """Number of views predicted as each class, from logits (views, classes); most frequent first, then by index."""
-    counts = Counter(logits.argmax(axis=1).tolist())
-    return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+def fooled_as(before: Logits, after: Logits, label: Label) -> Counter[int]:
+    """Number of views by class after the attack, of those recognised before it and not after."""
+    return Counter(after[recognised(before, label) & ~recognised(after, label, like=before)].argmax(axis=1).tolist())
 
 
 def texels_altered(before: Textures, after: Textures) -> float:

@@ -13,14 +13,15 @@ CLOSE: Final = 1.5
 
 
 def estimate(ended: Sequence[tuple[Job, Outcome]], *, pool: int, steps: int, epsilon: float) -> str | None:
-    """Medians over the jobs among ``ended`` with these views and steps and about this epsilon, in words.
+    """Medians over the jobs among ``ended`` with this pool, these steps and about this epsilon, in words.
 
     ``None`` if there are none. ``ended`` are against one classifier.
     """
 
     def is_like(spec: JobSpec) -> bool:
         ratio = max(spec.paint.epsilon, epsilon) / max(min(spec.paint.epsilon, epsilon), 1e-6)
-        return (spec.views.pool, spec.search.steps) == (pool, steps) and ratio <= CLOSE
+        effort = (spec.views.pool, spec.search.steps)
+        return not spec.views.grid and effort == (pool, steps) and ratio <= CLOSE
 
     like = [(job, outcome.drop) for job, outcome in ended if is_like(job.attack) and outcome.drop is not None]
     took = [(job.finished - job.started).total_seconds() for job, _ in like if job.started and job.finished]

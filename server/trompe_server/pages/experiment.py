@@ -38,6 +38,7 @@ def points_of(entries: Sequence[Entry], options: Sequence[str]) -> list[Point]:
         judged = result and (result.held_out or result.target)
         if not result or not judged or judged.a_drop is None:
             continue
+        probed = [str(value) for name, value in asked.items() if name in comparison.PROBED]
         job = comparison.Job(
             row.object,
             ", ".join(f"{name} {value_text(asked[name])}" for name in shown),
@@ -45,7 +46,7 @@ def points_of(entries: Sequence[Entry], options: Sequence[str]) -> list[Point]:
             max(sum(result.seconds.values()), 0.1),
             judged.a_drop,
             (result.probe_renders, result.seconds.get("calibrate", 0.0)),
-            (row.object, result.surrogate_model, result.target.views, asked["seed"]),
+            (row.object, result.image_size, result.target.views, asked["seed"], *probed),
         )
         points.append(Point(row.id, job))
     return points

@@ -8,6 +8,7 @@ from trompe_server.errors import NotFoundError
 from trompe_server.library import Library
 from trompe_server.pages.present import ClassNames, JobRow
 from trompe_shared.api import OPTIONS, Job, JobSpec, JudgementSpec
+from trompe_shared.errors import ClassifierError
 
 
 class Names:
@@ -62,10 +63,10 @@ class Names:
 
 
 def _classes(library: Library, reference: str) -> Sequence[str]:
-    """Names of a classifier's classes, if there are any."""
+    """Names of a classifier's classes; none for one that is deleted, no longer allowed, or cannot be loaded."""
     try:
         return library.classifier(reference).classes or ()
-    except NotFoundError:
+    except (NotFoundError, ClassifierError):
         return ()
 
 

@@ -39,7 +39,7 @@ Record = Mapping[str, Any]
 
 
 def offline_page(services: Services, job: Job, row: JobRow, shown: Shown) -> str:
-    """HTML of the result of ``job``. Raises ``FileNotFoundError`` if its images are not stored any more."""
+    """HTML of the result of ``job``. Raises ``MissingFileError`` if its images are not stored any more."""
     views: Sequence[Record] = shown.viewer[0]["views"]
     pictured = _pictured(services, job, views)
     return render(

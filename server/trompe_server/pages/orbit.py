@@ -25,14 +25,11 @@ def orbit(result: Result, job: str, classifiers: Sequence[ClassifierInfo]) -> Ma
     start = next(fooled, views[0])
     if start.after is None:
         return None
-    own = result.spec.victim.classifier
     return {
         "files": {name: static(f"{FOLDER.name}/{file}") for name, file in (("three", THREE), ("lights", LIGHTS))},
         "models": {side: f"/jobs/{job}/models/{side}.glb" for side in ("before", "after")},
         "label": " or ".join(map(str, result.label_names or result.labels)),
-        "labels": result.label_names or result.labels,
-        "classifiers": _choices(classifiers, own),
-        "classifier": own,
+        "classifiers": _choices(classifiers, result),
         "size": result.image_size,
         "fov": FIELD_OF_VIEW,
         "centred": result.spec.views.looks_at == "object",
@@ -53,10 +50,15 @@ def painted(services: Services, job: Job, side: str) -> Object3D:
     raise NotFoundError(f"Job {job.id} has no repainted object.")
 
 
-def _choices(classifiers: Sequence[ClassifierInfo], own: str) -> list[dict[str, str]]:
-    """Networks to choose from, ``own`` first, also if it is not stored, as torchvision's are."""
-    stored = {info.reference: info.name for info in classifiers}
-    return [{"reference": each, "name": name} for each, name in ({own: stored.get(own, own)} | stored).items()]
+def _choices(classifiers: Sequence[ClassifierInfo], result: Result) -> list[dict[str, Any]]:
+    """Networks to choose from with the object's classes. The job's own is first, also if it is not stored, as
+    torchvision's are; it has indices, since two of its classes can have one name."""
+    own, stored = result.spec.victim.classifier, {info.reference: info.name for info in classifiers}
+    named = result.label_names or result.labels
+    return [
+        {"reference": each, "name": name, "labels": result.labels if each == own else named}
+        for each, name in ({own: stored.get(own, own)} | stored).items()
+    ]
 
 
 def _pose(view: ViewPrediction) -> Mapping[str, Any]:

@@ -20,6 +20,7 @@ from trompe_shared.api import (
     Result,
     ViewPrediction,
 )
+from trompe_shared.local_files import LOOKED_UP
 
 ClassNames = Callable[[int], str]
 
@@ -85,9 +86,9 @@ class JobRow(Job):
     @property
     def phase(self) -> str:
         """The present phase in words; a running job that has reported none is being opened."""
-        kind = self.progress.phase.partition("-")[0]
-        kind = "open" if self.state is JobState.running and kind == JobState.queued else kind
-        return PHASES.get(kind, kind)
+        phase = self.progress.phase
+        phase = "open" if self.state is JobState.running and phase == JobState.queued else phase
+        return PHASES.get(phase.partition("-")[0], phase)
 
     @property
     def eta(self) -> str | None:
@@ -151,6 +152,7 @@ class Shown:
 def present(result: Result, job: JobRow, *, names: ClassNames) -> Shown:
     """Prepare a result for its page. ``names`` maps class indices to names."""
     sets = _view_sets(result, names, f"/jobs/{job.id}/pictures")
+    own = result.spec.victim.classifier
     return Shown(
         result=result,
         verdict=_verdict(result, job),
@@ -169,7 +171,9 @@ def present(result: Result, job: JobRow, *, names: ClassNames) -> Shown:
             for name, each in result.by_renderer
             if each.surrogate_model
         ],
-        command=command(result.spec, object=job.object, classifier=job.classifier),
+        command=command(
+            result.spec, object=job.object, classifier=own if own.startswith(LOOKED_UP) else job.classifier
+        ),
     )
 
 

@@ -46,6 +46,7 @@ GALLERY: Final[Mapping[str, Any]] = json.loads((Path(__file__).parent / "gallery
 LATEST: Final = 8
 PAGE: Final = 50
 MOST_COMPARED: Final = 6
+EXPERIMENT_PAGE: Final = 500
 RECENT: Final = 200
 """Jobs from which an estimate is made."""
 STREAM_INTERVAL: Final = 1.0
@@ -226,7 +227,7 @@ def experiments(request: Request, services: ServicesDep) -> HTMLResponse:
 @router.get("/experiments/{name:path}")
 def show_experiment(request: Request, services: ServicesDep, name: str, cursor: Cursor = None) -> HTMLResponse:
     """Jobs of an experiment, and a chart of seconds and accuracy."""
-    found = services.store.page(labels={EXPERIMENT: name}, limit=500, cursor=cursor)
+    found = services.store.page(labels={EXPERIMENT: name}, limit=EXPERIMENT_PAGE, cursor=cursor)
     if not found.jobs:
         raise NotFoundError(f"There is no experiment {name!r}.")
     names = Names(services.library)
@@ -242,6 +243,7 @@ def show_experiment(request: Request, services: ServicesDep, name: str, cursor: 
         chart=chart(points_of(entries, options), measure="A_drop in the target (held-out views, if any)"),
         columns=[*options, *OUTCOME],
         lines=[(entry[0], cells_of(entry, options)) for entry in entries],
+        whole=cursor is None and found.next_cursor is None,
         older=found.next_cursor and f"?{urlencode({'cursor': found.next_cursor})}",
     )
 
@@ -293,7 +295,7 @@ def _painted(job: Job) -> dict[str, Any]:
     return {
         "before": spec.object,
         "after": f"{JOB_RESULT}{job.id}",
-        "label": spec.goal.label[0],
+        "label": spec.goal.label,
         "network": spec.victim.classifier,
         "epsilon": spec.paint.epsilon,
     }

@@ -5,6 +5,7 @@ attempt raise ``LostJobError``, so a worker that was frozen and comes back chang
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from typing import Any, Final
@@ -141,8 +142,8 @@ class Claims:
             _requeue(connection, row, "the worker stopped; the next one continues the job")
 
     def lose(self, claim: Claim, reason: str) -> None:
-        """Take the job from its attempt, which died or stands still, unless the attempt is over."""
-        with write(self.engine) as connection:
+        """Take the job from its attempt, which died or stands still, unless the attempt is over or the job deleted."""
+        with suppress(NotFoundError), write(self.engine) as connection:
             row = fresh(connection, claim.job.id, lock=True)
             if _is_held(row, claim):
                 _lose(connection, row, reason, jobs.c.lost)

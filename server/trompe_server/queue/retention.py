@@ -13,6 +13,8 @@ from trompe_server.storage.folders import Folder, job_artifacts
 logger = logging.getLogger(__name__)
 
 DAY: Final = 86_400.0
+BATCH: Final = 100
+"""Jobs looked up at once."""
 INTERVAL: Final = 3600.0
 """Longest time between two runs, seconds. Shorter if jobs are kept for less than four hours."""
 
@@ -49,7 +51,7 @@ class Retention:
     def run(self) -> int:
         """Run once. Returns the number of deleted jobs."""
         deleted, kept = 0, set[str]()
-        while jobs := [job for job in self._store.ended_before(self._kept) if job not in kept]:
+        while jobs := [job for job in self._store.ended_before(self._kept, limit=BATCH + len(kept)) if job not in kept]:
             for job in jobs:
                 try:
                     delete_job(self._store, self._files, job)

@@ -180,8 +180,8 @@ class JobStore:
             connection.execute(events.delete().where(events.c.job == job))
             connection.execute(jobs.delete().where(jobs.c.number == row.number))
 
-    def ended_before(self, seconds: float, *, limit: int = 100) -> list[str]:
-        """Ids of jobs that ended more than ``seconds`` ago, oldest first."""
+    def ended_before(self, seconds: float, *, limit: int) -> list[str]:
+        """Ids of at most ``limit`` jobs that ended more than ``seconds`` ago, oldest first."""
         query = sa.select(jobs.c.id).where(jobs.c.finished < clock() - seconds).order_by(jobs.c.finished).limit(limit)
         with self.engine.connect() as connection:
             return list(connection.execute(query).scalars())

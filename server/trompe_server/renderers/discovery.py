@@ -3,7 +3,7 @@
 import logging
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_server.renderers.choice import listed
+from trompe_server.renderers.pool import RendererPool
 from trompe_server.renderers.protocol import OnFrame, TargetRenderer
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, RendererLostError
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
-from trompe_shared.sailenv_client import engine_at
+from trompe_shared.sailenv_client import SailenvTarget, engine_at
 
 logger = logging.getLogger(__name__)
 
@@ -63,18 +64,13 @@ def engines_at(addresses: Sequence[Address]) -> dict[Address, EngineInfo | None]
 class DiscoveredRenderers:
     """A ``TargetRenderer`` over the renderers with ``engine``; resolves their addresses anew between requests.
 
-    make: builds the target for a list of addresses and the engine. Raises ``RendererLostError`` if none has the engine.
+    Raises ``RendererLostError`` if none has the engine.
     """
 
-    def __init__(
-        self,
-        renderers: RendererAddresses,
-        engine: EngineInfo,
-        make: Callable[[Sequence[Address], EngineInfo], TargetRenderer],
-    ) -> None:
-        self.engine, self._renderers, self._make = engine, renderers, make
+    def __init__(self, renderers: RendererAddresses, engine: EngineInfo) -> None:
+        self.engine, self._renderers = engine, renderers
         self._addresses = renderers.addresses()
-        self._target = make(self._with_engine(), engine)
+        self._target = self._connected()
         self._looked = time.monotonic()
 
     def render(
@@ -99,7 +95,11 @@ class DiscoveredRenderers:
             logger.info("the renderers are at %s now", addresses)
             self._target.close()
             self._addresses = addresses
-            self._target = self._make(self._with_engine(), self.engine)
+            self._target = self._connected()
+
+    def _connected(self) -> TargetRenderer:
+        first, *others = found = self._with_engine()
+        return RendererPool(found, engine=self.engine) if others else SailenvTarget(*first, engine=self.engine)
 
     def _with_engine(self) -> list[Address]:
         """The addresses with the engine, then the silent ones: they are asked again when they are needed."""

@@ -18,8 +18,8 @@ COMMAND: Final = (sys.executable, "-m", "trompe_server.system.child", "render", 
 def local_renderer(command: Sequence[str] = COMMAND) -> Iterator[SailenvTarget]:
     """Run a renderer worker on a free port; it ends with the block, and with this process.
 
-    command: starts another worker. It must print ``listening on HOST:PORT`` as its first line and end when its standard
-    input closes.
+    command: starts another worker. It must print ``listening on HOST:PORT`` in a line and end when its standard input
+    closes.
 
     Raises ``RendererError`` with the worker's last words if it does not start.
     """
@@ -30,7 +30,8 @@ def local_renderer(command: Sequence[str] = COMMAND) -> Iterator[SailenvTarget]:
     ):
         try:
             assert process.stdout is not None
-            ready = re.search(r"listening on ([\d.]+):(\d+)", process.stdout.readline())
+            lines = (re.search(r"listening on ([\d.]+):(\d+)", line) for line in process.stdout)
+            ready = next(filter(None, lines), None)
             if ready is None:
                 raise RendererError(f"The renderer worker did not start. {_last_words(process, log)}")
             with contextlib.closing(SailenvTarget(ready[1], int(ready[2]))) as target:

@@ -17,15 +17,6 @@ DESCRIPTION: Final = """Crafts adversarial 3D objects. Upload an object and a cl
 submit a job, follow its events, fetch its result. Errors are problem details (RFC 9457);
 each response carries `X-Request-ID`. If the server has tokens, send `Authorization: Bearer trompe_...`."""
 
-ROUTERS: Final = (
-    library.router,
-    classify.router,
-    jobs.router,
-    judgements.router,
-    jobs.experiments,
-    health.router,
-)
-
 
 def create_app(services: Services) -> FastAPI:
     """Build the application on ``services``."""
@@ -36,7 +27,7 @@ def create_app(services: Services) -> FastAPI:
     app.add_middleware(Guard, tokens=services.tokens, rate=services.settings.rate_limit)
     app.add_middleware(Envelope, metrics=services.metrics)
     answer_with_problems(app)
-    for router in ROUTERS:
+    for router in (library.router, classify.router, jobs.router, judgements.router, jobs.experiments, health.router):
         app.include_router(router)
     add_pages(app)
     app.openapi = lambda: contract(app)  # type: ignore[method-assign]

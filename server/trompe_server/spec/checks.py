@@ -41,6 +41,17 @@ def check_labels(labels: Sequence[int], n_classes: int, *, given: Sequence[objec
         )
 
 
+def check_indices(label: Sequence[str | int], victim: Classes, judges: Sequence[Classes]) -> None:
+    """Raise ``SpecError`` for a class given by its index if a judge has another number of classes."""
+    index = next((each for each in label if isinstance(each, int) or each.strip().isdecimal()), None)
+    for judge in judges:
+        if index is not None and judge.n_classes != victim.n_classes:
+            raise SpecError(
+                f"The index {index} is another class for the judge {judge.name!r}: it has {judge.n_classes} classes, "
+                f"{victim.name!r} has {victim.n_classes}. Give the `label` by name."
+            )
+
+
 def check_top_k(top_k: int, n_others: int) -> None:
     """Raise ``SpecError`` for more than ``n_others``, the number of classes other than the object's."""
     if top_k > n_others:

@@ -1,5 +1,6 @@
 """Class labels: from a name, a synonym or an index to the index of the class."""
 
+import operator
 from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Final, SupportsIndex
@@ -35,7 +36,7 @@ def resolve_label(label: str | SupportsIndex, classes: Sequence[str] | None, n_c
     range, and for a name of no class or of several.
     """
     if isinstance(label, SupportsIndex) or label.strip().isdecimal():
-        digits = str(label).strip()
+        digits = label.strip() if isinstance(label, str) else str(operator.index(label))
         if len(digits) > MOST_DIGITS or not 0 <= int(digits) < n_classes:
             raise LabelError(
                 f"{digits[:MOST_DIGITS]} is not a class of {classifier!r}; its indices are 0..{n_classes - 1}."

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import sqlalchemy as sa
 from sqlalchemy.engine.interfaces import ExceptionContext
-from sqlalchemy.exc import ArgumentError, DataError, InterfaceError, NoSuchModuleError, OperationalError
+from sqlalchemy.exc import ArgumentError, DataError, InterfaceError, OperationalError
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 
@@ -69,18 +69,12 @@ def connect(url: str) -> sa.Engine:
         engine = sa.create_engine(parsed, pool_size=20, max_overflow=30)
         sa.event.listen(engine, "connect", _prepare_sqlite)
     elif kind in {"postgresql", "postgres"}:
-        engine = _postgres(parsed.set(drivername="postgresql+psycopg"))
+        parsed = parsed.set(drivername="postgresql+psycopg")
+        engine = sa.create_engine(parsed, pool_pre_ping=True, pool_size=10, max_overflow=40, connect_args=POSTGRES)
     else:
         raise ServiceError(_invalid_url(url))
     sa.event.listen(engine, "handle_error", _translate, retval=True)
     return engine
-
-
-def _postgres(url: sa.URL) -> sa.Engine:
-    try:
-        return sa.create_engine(url, pool_pre_ping=True, pool_size=10, max_overflow=40, connect_args=POSTGRES)
-    except (ImportError, NoSuchModuleError) as error:
-        raise ServiceError("PostgreSQL needs psycopg: pip install 'trompe[server]'") from error
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
-from trompe_server.errors import ServiceError
+from trompe_server.errors import MissingFileError, ServiceError
 from trompe_server.system.files import no_space, write_whole
 from trompe_shared.errors import SpecError, TrompeError
 
@@ -222,15 +222,15 @@ class JobArtifacts:
         self.folder.within(str(self.attempt)).write(name, data)
 
     def read(self, name: str) -> bytes:
-        """Bytes of a file. Raises ``FileNotFoundError``."""
+        """Bytes of a file. Raises ``MissingFileError``."""
         return self._where(name).read(name)
 
     def open(self, name: str) -> BinaryIO:
-        """Open a file for reading; it is seekable. Raises ``FileNotFoundError``."""
+        """Open a file for reading; it is seekable. Raises ``MissingFileError``."""
         return self._where(name).open(name)
 
     def size(self, name: str) -> int:
-        """Bytes of a file. Raises ``FileNotFoundError``."""
+        """Bytes of a file. Raises ``MissingFileError``."""
         return self._where(name).size(name)
 
     def exists(self, name: str) -> bool:
@@ -255,7 +255,7 @@ class JobArtifacts:
         for each in self._attempts():
             if each.exists(name):
                 return each
-        raise FileNotFoundError(f"There is no artifact {name!r}.")
+        raise MissingFileError(f"The file {name!r} is no longer in the store; run the job again to make it.")
 
     def _attempts(self) -> list[Folder]:
         """Folders of the attempts, newest first, then the job's folder itself."""

@@ -80,9 +80,9 @@ class Api:
         """The header that a new token is sent in."""
         return {"Authorization": f"Bearer {self.services.tokens.create(name, Right(right))}"}
 
-    def problem(self, response: httpx.Response, status: int) -> dict[str, Any]:
-        """The problem details of a response, checked to be well formed."""
-        assert response.status_code == status, response.text
+    def problem(self, response: httpx.Response, status: int, row: object = "") -> dict[str, Any]:
+        """The problem details of a response, checked to be well formed; ``row`` of a table is told on failure."""
+        assert response.status_code == status, f"{row} {response.text}"
         assert response.headers["content-type"] == "application/problem+json"
         body: dict[str, Any] = response.json()
         assert body["status"] == status

@@ -4,6 +4,7 @@ import asyncio
 import re
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from unittest.mock import Mock
 
 import httpx
@@ -57,13 +58,11 @@ def test_a_token_that_may_read_cannot_write_anything_and_one_that_may_write_can_
     assert api.get("/v1/jobs").status_code == 200
 
 
-@pytest.mark.parametrize(
-    "header",
-    ["Bearer trompe_guess", "Bearer ", "Bearer", "Basic dXNlcjpwYXNz", "trompe_guess", "bearer \N{SNOWMAN}"],
-)
-def test_what_is_no_token_is_refused(api: Api, header: str) -> None:
+def test_what_is_no_token_is_refused(api: Api) -> None:
     api.token("ci", Right.read)
-    api.problem(api.get("/v1/jobs", headers={"Authorization": header.encode()}), 401)
+    headers = ["Bearer trompe_guess", "Bearer ", "Bearer", "Basic dXNlcjpwYXNz", "trompe_guess", "bearer \N{SNOWMAN}"]
+    for header in headers:
+        api.problem(api.get("/v1/jobs", headers={"Authorization": header.encode()}), 401, header)
 
 
 def test_a_revoked_token_opens_nothing_and_the_service_stays_closed(api: Api) -> None:
@@ -76,13 +75,14 @@ def test_a_revoked_token_opens_nothing_and_the_service_stays_closed(api: Api) ->
     api.problem(api.get("/v1/jobs"), 401)
 
 
-@pytest.mark.parametrize("host", ["x/docs?", "x/docs#", "x/static/", "trompe/healthz?a=", "@/docs?", "[x/docs?"])
-@pytest.mark.parametrize("path", ["/v1/jobs", "/static/../v1/jobs", "/docs/../v1/jobs", "//v1/jobs", "/docs%2F..%2Fv1"])
-def test_no_host_and_no_path_is_a_way_around_the_token(api: Api, host: str, path: str) -> None:
+def test_no_host_and_no_path_is_a_way_around_the_token(api: Api) -> None:
     api.token("ci", Right.read)
-    answer = api.get(path, headers={"Host": host})
-    assert answer.status_code in {401, 404}
-    assert 'jobs":' not in answer.text
+    hosts = ["x/docs?", "x/docs#", "x/static/", "trompe/healthz?a=", "@/docs?", "[x/docs?"]
+    paths = ["/v1/jobs", "/static/../v1/jobs", "/docs/../v1/jobs", "//v1/jobs", "/docs%2F..%2Fv1"]
+    for host, path in product(hosts, paths):
+        answer = api.get(path, headers={"Host": host})
+        assert answer.status_code in {401, 404}, (host, path)
+        assert 'jobs":' not in answer.text, (host, path)
 
 
 def test_a_browser_that_signed_in_shows_its_token_in_a_cookie(api: Api) -> None:

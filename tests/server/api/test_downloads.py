@@ -9,7 +9,7 @@ import pytest
 
 from tests.server.api.conftest import Api
 from trompe_server.api import downloads
-from trompe_shared.api import JobState
+from trompe_shared.api import JobState, JudgementRequest
 
 TEN = b"0123456789"
 
@@ -50,9 +50,27 @@ def test_only_public_files_are_served(done: Ended) -> None:
     assert "It has: digits.txt." in done.api.problem(done.get("x"), 404)["detail"]
 
 
-def test_a_file_that_is_gone_from_the_store_is_not_found(done: Ended) -> None:
-    done.api.services.artifacts(done.job).delete()
-    assert "no longer in the store" in done.api.problem(done.get(), 404)["detail"]
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/v1/jobs/{}/artifacts/digits.txt",
+        "/v1/jobs/{}/archive",
+        "/v1/judgements/{}/manifest",
+        "/v1/judgements/{}/page",
+        "/jobs/{}/result.html",
+        "/jobs/{}/models/after.glb",
+    ],
+)
+def test_a_file_that_is_gone_from_the_store_is_not_found(stocked: Api, path: str) -> None:
+    if "judgements" in path:
+        request = JudgementRequest.of("mug", "mug", label="mug")
+        job = stocked.services.store.create(request)[0].id
+    else:
+        job = stocked.job()
+    files = {"digits.txt": TEN, "judgement.json": b"{}", "judgement.html": b"", "mug-adversarial.zip": b""}
+    stocked.end(job, JobState.succeeded, **files)
+    stocked.services.artifacts(job).delete()
+    assert "no longer in the store" in stocked.problem(stocked.get(path.format(job)), 404)["detail"]
 
 
 def test_without_a_result_the_reason_is_told_and_there_is_no_archive(stocked: Api) -> None:
@@ -82,37 +100,37 @@ def test_a_file_of_a_job_that_goes_on_is_hashed_anew_each_time(stocked: Api) -> 
     assert stocked.get(f"/v1/jobs/{job}/artifacts/a.txt").headers["etag"] != first
 
 
-@pytest.mark.parametrize(
-    ("asked", "status", "content"),
-    [
-        ("bytes=0-3", 206, b"0123"),
-        ("bytes=4-", 206, b"456789"),
-        ("bytes=-3", 206, b"789"),
-        ("bytes=9-99", 206, b"9"),
-        ("bytes=2-2", 206, b"2"),
-        ("bytes=-99", 206, TEN),
-        ("bytes=10-", 416, b""),
-        ("bytes=-0", 416, b""),
-        ("bytes=5-4", 200, TEN),
-        ("bytes=0-1,4-5", 200, TEN),
-        ("bytes=-", 200, TEN),
-        ("bytes=a-b", 200, TEN),
-        (f"bytes=0-{'9' * 5000}", 200, TEN),
-        ("lines=1-2", 200, TEN),
-    ],
-)
-def test_a_range_of_a_file(done: Ended, asked: str, status: int, content: bytes) -> None:
-    answer = done.get("digits.txt", {"Range": asked})
-    assert answer.status_code == status
-    if status == 416:
-        assert done.api.problem(answer, 416)["type"] == "urn:trompe:no-such-range"
-        assert answer.headers["content-range"] == "bytes */10"
-        return
-    assert answer.content == content
-    assert answer.headers["content-length"] == str(len(content))
-    first = TEN.index(content)
-    told = f"bytes {first}-{first + len(content) - 1}/10" if status == 206 else None
-    assert answer.headers.get("content-range") == told
+RANGES = [
+    ("bytes=0-3", 206, b"0123"),
+    ("bytes=4-", 206, b"456789"),
+    ("bytes=-3", 206, b"789"),
+    ("bytes=9-99", 206, b"9"),
+    ("bytes=2-2", 206, b"2"),
+    ("bytes=-99", 206, TEN),
+    ("bytes=10-", 416, b""),
+    ("bytes=-0", 416, b""),
+    ("bytes=5-4", 200, TEN),
+    ("bytes=0-1,4-5", 200, TEN),
+    ("bytes=-", 200, TEN),
+    ("bytes=a-b", 200, TEN),
+    (f"bytes=0-{'9' * 5000}", 200, TEN),
+    ("lines=1-2", 200, TEN),
+]
+
+
+def test_a_range_of_a_file(done: Ended) -> None:
+    for asked, status, content in RANGES:
+        answer = done.get("digits.txt", {"Range": asked})
+        assert answer.status_code == status, asked
+        if status == 416:
+            assert done.api.problem(answer, 416)["type"] == "urn:trompe:no-such-range", asked
+            assert answer.headers["content-range"] == "bytes */10", asked
+            continue
+        assert answer.content == content, asked
+        assert answer.headers["content-length"] == str(len(content)), asked
+        first = TEN.index(content)
+        told = f"bytes {first}-{first + len(content) - 1}/10" if status == 206 else None
+        assert answer.headers.get("content-range") == told, asked
 
 
 def test_a_download_goes_on_only_if_the_file_is_the_same(done: Ended) -> None:

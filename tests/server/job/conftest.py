@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.attack_runs import default_sampling
 from tests.job_runs import SmallLibrary
 from trompe_server.library import Library
 from trompe_server.surrogate import SamplingModel
@@ -37,11 +38,9 @@ def pictures() -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def default_sampling() -> Iterator[None]:
-    """Calibrations with the default sampling: its search takes four times as long as the rest of a small job."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("trompe_server.surrogate.calibration.find_sampling", lambda _: SamplingModel())
-        patch.setattr("trompe_server.surrogate.calibration.find_physics", lambda best, *_: best)
+def known_sampling() -> Iterator[None]:
+    """Calibrations with the default sampling."""
+    with default_sampling():
         yield
 
 

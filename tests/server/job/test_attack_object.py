@@ -1,5 +1,6 @@
 """One attack without a service: random renderers, views of one's own, and none."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,13 @@ def test_held_out_views_are_not_needed() -> None:
     assert attacked.target.views == 5
     assert all(views for _, views in target.asked)
     assert {view.noise for _, views in target.asked for view in views} == {0}
+
+
+def test_a_picture_behind_the_object_is_refused_at_once() -> None:
+    target = Recorder()
+    with pytest.raises(SpecError, match="picture behind the object"):
+        attack_object(CHAIR, "tiny", target=target, **OPTIONS | {"held_out": [replace(VIEWS[0], backdrop="sea")]})
+    assert target.asked == []
 
 
 def test_an_attack_on_no_views_is_refused_at_once() -> None:

@@ -11,7 +11,19 @@ from tests.fakes import FakeTarget
 from tests.job_runs import MemoryArtifacts, run_job, spec_of
 from tests.pretend_device import pretend_device
 from tests.scores_only import Scores
-from trompe_server.attack import Budget, Goal, attack, start
+from trompe_server.attack import (
+    Budget,
+    Goal,
+    attack,
+    best_texels,
+    few_texels,
+    image_gradients,
+    movable,
+    rank_texels,
+    saliency,
+    saliency_masks,
+    start,
+)
 from trompe_server.classifiers import NetworkClassifier, load_classifier
 from trompe_server.job.texture_attack import CHUNK
 from trompe_server.library import Library
@@ -78,6 +90,24 @@ def test_an_attack_computes_on_its_surrogates_device(mug: Object3D, monkeypatch:
     expected, other = found
     assert any(delta.any() for delta in expected.values())
     assert all(torch.equal(expected[name], other[name]) for name in expected)
+
+
+def test_texels_are_chosen_for_a_surrogate_on_another_device(mug: Object3D, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As docs/library.md does it: textures, masks and gradients stay on the CPU."""
+    textures, budget, found = textures_of(mug), Budget(0.1, 0.03), []
+    for device in ("cpu", pretend_device(monkeypatch)):
+        geometry = prepare_geometry(mug, MUG_VIEWS, size=SIZE, sampling=SamplingModel(), device=device)
+        surrogate, classifier = diffuse_surrogate(geometry, MUG_VIEWS), load_classifier("tiny", device=device)
+        assert isinstance(classifier, NetworkClassifier)
+        clean, goal = surrogate.images(mug), Goal((classifier.classes or ()).index("mug"))
+        masks, gradients = (each(clean, classifier, goal=goal) for each in (saliency, image_gradients))
+        masks = saliency_masks(masks, 0.05)
+        ranked = best_texels(rank_texels(surrogate, textures, gradients), 0.05)
+        tried = few_texels(0.2, textures, surrogate, classifier, gradients, goal=goal, budget=budget, masks=masks)
+        found.append([movable(surrogate, budget, masks, within=[each]) for each in (ranked, tried.masks)])
+    for expected, other in zip(*found, strict=True):
+        assert any(mask.any() for mask in expected.values())
+        assert all(torch.equal(mask, other[name].cpu()) for name, mask in expected.items())
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")

@@ -29,7 +29,8 @@ from trompe_server.renderers import SailenvTarget
 from trompe_server.storage.folders import checked
 from trompe_shared.api import JobSpec
 from trompe_shared.geometry import Camera, View
-from trompe_shared.object3d import Object3D, load_object, pack_zip
+from trompe_shared.local_files import pack_zip
+from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
 
 Image8 = NDArray[np.uint8]

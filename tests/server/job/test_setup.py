@@ -180,6 +180,9 @@ def test_views_draw_their_backgrounds_from_several(library: Library, photo: Imag
         assert seen <= {(0, 0, 0), (255, 0, 0), picture}
     assert len({view.backdrop or view.background for view in setup.held_out}) == 3
     assert setup.backdrops[picture].shape == (*setup.size, 3)
+    target = setup.renderers[0].target
+    assert isinstance(target, BackdropTarget)
+    assert target._pictures is setup.backdrops  # each is scaled once
     assert setup_of(library, **options).views == setup.views
 
 

@@ -1,5 +1,6 @@
 """Judgements of the mug over a fake renderer: figures, findings, page, and how one goes on where it stopped."""
 
+import io
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -18,15 +19,16 @@ from trompe_server.job.protocol import OnProgress
 from trompe_server.judgement.judge_files import judge_files
 from trompe_server.judgement.manifest import Judged, manifest_of
 from trompe_server.judgement.pictures import judgement_pictures
-from trompe_server.judgement.sources import LocalSources
+from trompe_server.judgement.sources import LocalSources, StoredSources
 from trompe_server.judgement.suites import SUITES, Suite, suite_of
 from trompe_server.judgement.verify import verify
 from trompe_server.judgement.work import Timed
+from trompe_server.library import Library
 from trompe_server.pages.judgement import judgement_page
 from trompe_server.renderers import TargetRenderer
 from trompe_server.storage.folders import LocalArtifacts
 from trompe_shared.api import AS_RENDERED, JudgementSpec, Manifest, Progress, Visibility
-from trompe_shared.errors import RendererError, SpecError
+from trompe_shared.errors import RendererError, RendererLostError, SpecError
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
 
@@ -41,7 +43,8 @@ def fake_renderer(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     @contextmanager
     def running(_sources: LocalSources, name: str) -> Iterator[TargetRenderer]:
         if name != "fake":
-            raise RendererError(f"The renderer worker did not start. There is no engine {name!r}.")
+            error = SpecError if name == "two-of-it" else RendererError
+            raise error(f"The renderer worker did not start. There is no engine {name!r}.")
         yield target
 
     monkeypatch.setattr(LocalSources, "running", running)
@@ -99,7 +102,7 @@ def test_each_thing_that_does_not_fit_is_a_sentence_and_the_rest_is_judged(
     missing = dark.with_name("nowhere.pt2")
     options = {
         "networks": ["tiny", str(missing)],
-        "renderers": ["fake", "none-such"],
+        "renderers": ["fake", "none-such", "two-of-it"],
         "views": None,
         "suite": "small",
         "epsilon": 0.1,
@@ -115,9 +118,23 @@ def test_each_thing_that_does_not_fit_is_a_sentence_and_the_rest_is_judged(
         ("network", "The network 'tiny' takes images of 128 x 128; those of 64 x 96 are resized."),
         ("network", f"No figures of {str(missing)!r}"),
         ("renderer", "No figures in 'none-such'"),
+        ("renderer", "No figures in 'two-of-it'"),
     }
     empty = Counter(cell.accuracy is None for cell in manifest.cells)
-    assert empty == {False: 1 + len(SUITE), True: 3 * (1 + len(SUITE))}
+    assert empty == {False: 1 + len(SUITE), True: 5 * (1 + len(SUITE))}
+
+
+def test_what_is_named_twice_is_looked_at_once(judge: Judge, dark: Path) -> None:
+    manifest = manifest_of(judge(dark, networks=["tiny", "tiny"], renderers=["fake", "fake"]), seconds=1.0)
+    assert (len(manifest.renderers), len(manifest.networks)) == (1, 1)
+
+
+def test_a_stored_object_is_judged_as_it_was_attacked(mug: Object3D, tmp_path: Path) -> None:
+    library, kept = Library(tmp_path / "library"), LocalArtifacts(tmp_path / "kept")
+    library.add_object(io.BytesIO(mug.to_zip()), "Mug ver. 2", max_texture=128)
+    found = StoredSources(library, kept, "fake", LocalSources(tmp_path).running).object("Mug ver", "before")
+    assert {texture.shape for texture in found.obj.textures.values()} == {(128, 128, 3)}
+    assert kept.exists(found.file.source)
 
 
 def test_an_object_that_is_not_recognised_before_is_said(judge: Judge, dark: Path) -> None:
@@ -177,6 +194,24 @@ def test_a_stopped_judgement_goes_on_to_the_same_figures(
     for file in (tmp_path / "kept").iterdir():
         file.write_bytes(b"damaged")
     assert manifest_of(judge(dark), seconds=1.0) == resumed
+
+
+def test_a_renderer_that_is_lost_once_is_asked_again_and_the_time_left_stays_right(
+    judge: Judge, dark: Path, fake_renderer: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told, lost = list[Progress](), iter([False, True])
+    render = fake_renderer.render
+
+    def render_or_fail(*given: Any, **options: Any) -> Any:
+        if next(lost, False):
+            raise RendererLostError("The renderer is gone.")
+        return render(*given, **options)
+
+    monkeypatch.setattr(fake_renderer, "render", render_or_fail)
+    manifest = manifest_of(judge(dark, on_progress=told.append), seconds=1.0)
+    assert all(cell.accuracy is not None for cell in manifest.cells)
+    assert max(each.fraction for each in told) == told[-1].fraction == 1
+    assert min(each.eta_seconds or 0 for each in told) >= 0
 
 
 def test_the_time_left_is_that_of_the_images_to_come() -> None:

@@ -18,7 +18,6 @@ from trompe_server.judging.metrics import (
     fooled_as,
     max_view_change,
     mean_texel_change,
-    predicted_classes,
     reach_warning,
     share_beyond,
     texels_altered,
@@ -170,20 +169,14 @@ def test_a_drop_that_rests_on_few_views_comes_with_a_warning(pairs: list[tuple[b
     assert found is words is None or (words and re.search(words, found or ""))
 
 
-def test_predicted_classes_are_counted_most_frequent_first() -> None:
-    rows = np.eye(5, dtype=np.float32)[[4, 2, 2, 0, 4, 2]]
-    assert list(predicted_classes(rows).items()) == [(2, 3), (4, 2), (0, 1)]
-    assert predicted_classes(rows[:0]) == {}
-
-
 def test_agreement_compares_verdicts_and_margins_of_surrogate_and_target() -> None:
     before = np.array([[4.0, 1, 0], [5, 0, 3]], np.float32)  # margins 3, 2
     after = np.array([[0.0, 1, 0], [5, 0, 4]], np.float32)  # -1, 1
     predicted = np.array([[0.5, 1, 0], [4, 0, 4.5]], np.float32)  # -0.5, -0.5
-    assert agreement(before, after, predicted, 0) == (0.5, (0.5 + 1.5) / 2 / 2.5)
-    assert agreement(before, after, after, 0) == (0.0, 0.0)
-    assert agreement(after, before, after, 0).margin_error is None
-    assert agreement(before, after, predicted, (0, 2)).disagreement == 0.0  # either class counts as the object
+    assert agreement(before, after, predicted, 0) == {"disagreement": 0.5, "margin_error": (0.5 + 1.5) / 2 / 2.5}
+    assert agreement(before, after, after, 0) == {"disagreement": 0.0, "margin_error": 0.0}
+    assert agreement(after, before, after, 0)["margin_error"] is None
+    assert agreement(before, after, predicted, (0, 2))["disagreement"] == 0.0  # either class counts as the object
 
 
 def test_the_transfer_gap_is_surrogate_minus_target() -> None:

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from trompe_server.formats import read_object, write_glb
 from trompe_server.judging.objects import ObjectPair, texture_changes
-from trompe_shared.object3d import Object3D, Part, encode_png, load_object
+from trompe_shared.object3d import Object3D, encode_png, load_object
 from trompe_shared.shipped import shipped_objects
+from trompe_shared.wavefront import Part
 
 NAMES = sorted(shipped_objects())
 

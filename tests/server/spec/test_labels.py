@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -54,6 +55,7 @@ def test_one_label_or_several_are_distinct_classes_in_their_order() -> None:
     assert resolve_labels("toilet paper", CLASSES, len(CLASSES), "net") == (1,)
     assert resolve_labels(["wall clock", 0], CLASSES, len(CLASSES), "net") == (3, 0)
     assert resolve_labels(np.int64(2), CLASSES, len(CLASSES), "net") == (2,)
+    assert resolve_labels(torch.tensor(2), CLASSES, len(CLASSES), "net") == (2,)
     with pytest.raises(
         SpecError, match="'toilet paper' and 'toilet tissue' are the same class, 1: name each `label` once"
     ):

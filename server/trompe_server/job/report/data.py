@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from trompe_server.job.files import Spent
 from trompe_server.job.setup import JobRenderer, JobSetup
-from trompe_server.judging.metrics import Agreement, agreement
+from trompe_server.judging.metrics import agreement
 from trompe_server.surrogate import Surrogate
 from trompe_server.surrogate.calibration import Calibration
 from trompe_server.surrogate.fidelity import ViewFit, compare_views
@@ -66,7 +66,7 @@ class ReportData:
         return self.setup.judge.accuracy(*self._expected, distinct=self.distinct("own"))
 
     @cached_property
-    def agreement(self) -> Agreement | None:
+    def agreement(self) -> dict[str, float | None] | None:
         """Agreement of surrogate and target on the own views; ``None`` without an attack."""
         if self._expected is None or self.logits_after is None:
             return None

@@ -10,7 +10,6 @@ from PIL import Image
 from trompe_server.job.protocol import THUMBNAIL
 from trompe_server.job.report.data import Images, ReportData, distinct_views
 from trompe_server.job.setup import JobSetup
-from trompe_server.judging.metrics import predicted_classes
 from trompe_server.pictures import (
     difference_strip,
     prediction_histogram,
@@ -101,10 +100,7 @@ def _thumbnail(data: ReportData, after: Images) -> Image.Image:
 
 def _counts(logits: NDArray[np.float32], setup: JobSetup) -> Counter[str]:
     """Number of views by the name of the predicted class."""
-    counts: Counter[str] = Counter()
-    for index, number in predicted_classes(logits).items():
-        counts[_short_name(setup, index)] += number
-    return counts
+    return Counter(_short_name(setup, index) for index in logits.argmax(axis=1).tolist())
 
 
 def _short_name(setup: JobSetup, index: int) -> str:

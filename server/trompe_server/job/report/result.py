@@ -128,7 +128,7 @@ def _figures(data: ReportData) -> dict[str, Any]:
         "held_out_views": view_predictions(setup.held_out, before["held_out"], after.get("held_out"), setup.labels),
     }
     if data.agreement is not None:
-        figures |= data.agreement._asdict()
+        figures |= data.agreement
     if (calibration := data.calibration) is not None:
         figures |= {"surrogate_model": calibration.model, "surrogate_reason": calibration.reason}
         figures["fidelity"] = _rounded(calibration.fidelity.mean())

@@ -15,12 +15,16 @@ function put({ ids, html, older }) {
   for (const row of [...holder.children].reverse()) {
     const old = document.getElementById(row.id);
     if (!old) table.tBodies[0].insertBefore(row, document.getElementById(`job-${ids[ids.indexOf(idOf(row)) + 1]}`));
-    else if (old.dataset.version !== row.dataset.version && !old.contains(document.activeElement)) {
-      const picked = old.querySelector("input:checked");
-      old.replaceWith(row);
-      if (picked) row.querySelector("input").checked = true;
-    }
+    else if (old.dataset.version === row.dataset.version) continue;
+    else if (old.contains(document.activeElement)) old.newer = row;
+    else replace(old, row);
   }
+}
+
+function replace(old, row) {
+  const picked = old.querySelector("input:checked");
+  old.replaceWith(row);
+  if (picked) row.querySelector("input").checked = true;
 }
 
 // Rows by a column; empty cells last.
@@ -45,6 +49,13 @@ function filter() {
 if (table) {
   follow(table.dataset.stream, "rows", (data) => {
     put(JSON.parse(data));
+    filter();
+  });
+  // A row with the focus is replaced when the focus leaves it.
+  table.tBodies[0].addEventListener("focusout", ({ target, relatedTarget }) => {
+    const old = target.closest("tr");
+    if (!old.newer || old.contains(relatedTarget)) return;
+    replace(old, old.newer);
     filter();
   });
   table.tHead.addEventListener("click", (event) => event.target.matches("button") && sort(event.target.closest("th")));

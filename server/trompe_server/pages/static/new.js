@@ -82,7 +82,7 @@ for (const name of ["dragleave", "drop"])
 drop.addEventListener("drop", (event) => take(event.dataTransfer.files[0]));
 document.getElementById("classifier-file").onchange = async (event) => {
   const [picked] = event.target.files;
-  if (picked && (await upload("/v1/classifiers", picked, classifier, "classifier"))) await classes();
+  if (picked && (await upload("/v1/classifiers", picked, classifier, classifier.name))) await classes();
 };
 object.onchange = chosen;
 option("views.background").onchange = chosen;

@@ -2,7 +2,7 @@
 import { submits, upload } from "./form.js";
 import { Turntable } from "./turntable.js";
 
-const { elements } = document.getElementById("new");
+const form = document.getElementById("new"), { elements } = form;
 
 for (const input of document.querySelectorAll("input[data-for]")) {
   const name = input.dataset.for, path = name === "networks" ? "/v1/classifiers" : "/v1/objects";
@@ -28,7 +28,8 @@ for (const { slider } of tables)
 function request() {
   const given = (name) => elements[name].value;
   const body = { before: given("before"), after: given("after"), networks: [given("networks")], priority: "interactive" };
-  body.label = /^\d+$/.test(given("label")) ? Number(given("label")) : given("label");
+  const labels = [...form.querySelectorAll("[name=label]")].map(({ value }) => value).filter(Boolean);
+  body.label = labels.map((label) => (/^\d+$/.test(label) ? Number(label) : label));
   if (given("suite")) body.suite = given("suite");
   for (const name of ["views", "seed", "epsilon"]) if (given(name)) body[name] = Number(given(name));
   return JSON.stringify(body);

@@ -281,7 +281,7 @@ class Orbit extends HTMLElement {
   async classified() {
     const body = new FormData();
     (await this.stage.pictures(this.given.size)).forEach((picture) => body.append("images", picture, "view.png"));
-    for (const label of this.given.labels) body.append("label", label);
+    for (const label of this.given.classifiers[this.classifier.selectedIndex].labels) body.append("label", label);
     body.append("classifier", this.classifier.value);
     this.way.forEach((input, each) => {
       if (Number(input.value) !== WAY[each][4]) body.append(input.name, input.value);
