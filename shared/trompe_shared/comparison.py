@@ -18,8 +18,9 @@ from trompe_shared.api import OPTIONS
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
-PROBED: Final = {"surrogate", *(name for name, option in OPTIONS.items() if option.part == "views")} - {"held_out"}
-"""Options on which a calibration depends, besides the seed."""
+_VIEWS: Final = {name for name, option in OPTIONS.items() if option.part == "views"}
+PROBED: Final = {"surrogate", *_VIEWS} - {"held_out", "pool"}
+"""Options on which a calibration depends, besides the seed; of a pool only the number of its first views counts."""
 
 
 @dataclass(frozen=True)

@@ -60,10 +60,10 @@ def test_a_job_pays_for_the_calibration_of_a_job_with_the_same_probes_alone() ->
         result = SimpleNamespace(
             held_out=judged, target=judged, seconds=seconds, probe_renders=renders, image_size=(size, size)
         )
-        asked = {"epsilon": 0.1, "seed": 0, "held_out": 60, "background": ["white"]} | options
+        asked = {"epsilon": 0.1, "seed": 0, "pool": 60, "held_out": 60, "background": ["white"]} | options
         return SimpleNamespace(id="1", object="mug"), asked, result
 
-    entries = [entry(100), entry(0, held_out=9), entry(0, size=224), entry(0, background=["black"])]
+    entries = [entry(100), entry(0, held_out=9, pool=240), entry(0, size=224), entry(0, background=["black"])]
     assert [job.cost for job in charged(one.job for one in points_of(entries, ["epsilon"]))] == [19.0, 19.0, 9.0, 9.0]
 
 
