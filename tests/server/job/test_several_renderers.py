@@ -156,7 +156,7 @@ def test_held_out_views_have_noise_that_the_attack_has_not_seen(library: Library
     painted, clean = run.artifacts.painted().to_zip(), setup.obj.to_zip()
     own, held_out = setup.renderers[0].noise
     assert own != held_out
-    looks = [own] * 4 + [held_out] * 3 + [own + 1] * 2  # the last ones measure the noise
+    looks = [own] * 4 + [held_out] * 3 + [own + 1] * 4  # the last ones measure the noise
     assert [noise for shown, noise in target.seen if shown == clean] == looks
     judged = [noise for shown, noise in target.seen if shown == painted]
     assert judged[-7:] == [own] * 4 + [held_out] * 3
