@@ -16,9 +16,9 @@ from trompe_renderer.engines.surfaces import (
     ContentCache,
     Surface,
     TextureImage,
-    clipping_planes,
     composited,
     encoded_light,
+    ray_range,
     surfaces_of,
     without_backs,
 )
@@ -28,9 +28,6 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import FIELD_OF_VIEW
 from trompe_shared.opacity import CUTOFF
 
-NEAR: Final = 1e-3
-FAR: Final = 1e5
-"""Clipping planes, metres: a ray needs no depth buffer."""
 MAX_RAYS: Final = 2**23
 """Rays of one pass: bounds the memory."""
 
@@ -141,13 +138,13 @@ def _mesh(name: str, surface: Surface) -> Any:
 
 def _sensor(world: Snapshot, surfaces: Sequence[Surface], rfilter: str, width: int, height: int) -> dict[str, Any]:
     """Mitsuba's camera looks along z, with x to the left."""
-    near, far = clipping_planes(world.camera, [surface.ball for surface in surfaces])
+    near, far = ray_range(world.camera, [surface.ball for surface in surfaces])
     return {
         "type": "perspective",
         "fov": FIELD_OF_VIEW,
         "fov_axis": "y",
-        "near_clip": min(NEAR, near),
-        "far_clip": max(FAR, far),
+        "near_clip": near,
+        "far_clip": far,
         "to_world": mitsuba.ScalarTransform4f((world.camera @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist()),
         "sampler": {"type": "independent"},
         "film": {

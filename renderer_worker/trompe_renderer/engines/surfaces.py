@@ -151,6 +151,12 @@ def clipping_planes(camera: Matrix, balls: Iterable[Ball]) -> tuple[float, float
     return (max(near, 1e-3 * free) if np.isfinite(free) else near), far
 
 
+def ray_range(camera: Matrix, balls: Iterable[Ball]) -> tuple[float, float]:
+    """``clipping_planes`` of a ray tracer, which has no depth buffer: at most 1 mm, and at least 100 km."""
+    near, far = clipping_planes(camera, balls)
+    return min(1e-3, near), max(1e5, far)
+
+
 def sphere_around(surfaces: Iterable[Surface]) -> tuple[NDArray[np.float64], float]:
     """Centre (3,) and radius, metres, of a sphere around all surfaces; around the origin without any."""
     balls = [surface.ball for surface in surfaces]

@@ -100,8 +100,7 @@ class Blender:
     def _aim(self, world: Json) -> None:
         camera = bpy.data.cameras.new("camera")
         camera.sensor_fit, camera.angle_y = "VERTICAL", math.radians(world["fov"])
-        near, far = world["clip"]
-        camera.clip_start, camera.clip_end = min(1e-3, near), max(1e5, far)
+        camera.clip_start, camera.clip_end = world["clip"]
         self._scene.camera = self._add(camera, world["camera"])
         self._scene.cycles.seed = world["seed"]
         self._scene.render.resolution_x, self._scene.render.resolution_y = world["size"]

@@ -20,8 +20,8 @@ from trompe_renderer.engines.surfaces import (
     ContentCache,
     Surface,
     TextureImage,
-    clipping_planes,
     composited,
+    ray_range,
     rgba_of,
     surfaces_of,
     without_backs,
@@ -67,7 +67,7 @@ class CyclesEngine:
         surfaces = list(surfaces_of(world))
         values = {
             "fov": FIELD_OF_VIEW,
-            "clip": clipping_planes(world.camera, [surface.ball for surface in surfaces]),
+            "clip": ray_range(world.camera, [surface.ball for surface in surfaces]),
             "size": [width, height],
             "seed": noise_seed(world),
             "camera": world.camera.tolist(),
