@@ -132,3 +132,16 @@ def fooled_classifier() -> NetworkClassifier:
         last.bias.fill_(50.0)[LABEL] = -50.0
     network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), last)
     return replace(fake_classifier(), network=network)
+
+
+class _Constant(torch.nn.Module):
+    """The same logits for all images, with a gradient of zero."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        logits = torch.zeros(len(images), 10).index_fill(1, torch.tensor(LABEL), 3.0)
+        return logits + 0 * images.sum((1, 2, 3))[:, None]
+
+
+def constant_classifier() -> NetworkClassifier:
+    """A classifier that no image fools."""
+    return NetworkClassifier("constant", _Constant(), SIZE, 10)

@@ -2,7 +2,8 @@
 
 The margin that counts as safely won starts at the goal's. It is small by default, so that the gradient comes from the
 views still to be won. It rises with each step that finds nearly all of its views fooled, because a larger margin also
-wins unseen views, and falls with each other step. The search ends when it reaches its maximum.
+wins unseen views, and falls with each other step. The search ends when it reaches its maximum, or when steps that look
+at the same images gain nothing more (``schedule``).
 
 Saliency masks can lead the search downhill, because masked-out pixels see the same texels. At the end of a masked
 search the unpainted textures win if they fool more views.
@@ -22,7 +23,8 @@ from trompe_server.attack.backgrounds import Backgrounds
 from trompe_server.attack.budget import Box
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Evaluation, Flat, Objective
-from trompe_server.attack.optimiser import Iterate, Memory, gradient_at, moved, step_factor
+from trompe_server.attack.optimiser import Iterate, gradient_at, moved
+from trompe_server.attack.schedule import Memory, after_step, anew, by_gain, in_rounds, stalled
 from trompe_server.attack.view_budget import ViewBudget
 from trompe_server.image_pipelines import Drawn, ImagePipeline
 from trompe_shared.api import OptimiserName
@@ -47,15 +49,15 @@ RESUME, SHOWN, SAFE = "search.resume", "search.shown", "search.safe"
 
 
 def finished(memory: Memory, goal: Goal) -> bool:
-    """Whether all views are so safely won that no step is left to take."""
-    return float(memory.get(SAFE, goal.safe)) > SAFE_ENOUGH > goal.safe
+    """Whether all views are so safely won, or so little is gained, that no step is left to take."""
+    return float(memory.get(SAFE, goal.safe)) > SAFE_ENOUGH > goal.safe or stalled(memory)
 
 
 def went_on(memory: Memory, goal: Goal, *, shown: int, added: int) -> Memory:
     """Memory of a search that has looked at ``shown`` further images and ``added`` views: these ask for more steps."""
     sooner = added and SAFE in memory and goal.safe < SAFE_ENOUGH
     safe = {SAFE: memory[SAFE].clamp(max=SAFE_ENOUGH / RISE**AGAIN)} if sooner else {}
-    return {**memory, **safe, SHOWN: memory.get(SHOWN, torch.tensor(0)) + shown}
+    return {**(anew(memory) if added else memory), **safe, SHOWN: memory.get(SHOWN, torch.tensor(0)) + shown}
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,8 @@ class Search:
 
     total: steps of the run. seed: draws the views and backgrounds of each step. movable: 1 for texels that may move,
     else 0. view_budget: bound on the change of the images, if any. backgrounds: drawn behind each step's views in place
-    of their own, if any. pipeline: what happens to the images, drawn anew in each step.
+    of their own, if any. pipeline: what happens to the images, drawn anew in each step. gains: whether the gain of each
+    step decides on the step size and on the end.
     """
 
     objective: Objective
@@ -77,6 +80,7 @@ class Search:
     views_per_step: int | None
     backgrounds: Backgrounds | None
     pipeline: ImagePipeline | None
+    gains: bool
 
     def least_left(self, point: Iterate, step: int) -> int:
         """Number of steps after ``step`` if nearly all views are fooled from now on."""
@@ -91,7 +95,7 @@ class Search:
         from_start = torch.zeros(sum(map(len, batches)), dtype=torch.long, device=point.delta.device)
         known = point.memory.get(RESUME, from_start)
         resume = torch.cat([known, from_start[len(known) :]])
-        change = gradient_at(self.optimiser, point, step_factor(step, self.total), self.box)
+        change = gradient_at(self.optimiser, point, self._factor(point, step), self.box)
         drawn = self._drawn(batches, step)
         found = self._objective_at(point, step).evaluate(change, drawn, resume <= step)
         memory = {
@@ -135,11 +139,16 @@ class Search:
         """The iterate after ``step``; the same one for a zero gradient."""
         gradient = found.gradient.mul_(self.movable)
         if len(gradient) and any(gradient.aminmax()):  # gradient.any() would take four times as long
-            point = moved(self.optimiser, point, gradient, step_factor(step, self.total), self.box)
+            point = moved(self.optimiser, point, gradient, self._factor(point, step), self.box)
             if self.view_budget is not None:
                 point = replace(point, delta=self.view_budget.project(point.delta))
-        masked = self.objective.masks is not None
-        return self._no_worse(point) if masked and step + 1 == self.total else point
+        if self.gains:
+            point = replace(point, memory=after_step(point.memory, found.fooled, found.loss))
+        last = step + 1 == self.total or stalled(point.memory)
+        return self._no_worse(point) if last and self.objective.masks is not None else point
+
+    def _factor(self, point: Iterate, step: int) -> float:
+        return by_gain(point.memory, step, self.total) if self.gains else in_rounds(step, self.total)
 
     def saved(self, delta: Flat) -> Flat:
         """``delta``, or the part of it that keeps the images within their bound once saved in 8 bits."""

@@ -259,7 +259,7 @@ class SearchOptions(_Part):
     """Search for the change."""
 
     steps: Annotated[int, Field(ge=1, le=10_000)] = option(
-        90, "steps at most; the attack stops once all views are safely won"
+        90, "steps at most; the attack stops once all views are safely won, on a grid also once steps gain nothing"
     )
     alpha: Annotated[float, Field(gt=0, le=1)] | None = option(
         None, "mean step size, 0..1; default: 0.01, or epsilon / 5 if smaller"

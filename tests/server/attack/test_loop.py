@@ -17,6 +17,7 @@ from tests.attack_runs import (
     SMALL,
     SQUARE,
     SURROGATE,
+    constant_classifier,
     fooled_classifier,
     objective_of,
     run,
@@ -39,8 +40,10 @@ from trompe_server.attack import (
     start,
 )
 from trompe_server.attack.goal import SAFE_MARGIN
-from trompe_server.attack.search import RISE, SAFE_ENOUGH, went_on
-from trompe_server.classifiers import NetworkClassifier, load_classifier
+from trompe_server.attack.schedule import HALVINGS, PATIENCE, after_step
+from trompe_server.attack.search import RISE, SAFE_ENOUGH, finished, went_on
+from trompe_server.classifiers import NetworkClassifier, load_classifier, score_based
+from trompe_server.image_pipelines import PIPELINES
 from trompe_server.judging.metrics import accuracy, texels_altered
 from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
 from trompe_server.surrogate.blocks import means
@@ -274,6 +277,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "pool": {"views_per_step": 10},
     "backgrounds": {"views_per_step": 10, "backgrounds": Backgrounds(PICTURES, [k % 2 for k in range(30)])},
     "view budget": {"budget": Budget(0.3, 0.1, 0.02)},
+    "given up": {"classifier": constant_classifier(), "total_steps": 40},
     "early end": {"classifier": fooled_classifier(), "budget": Budget(0.1, 0.1), "total_steps": 40},
 }
 
@@ -291,7 +295,7 @@ def test_a_run_cut_anywhere_resumes_bit_for_bit(kind: str, many_views: Surrogate
     ended = run(views, steps=total - cut, state=part, on_step=seen.append, **options)
     assert same(ended, whole)
     assert [step.step for step in seen] == list(range(len(seen)))
-    assert (len(seen) == total) == (kind != "early end")
+    assert (len(seen) == total) == (kind not in ("early end", "given up"))
 
 
 def test_backgrounds_change_a_run(many_views: Surrogate) -> None:
@@ -434,6 +438,41 @@ def test_a_goal_with_an_unreachable_margin_runs_all_steps() -> None:
     assert all(90 < step.loss < 110 and step.fooled == 1 for step in seen)
     assert [step.least_left for step in seen] == list(range(40))[::-1]
     assert float(state.memory["search.safe"]) == 1000.0
+
+
+def stubborn_run(surrogate: Surrogate = SURROGATE, **options: Any) -> int:
+    """Steps of a search that gains nothing, of at most 50."""
+    asked: dict[str, Any] = {"classifier": constant_classifier(), "total_steps": 50} | options
+    return len(steps_of(surrogate, steps=50, **asked))
+
+
+GIVEN_UP = 1 + PATIENCE * (HALVINGS + 1)
+"""Steps of a search of which only the first gains."""
+
+
+def test_a_search_that_gains_nothing_more_ends() -> None:
+    assert stubborn_run() == stubborn_run(goal=Goal(LABEL, loss="cross_entropy")) == GIVEN_UP
+
+
+@pytest.mark.parametrize("kind", ["pgd", "pool", "backgrounds", "pipeline", "queries", "the goal asks for all"])
+def test_a_search_whose_steps_do_not_tell_what_they_gain_takes_them_all(kind: str, many_views: Surrogate) -> None:
+    others: dict[str, dict[str, Any]] = {
+        "pipeline": {"pipeline": PIPELINES["robust"]},
+        "queries": {"classifier": score_based(constant_classifier(), seed=0, queries=2, sigma=0.1)},
+        "the goal asks for all": {"goal": Goal(LABEL, safe=1000.0)},
+    }
+    options = (RUNS | others)[kind]
+    assert stubborn_run(many_views if "views_per_step" in options else SURROGATE, **options) == 50
+
+
+@pytest.mark.parametrize("added", [0, 2])
+def test_a_search_looks_at_added_views_anew(added: int) -> None:
+    given_up: dict[str, Tensor] = {}
+    for _ in range(GIVEN_UP):
+        given_up = dict(after_step(given_up, 0.0, -3.0))
+    goal = Goal(LABEL)
+    assert finished(given_up, goal)
+    assert finished(went_on(given_up, goal, shown=7, added=added), goal) == (added == 0)
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,15 @@
 """The update rules, each on a small scene and against its formula."""
 
-from itertools import pairwise
 from typing import get_args
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.attack_runs import EPS, SMALL, SQUARE, mean_loss, random_state, run, steps_of
 from trompe_server.attack import AttackState, Budget, save_state, start
-from trompe_server.attack.optimiser import ROUND, step_factor
 from trompe_server.surrogate import textures_of
 from trompe_shared.api import OptimiserName
 
@@ -81,16 +79,3 @@ def test_nesterov_steps_along_the_sign_of_momentum_one_momentum_step_ahead() -> 
     ahead = 0.9 * 0.02 * mean.sign()
     there = {**one.deltas, "m0.png": (delta + ahead).clamp(-0.06, 0.06)}
     assert seen.loss == pytest.approx(mean_loss(AttackState(1, there)), abs=1e-5)
-
-
-@given(length=st.integers(1, 2000))
-@settings(max_examples=40)
-def test_the_step_falls_to_nothing_in_every_round_and_rounds_grow(length: int) -> None:
-    falling = [step_factor(done, length) for done in range(length)]
-    starts = [0, *(done for done in range(1, length) if falling[done] > falling[done - 1])]
-    rounds = np.diff([*starts, length])
-    assert np.mean(falling) == pytest.approx(1)
-    assert all(later >= 2 * sooner for sooner, later in pairwise(rounds))
-    assert len(rounds) == 1 or rounds[0] == ROUND
-    for begin, size in zip(starts, rounds, strict=True):
-        np.testing.assert_allclose(falling[begin : begin + size], np.arange(2 * size - 1, 0, -2) / size)

@@ -1,0 +1,74 @@
+"""Step size of the default optimiser, as a factor of alpha, and the end of a search that gains nothing more.
+
+Steps that all look at the same images tell what they gain. Their factor is 2, halves whenever ``PATIENCE`` steps gained
+nothing (as in Auto-PGD, Croce and Hein 2020), and the search ends instead of the fourth halving. Towards the last step
+it falls to 0.
+
+Steps that draw their views or what happens to them tell little. Their factor falls linearly from 2 to 0; a long run
+repeats this in rounds, each twice as long as the one before (Loshchilov and Hutter 2017, SGDR).
+"""
+
+from collections.abc import Mapping
+from typing import Final
+
+import torch
+from torch import Tensor
+
+Memory = Mapping[str, Tensor]
+
+ROUND: Final = 30
+"""Steps of the first round of a run, and of the fall at the end of one without rounds."""
+
+PATIENCE: Final = 8
+"""Steps without a gain after which the factor halves."""
+
+GAIN: Final = 0.05
+"""Least gain in mean loss: a margin is a difference of logits. One more view fooled is a gain, too."""
+
+HALVINGS: Final = 3
+"""Halvings of the factor before the end."""
+
+BEST, WAITED, HALVED = "schedule.best", "schedule.waited", "schedule.halved"
+"""Memory: highest share of fooled views and highest loss, steps since the last gain, halvings so far."""
+
+
+def in_rounds(done: int, length: int) -> float:
+    """Factor of the step after ``done`` of ``length`` steps that draw their views; mean 1."""
+    begin, size = 0, ROUND
+    while begin + 3 * size <= length and done >= begin + size:
+        begin, size = begin + size, 2 * size
+    end = begin + size if begin + 3 * size <= length else length  # the last round takes all remaining steps
+    return 2 * (end - done - 0.5) / (end - begin)
+
+
+def by_gain(memory: Memory, done: int, length: int) -> float:
+    """Factor of the step after ``done`` of ``length`` steps that look at the same images."""
+    fall = min(1.0, (length - done - 0.5) / min(length, ROUND))
+    halved = int(memory.get(HALVED, 0))
+    return 2 * fall * 0.5**halved
+
+
+def after_step(memory: Memory, fooled: float, loss: float) -> Memory:
+    """Memory after a step with such figures."""
+    best_fooled, best_loss = memory[BEST].tolist() if BEST in memory else (-1.0, -torch.inf)
+    gained = fooled > best_fooled or loss > best_loss + GAIN
+    waited, halved = 0 if gained else int(memory[WAITED]) + 1, int(memory.get(HALVED, 0))
+    if waited == PATIENCE:
+        waited, halved = 0, halved + 1
+    best = [max(fooled, best_fooled), loss if loss > best_loss + GAIN else best_loss]
+    return {
+        **memory,
+        BEST: torch.tensor(best, dtype=torch.float64),
+        WAITED: torch.tensor(waited),
+        HALVED: torch.tensor(halved),
+    }
+
+
+def anew(memory: Memory) -> Memory:
+    """Memory without what earlier steps gained: others are to be looked at."""
+    return {key: value for key, value in memory.items() if key not in (BEST, WAITED, HALVED)}
+
+
+def stalled(memory: Memory) -> bool:
+    """Whether further steps would gain nothing."""
+    return int(memory.get(HALVED, 0)) > HALVINGS
