@@ -75,6 +75,27 @@ def test_an_archive_that_differs_in_an_albedo_alone_is_not_parsed_again(parsed: 
     assert len(parsed) == 1
 
 
+def test_an_archive_that_differs_in_the_alpha_of_an_albedo_has_its_own() -> None:
+    models, box, cut = cache(), boxes(), np.full((8, 8, 4), 255, np.uint8)
+    cut[:, :4, 3] = 0
+    pierced = pack_zip({**box.files, "front_albedo.png": encode_png(cut)})
+    for archive in (box.to_zip(), pierced, box.to_zip()):
+        assert read(models, archive).key == model_of(load_object(archive)).key
+
+
+def test_alphas_are_decoded_once_however_often_an_object_is_painted(monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[bytes] = []
+
+    def counted(data: bytes, *, blended: bool) -> None:
+        decoded.append(data)
+
+    monkeypatch.setattr("trompe_renderer.world.model.opacity_of", counted)
+    model = model_of(boxes())
+    keys = {repainted(model, {"front_albedo.png": noise(seed, 4, 4)}).key for seed in range(3)}
+    assert len(keys) == 3
+    assert len(decoded) == len(model.obj.textures)
+
+
 def test_any_other_difference_makes_another_shape() -> None:
     maps, models = {"normal": noise(1, 4, 4)}, cache()
     half = ((0.0, 0.0, 0.0), (0.1, 0.06, 0.05))

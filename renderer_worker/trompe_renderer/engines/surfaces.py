@@ -42,12 +42,12 @@ class TextureImage:
         """Equal for equal pixels."""
         name, model = self.name, self.model
         key = model.albedos.get(name) or f"{model.shape} {self.use} {name}"
-        return key + (model.opacity(name)[0] if self.use == "albedo" else "")
+        return key + (model.opacities[name][0] if self.use == "albedo" else "")
 
     @property
     def transparent(self) -> bool:
         """Whether the pixels of an albedo have alpha."""
-        return self.model.opacity(self.name)[1] is not None
+        return self.model.opacities[self.name][1] is not None
 
     def pixels(self) -> Pixels:
         """(H, W, channels) uint8, row 0 on top: sRGB, with alpha if transparent; a normal map; (roughness, metallic).
@@ -56,7 +56,7 @@ class TextureImage:
         """
         name, obj = self.name, self.model.obj
         if self.use == "albedo":
-            texture, opacity = obj.textures[name], self.model.opacity(name)[1]
+            texture, opacity = obj.textures[name], self.model.opacities[name][1]
             alike = opacity is not None and opacity.shape == texture.shape[:2]
             return np.dstack([texture, opacity]) if alike else texture  # type: ignore[list-item]
         data = obj.files[name]

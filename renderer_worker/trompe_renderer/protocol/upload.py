@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 from trompe_renderer.protocol.limits import Limits, StorageQuota
-from trompe_renderer.world.model import HashedModel, model_of, repainted
+from trompe_renderer.world.model import HashedModel, model_of, opacities_of, repainted
 from trompe_shared.object3d import decode_rgb, object_from_files, unpacked_size, unzip
 
 
@@ -56,7 +56,8 @@ def _read(files: Mapping[str, bytes], recent: list[HashedModel]) -> HashedModel:
         if _only_albedos_differ(files, model):
             changed = [name for name in model.albedos if files[name] != model.obj.files[name]]
             new = repainted(model, {name: decode_rgb(files[name], name) for name in changed})
-            return replace(new, obj=replace(new.obj, files=files))
+            obj = replace(new.obj, files=files)
+            return replace(new, obj=obj, opacities=opacities_of(obj))
     return model_of(object_from_files(files))
 
 

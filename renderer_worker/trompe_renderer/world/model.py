@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,28 +21,27 @@ class HashedModel:
 
     ``albedos`` holds the hash of each texture that serves as albedo only, by file name; ``shape`` covers everything
     else, ``key`` covers all. In a repainted model ``obj.textures`` is up to date and ``obj.files`` is not.
+    ``opacities`` holds a cache key and the alpha (H, W) of each albedo texture; "" and ``None`` if all of it is opaque.
     """
 
     shape: str
     albedos: Mapping[str, str]
     obj: Object3D = field(compare=False, repr=False)
+    opacities: Mapping[str, tuple[str, Texture | None]] = field(compare=False, repr=False)
 
     @cached_property
     def key(self) -> str:
         """Equal for equal content."""
-        opacities = [self.opacity(name)[0] for name in sorted(self.albedos)]
+        opacities = [self.opacities[name][0] for name in sorted(self.albedos)]
         return content_key(repr((self.shape, sorted(self.albedos.items()), opacities)).encode())
-
-    def opacity(self, name: str) -> tuple[str, Texture | None]:
-        """A cache key of an albedo's alpha, and the alpha (H, W); "" and ``None`` if all of it is opaque."""
-        return _opacity(self.obj.files[name], name in self.obj.blended)
 
     @property
     def nbytes(self) -> int:
         """Approximate size in memory."""
         parts = sum(p.vertices.nbytes + p.normals.nbytes + p.uvs.nbytes + p.faces.nbytes for p in self.obj.parts)
         textures = sum(texture.nbytes for texture in self.obj.textures.values())
-        return parts + textures + sum(map(len, self.obj.files.values()))
+        alphas = sum(alpha.nbytes for _, alpha in self.opacities.values() if alpha is not None)
+        return parts + textures + alphas + sum(map(len, self.obj.files.values()))
 
 
 def content_key(*data: bytes | Texture) -> str:
@@ -60,7 +59,13 @@ def model_of(obj: Object3D) -> HashedModel:
     albedos = {name: _texture_key(texture) for name, texture in obj.textures.items() if name not in maps}
     kept = [(name.encode(), data) for name, data in sorted(obj.files.items()) if name not in albedos]
     blended = (name.encode() for name, look in sorted(obj.materials.items()) if look.opacity is not None)
-    return HashedModel(content_key(*(part for item in kept for part in item), *blended), albedos, obj)
+    shape = content_key(*(part for item in kept for part in item), *blended)
+    return HashedModel(shape, albedos, obj, opacities_of(obj))
+
+
+def opacities_of(obj: Object3D) -> Mapping[str, tuple[str, Texture | None]]:
+    """``HashedModel.opacities``, from the files of ``obj``."""
+    return {name: _opacity(obj.files[name], blended=name in obj.blended) for name in obj.textures}
 
 
 def repainted(model: HashedModel, textures: Mapping[str, Texture]) -> HashedModel:
@@ -74,11 +79,11 @@ def repainted(model: HashedModel, textures: Mapping[str, Texture]) -> HashedMode
     if not all(texture.size for texture in textures.values()):
         raise ObjectError("A texture must have at least one texel.")
     obj = replace(model.obj, textures={**model.obj.textures, **textures})
-    return HashedModel(model.shape, {**model.albedos, **{name: _texture_key(t) for name, t in textures.items()}}, obj)
+    albedos = {**model.albedos, **{name: _texture_key(texture) for name, texture in textures.items()}}
+    return replace(model, albedos=albedos, obj=obj)
 
 
-@lru_cache(maxsize=32)
-def _opacity(data: bytes, blended: bool) -> tuple[str, Texture | None]:
+def _opacity(data: bytes, *, blended: bool) -> tuple[str, Texture | None]:
     opacity = opacity_of(data, blended=blended)
     return ("", None) if opacity is None else (f" opacity {content_key(opacity)}", opacity)
 
