@@ -8,6 +8,7 @@ Steps that draw their views or what happens to them tell little. Their factor fa
 repeats this in rounds, each twice as long as the one before (Loshchilov and Hutter 2017, SGDR).
 """
 
+import math
 from collections.abc import Mapping
 from typing import Final
 
@@ -23,13 +24,16 @@ PATIENCE: Final = 8
 """Steps without a gain after which the factor halves."""
 
 GAIN: Final = 0.05
-"""Least gain in mean loss: a margin is a difference of logits. One more view fooled is a gain, too."""
+"""Least gain in mean loss, a difference of logits. One more view fooled is a gain, too."""
+
+SHARE: Final = 0.025
+"""The same as a share of the first loss, if that is less: a network may have small logits."""
 
 HALVINGS: Final = 3
 """Halvings of the factor before the end."""
 
 BEST, WAITED, HALVED = "schedule.best", "schedule.waited", "schedule.halved"
-"""Memory: highest share of fooled views and highest loss, steps since the last gain, halvings so far."""
+"""Memory: highest share of fooled views, highest loss and least gain; steps since the last gain; halvings so far."""
 
 
 def in_rounds(done: int, length: int) -> float:
@@ -50,15 +54,16 @@ def by_gain(memory: Memory, done: int, length: int) -> float:
 
 def after_step(memory: Memory, fooled: float, loss: float) -> Memory:
     """Memory after a step with such figures."""
-    best_fooled, best_loss = memory[BEST].tolist() if BEST in memory else (-1.0, -torch.inf)
-    gained = fooled > best_fooled or loss > best_loss + GAIN
+    first = -1.0, -math.inf, min(GAIN, SHARE * abs(loss))
+    most_fooled, best, least = memory[BEST].tolist() if BEST in memory else first
+    gained = fooled > most_fooled or loss > best + least
     waited, halved = 0 if gained else int(memory[WAITED]) + 1, int(memory.get(HALVED, 0))
     if waited == PATIENCE:
         waited, halved = 0, halved + 1
-    best = [max(fooled, best_fooled), loss if loss > best_loss + GAIN else best_loss]
+    now = [max(fooled, most_fooled), loss if loss > best + least else best, least]
     return {
         **memory,
-        BEST: torch.tensor(best, dtype=torch.float64),
+        BEST: torch.tensor(now, dtype=torch.float64),
         WAITED: torch.tensor(waited),
         HALVED: torch.tensor(halved),
     }

@@ -70,15 +70,16 @@ def test_the_step_halves_whenever_nothing_is_gained_until_the_search_ends() -> N
     ],
 )
 def test_one_more_view_or_a_higher_loss_is_a_gain(figures: tuple[float, float], gains: bool) -> None:
-    waited = after([(0.5, 0.1)] * PATIENCE)  # one step before a halving
+    waited = after([(0.5, -2.0), (0.5, 0.1), *[(0.5, 0.1)] * (PATIENCE - 1)])  # one step before a halving
     factor = by_gain(after([figures], waited), 100, LONG)
     assert factor == (2.0 if gains else 1.0)
     assert by_gain(after([figures, *[(0.0, -9.0)] * (PATIENCE - 1)], waited), 100, LONG) == factor
 
 
-@given(rise=st.floats(0.001, 0.04))
-@settings(max_examples=20)
-def test_small_gains_add_up(rise: float) -> None:
-    """A slow search whose gains within the patience add up to one goes on; a slower one ends."""
-    memory = after((0.0, -5 + rise * step) for step in range(200))
-    assert stalled(memory) == (rise * PATIENCE < GAIN * (1 - 1e-6)) or rise * PATIENCE == pytest.approx(GAIN, rel=0.2)
+@pytest.mark.parametrize("scale", [1.0, 1e-3], ids=["usual logits", "small logits"])
+@pytest.mark.parametrize(("share", "ends"), [(1.3, False), (0.7, True)])
+def test_small_gains_add_up(share: float, ends: bool, scale: float) -> None:
+    """A slow search goes on if its gains within the patience add up to one."""
+    rise = share * GAIN / PATIENCE
+    memory = after((0.0, scale * (-2 + rise * step)) for step in range(200))
+    assert stalled(memory) == ends
