@@ -57,7 +57,7 @@ def _read(files: Mapping[str, bytes], recent: list[HashedModel]) -> HashedModel:
             changed = [name for name in model.albedos if files[name] != model.obj.files[name]]
             new = repainted(model, {name: decode_rgb(files[name], name) for name in changed})
             obj = replace(new.obj, files=files)
-            return replace(new, obj=obj, opacities=opacities_of(obj))
+            return replace(new, obj=obj, opacities={**new.opacities, **opacities_of(obj, changed)})
     return model_of(object_from_files(files))
 
 

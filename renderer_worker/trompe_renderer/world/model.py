@@ -1,7 +1,7 @@
 """3D models with hashes of their content, by which caches find meshes and textures."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -60,12 +60,12 @@ def model_of(obj: Object3D) -> HashedModel:
     kept = [(name.encode(), data) for name, data in sorted(obj.files.items()) if name not in albedos]
     blended = (name.encode() for name, look in sorted(obj.materials.items()) if look.opacity is not None)
     shape = content_key(*(part for item in kept for part in item), *blended)
-    return HashedModel(shape, albedos, obj, opacities_of(obj))
+    return HashedModel(shape, albedos, obj, opacities_of(obj, obj.textures))
 
 
-def opacities_of(obj: Object3D) -> Mapping[str, tuple[str, Texture | None]]:
-    """``HashedModel.opacities``, from the files of ``obj``."""
-    return {name: _opacity(obj.files[name], blended=name in obj.blended) for name in obj.textures}
+def opacities_of(obj: Object3D, names: Iterable[str]) -> Mapping[str, tuple[str, Texture | None]]:
+    """``HashedModel.opacities`` of some textures, from the files of ``obj``."""
+    return {name: _opacity(obj.files[name], blended=name in obj.blended) for name in names}
 
 
 def repainted(model: HashedModel, textures: Mapping[str, Texture]) -> HashedModel:

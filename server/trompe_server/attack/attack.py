@@ -25,11 +25,11 @@ from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Objective, Textures, members_of
 from trompe_server.attack.optimiser import Iterate
 from trompe_server.attack.perception import perceptual_bounds
-from trompe_server.attack.search import SAFE_ENOUGH, Search, finished
+from trompe_server.attack.search import Search, finished
 from trompe_server.attack.state import AttackState
 from trompe_server.attack.texels import TexelMasks, movable, moving_blocks
 from trompe_server.attack.view_budget import ViewBudget
-from trompe_server.classifiers import ScoreBasedClassifier, WhiteBoxClassifier
+from trompe_server.classifiers import WhiteBoxClassifier
 from trompe_server.image_pipelines import ImagePipeline
 from trompe_server.surrogate import AnySurrogate
 from trompe_server.surrogate.blocks import halvings, means, whole
@@ -77,11 +77,10 @@ def attack(
 
     ``textures`` are sRGB in [0, 1]. With several classifiers the loss is their mean, and a view is fooled when all of
     them are. The search ends early once all views are safely won, or once steps that all look at the same images gain
-    nothing more. ``masks`` (saliency) pass only the gradients of their
-    pixels, and only ``texels`` (default: ``movable``) move. Each step looks at all views, or at ``views_per_step``
-    drawn from ``seed`` and the step's number, in front of ``backgrounds`` drawn likewise (default: their own); each
-    image passes ``pipeline``, drawn anew. After the last step the budget's bound on the images holds for the textures
-    that ``Budget.repaint`` saves.
+    nothing more. ``masks`` (saliency) pass only the gradients of their pixels, and only ``texels`` (default:
+    ``movable``) move. Each step looks at all views, or at ``views_per_step`` drawn from ``seed`` and the step's number,
+    in front of ``backgrounds`` drawn likewise (default: their own); each image passes ``pipeline``, drawn anew. After
+    the last step the budget's bound on the images holds for the textures that ``Budget.repaint`` saves.
 
     Deterministic, in one call or in several. Computes on the surrogate's device. Raises ``SpecError`` for contradictory
     options, before any work.
@@ -98,8 +97,6 @@ def attack(
     wanted = movable(surrogate, budget, masks) if texels is None else texels
     state, moving = _in_blocks(state, {name: mask.to(device) for name, mask in wanted.items()}, surrogate, budget)
     touched = {name: mask | state.deltas[name].any(2) for name, mask in moving.items()}
-    drawn = (views_per_step or surrogate.n_views) < surrogate.n_views or backgrounds is not None or pipeline is not None
-    same = not drawn and not any(isinstance(member, ScoreBasedClassifier) for member in members)
     objective = Objective(textures, surrogate, members, goal, masks, surrogate.canvas(textures, touched))
     search = Search(
         objective,
@@ -112,7 +109,6 @@ def attack(
         views_per_step=views_per_step,
         backgrounds=backgrounds,
         pipeline=pipeline,
-        gains=optimiser == "nesterov" and goal.safe < SAFE_ENOUGH and same,
     )
     momentum = objective.join(state.momentum) if state.momentum else None
     point = Iterate(objective.join(state.deltas), state.memory, momentum)

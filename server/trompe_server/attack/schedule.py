@@ -56,11 +56,12 @@ def after_step(memory: Memory, fooled: float, loss: float) -> Memory:
     """Memory after a step with such figures."""
     first = -1.0, -math.inf, min(GAIN, SHARE * abs(loss))
     most_fooled, best, least = memory[BEST].tolist() if BEST in memory else first
-    gained = fooled > most_fooled or loss > best + least
-    waited, halved = 0 if gained else int(memory[WAITED]) + 1, int(memory.get(HALVED, 0))
+    rose = loss > best + least
+    waited = 0 if rose or fooled > most_fooled else int(memory[WAITED]) + 1
+    halved = int(memory.get(HALVED, 0))
     if waited == PATIENCE:
         waited, halved = 0, halved + 1
-    now = [max(fooled, most_fooled), loss if loss > best + least else best, least]
+    now = [max(fooled, most_fooled), loss if rose else best, least]
     return {
         **memory,
         BEST: torch.tensor(now, dtype=torch.float64),

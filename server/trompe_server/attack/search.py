@@ -26,6 +26,7 @@ from trompe_server.attack.objective import Evaluation, Flat, Objective
 from trompe_server.attack.optimiser import Iterate, gradient_at, moved
 from trompe_server.attack.schedule import Memory, after_step, anew, by_gain, in_rounds, stalled
 from trompe_server.attack.view_budget import ViewBudget
+from trompe_server.classifiers import ScoreBasedClassifier
 from trompe_server.image_pipelines import Drawn, ImagePipeline
 from trompe_shared.api import OptimiserName
 
@@ -66,8 +67,7 @@ class Search:
 
     total: steps of the run. seed: draws the views and backgrounds of each step. movable: 1 for texels that may move,
     else 0. view_budget: bound on the change of the images, if any. backgrounds: drawn behind each step's views in place
-    of their own, if any. pipeline: what happens to the images, drawn anew in each step. gains: whether the gain of each
-    step decides on the step size and on the end.
+    of their own, if any. pipeline: what happens to the images, drawn anew in each step.
     """
 
     objective: Objective
@@ -80,7 +80,14 @@ class Search:
     views_per_step: int | None
     backgrounds: Backgrounds | None
     pipeline: ImagePipeline | None
-    gains: bool
+
+    @property
+    def steps_by_gain(self) -> bool:
+        """Whether the gain of each step decides on the step size and the end: all steps look at the same images."""
+        n_views = self.objective.surrogate.n_views
+        drawn = (self.views_per_step or n_views) < n_views or self.backgrounds is not None or self.pipeline is not None
+        estimated = any(isinstance(member, ScoreBasedClassifier) for member in self.objective.members)
+        return self.optimiser == "nesterov" and self.objective.goal.safe < SAFE_ENOUGH and not (drawn or estimated)
 
     def least_left(self, point: Iterate, step: int) -> int:
         """Number of steps after ``step`` if nearly all views are fooled from now on."""
@@ -142,13 +149,13 @@ class Search:
             point = moved(self.optimiser, point, gradient, self._factor(point, step), self.box)
             if self.view_budget is not None:
                 point = replace(point, delta=self.view_budget.project(point.delta))
-        if self.gains:
+        if self.steps_by_gain:
             point = replace(point, memory=after_step(point.memory, found.fooled, found.loss))
         last = step + 1 == self.total or stalled(point.memory)
         return self._no_worse(point) if last and self.objective.masks is not None else point
 
     def _factor(self, point: Iterate, step: int) -> float:
-        return by_gain(point.memory, step, self.total) if self.gains else in_rounds(step, self.total)
+        return by_gain(point.memory, step, self.total) if self.steps_by_gain else in_rounds(step, self.total)
 
     def saved(self, delta: Flat) -> Flat:
         """``delta``, or the part of it that keeps the images within their bound once saved in 8 bits."""
