@@ -5,8 +5,8 @@ views still to be won. It rises with each step that finds nearly all of its view
 wins unseen views, and falls with each other step. The search ends when it reaches its maximum, or when steps that look
 at the same images gain nothing more (``schedule``).
 
-Saliency masks can lead the search downhill, because masked-out pixels see the same texels. At the end of a masked
-search the unpainted textures win if they fool more views.
+Saliency masks can lead the search downhill, because masked-out pixels see the same texels. A masked search ends at the
+best of its last point, the unpainted textures and, if all steps look at the same images, what they looked at.
 """
 
 import math
@@ -48,6 +48,9 @@ AGAIN: Final = 2
 RESUME, SHOWN, SAFE = "search.resume", "search.shown", "search.safe"
 """Memory of the search: step from which each view is evaluated again, images shown so far, safe margin."""
 
+BEST, SCORED = "search.best", "search.scored"
+"""Memory of a masked search: the best change that it looked at, and its score."""
+
 
 def finished(memory: Memory, goal: Goal) -> bool:
     """Whether all views are so safely won, or so little is gained, that no step is left to take."""
@@ -58,7 +61,8 @@ def went_on(memory: Memory, goal: Goal, *, shown: int, added: int) -> Memory:
     """Memory of a search that has looked at ``shown`` further images and ``added`` views: these ask for more steps."""
     sooner = added and SAFE in memory and goal.safe < SAFE_ENOUGH
     safe = {SAFE: memory[SAFE].clamp(max=SAFE_ENOUGH / RISE**AGAIN)} if sooner else {}
-    return {**(anew(memory) if added else memory), **safe, SHOWN: memory.get(SHOWN, torch.tensor(0)) + shown}
+    kept = {key: value for key, value in anew(memory).items() if key not in (BEST, SCORED)} if added else memory
+    return {**kept, **safe, SHOWN: memory.get(SHOWN, torch.tensor(0)) + shown}
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,10 @@ class Search:
             SHOWN: torch.tensor(self.shown(point) + found.images),
             SAFE: torch.tensor(self._safe_after(found, point)),
         }
+        score = found.fooled, found.loss
+        better = SCORED not in point.memory or score > tuple(point.memory[SCORED].tolist())
+        if self.objective.masks is not None and self.steps_by_gain and better:
+            memory |= {BEST: change, SCORED: torch.tensor(score, dtype=torch.float64)}
         return found, replace(point, memory={**point.memory, **memory})
 
     def _drawn(self, batches: Sequence[range], step: int) -> Sequence[int]:
@@ -152,7 +160,7 @@ class Search:
         if self.steps_by_gain:
             point = replace(point, memory=after_step(point.memory, found.fooled, found.loss))
         last = step + 1 == self.total or stalled(point.memory)
-        return self._no_worse(point) if last and self.objective.masks is not None else point
+        return self._best(point) if last and self.objective.masks is not None else point
 
     def _factor(self, point: Iterate, step: int) -> float:
         return by_gain(point.memory, step, self.total) if self.steps_by_gain else in_rounds(step, self.total)
@@ -161,9 +169,12 @@ class Search:
         """``delta``, or the part of it that keeps the images within their bound once saved in 8 bits."""
         return delta if self.view_budget is None else self.view_budget.saved(delta, levels=self.box.budget.levels)
 
-    def _no_worse(self, point: Iterate) -> Iterate:
-        """The iterate, or no change if that fools more views."""
-        unpainted = torch.zeros_like(point.delta)
-        best = max(point.delta, unpainted, key=self.objective.score)
-        shown = self.shown(point) + 2 * self.objective.surrogate.n_views
+    def _best(self, point: Iterate) -> Iterate:
+        """The iterate, the best change that a step looked at, or no change: what fools most views."""
+        changes = [point.delta, torch.zeros_like(point.delta)]
+        if BEST in point.memory:
+            best = point.memory[BEST]
+            changes.append(best if self.view_budget is None else self.view_budget.project(best))
+        shown = self.shown(point) + len(changes) * self.objective.surrogate.n_views
+        best = max(changes, key=self.objective.score)
         return replace(point, delta=best, memory={**point.memory, SHOWN: torch.tensor(shown)})
