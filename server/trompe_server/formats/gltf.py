@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from trompe_server.formats.assembly import assemble, flat_picture, free_name, safe_name
 from trompe_server.formats.gltf_container import Container, at, open_container
 from trompe_server.formats.gltf_schema import Document, Material, TextureInfo
-from trompe_server.formats.gltf_shapes import Matrix, Shape, instances, placed, read_shape
+from trompe_server.formats.gltf_shapes import Instance, Shape, instances, placed, read_shape
 from trompe_server.formats.pictures import (
     cutout_alpha,
     decode,
@@ -77,16 +77,15 @@ class Model:
 
     def add(self) -> None:
         """Read all meshes of the scene."""
-        standing = list(instances(self.document))
-        for mesh in dict.fromkeys(mesh for mesh, _ in standing):
+        standing = list(instances(self.container))
+        for mesh in dict.fromkeys(instance.mesh for instance in standing):
             self._read_mesh(mesh)
         self._unwrap()
         for shape in self.shapes.values():
             self._paint(shape)
-        for mesh, matrix in standing:
-            self.parts += [
-                part for key, shape in self.shapes.items() if key[0] == mesh for part in self._place(shape, matrix)
-            ]
+        for instance in standing:
+            own = (shape for (mesh, _), shape in self.shapes.items() if mesh == instance.mesh)
+            self.parts += [part for shape in own for part in self._place(shape, instance)]
 
     def _read_mesh(self, index: int) -> None:
         mesh = at(self.document.meshes, index, "mesh")
@@ -214,9 +213,9 @@ class Model:
             self._converted[key] = self._new_file(f"{stem}.png", encode_png(converted))
         return self._converted[key]
 
-    def _place(self, shape: Shape, matrix: Matrix) -> tuple[Part, ...]:
+    def _place(self, shape: Shape, instance: Instance) -> tuple[Part, ...]:
         """The shape at the place of an instance; both sides if the material is double-sided."""
-        part = placed(shape, matrix, self._names[shape.material, shape.cut is not None])
+        part = placed(shape, instance, self._names[shape.material, shape.cut is not None])
         if not self._material(shape.material).double_sided:
             return (part,)
         return part, replace(part, normals=-part.normals, faces=np.ascontiguousarray(part.faces[:, ::-1]))

@@ -17,6 +17,7 @@ READ_EXTENSIONS: Final = (
 """Prefixes of extensions a file may require: supported, or about light and finish without effect here."""
 
 MAX_NODES: Final = 100_000
+MAX_JOINTS: Final = 65_536
 
 Index = Annotated[int, Field(ge=0, lt=2**31)]
 Size = Annotated[int, Field(ge=0, lt=2**40)]
@@ -108,6 +109,13 @@ class Node(_Part):
     rotation: Quadruple = (0.0, 0.0, 0.0, 1.0)
     scale: Triple = (1.0, 1.0, 1.0)
     weights: tuple[Number, ...] = ()
+
+
+class Skin(_Part):
+    """Nodes that move the vertices of a mesh, and matrices from the mesh to each of them (default: none)."""
+
+    joints: Annotated[tuple[Index, ...], Field(min_length=1, max_length=MAX_JOINTS)]
+    inverse_bind_matrices: Index | None = None
 
 
 class Scene(_Part):
@@ -207,6 +215,7 @@ class Document(_Part):
     scenes: tuple[Scene, ...] = ()
     nodes: Annotated[tuple[Node, ...], Field(max_length=MAX_NODES)] = ()
     meshes: tuple[Mesh, ...] = ()
+    skins: tuple[Skin, ...] = ()
     accessors: tuple[Accessor, ...] = ()
     buffer_views: tuple[BufferView, ...] = ()
     buffers: tuple[Buffer, ...] = ()

@@ -1,6 +1,6 @@
 """Meshes of a glTF scene: transforms of their instances, and geometry of their primitives."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 
@@ -18,10 +18,20 @@ Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Instance:
+    """A mesh in the scene. matrix: (4, 4), to the world; joints: (J, 4, 4), those of its skin, in place of it."""
+
+    mesh: int
+    matrix: Matrix
+    joints: Matrix | None = None
+
+
+@dataclass(frozen=True)
 class Shape:
     """One primitive of the file. ``cut``: its unwrapping, if any.
 
-    uvs: (V, 2), v upwards. colours: (V, 3), linear.
+    uvs: (V, 2), v upwards. colours: (V, 3), linear. pull: numbers (V, n) of the joints that move each vertex, and their
+    weights (V, n), which sum to 1.
     """
 
     material: int | None
@@ -31,28 +41,54 @@ class Shape:
     colours: NDArray[np.float64] | None
     faces: NDArray[np.int32]
     cut: Unwrapped | None = None
+    pull: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None
 
 
-def instances(document: Document) -> Iterator[tuple[int, Matrix]]:
-    """Each mesh of the scene with its world transform. Raises ``ObjectError`` unless the nodes form a tree."""
-    waiting = [(index, np.eye(4)) for index in reversed(_roots(document))]
-    seen: set[int] = set()
+def instances(container: Container) -> Iterator[Instance]:
+    """Each mesh of the scene. Raises ``ObjectError`` unless the nodes form a tree."""
+    document = container.document
+    world = _worlds(document)
     triangles, count_of = 0, cache(partial(_triangles, document))
+    for index, matrix in world.items():
+        node = document.nodes[index]
+        if node.mesh is None:
+            continue
+        if any(node.weights or at(document.meshes, node.mesh, "mesh").weights):
+            raise ObjectError("The glTF has morph targets; apply them and export it again.")
+        triangles += count_of(node.mesh)
+        if triangles > MAX_FACES:
+            raise ObjectError(f"The glTF has more than {MAX_FACES} triangles; simplify it.")
+        yield Instance(node.mesh, matrix, None if node.skin is None else _joints(container, node.skin, world))
+
+
+def _worlds(document: Document) -> dict[int, Matrix]:
+    """World transform of each node of the scene, parents first."""
+    waiting = [(index, np.eye(4)) for index in reversed(_roots(document))]
+    found: dict[int, Matrix] = {}
     while waiting:
         index, above = waiting.pop()
-        if index in seen:
+        if index in found:
             raise ObjectError(f"Node {index} of the glTF has two parents or contains itself; nodes must form a tree.")
-        seen.add(index)
         node = at(document.nodes, index, "node")
-        matrix = above @ _local(node)
-        if node.mesh is not None:
-            if node.skin is not None or any(node.weights or at(document.meshes, node.mesh, "mesh").weights):
-                raise ObjectError("The glTF has skins or morph targets; apply them and export it again.")
-            triangles += count_of(node.mesh)
-            if triangles > MAX_FACES:
-                raise ObjectError(f"The glTF has more than {MAX_FACES} triangles; simplify it.")
-            yield node.mesh, matrix
-        waiting += [(child, matrix) for child in reversed(node.children)]
+        found[index] = above @ _local(node)
+        waiting += [(child, found[index]) for child in reversed(node.children)]
+    return found
+
+
+def _joints(container: Container, index: int, world: Mapping[int, Matrix]) -> Matrix:
+    """What each joint of a skin does to the vertices in its pose, (joints, 4, 4)."""
+    skin = at(container.document.skins, index, "skin")
+    if lost := [joint for joint in skin.joints if joint not in world]:
+        raise ObjectError(f"Joint {lost[0]} of the glTF's skin {index} is not in the scene; export it again.")
+    joints = np.stack([world[joint] for joint in skin.joints])
+    if skin.inverse_bind_matrices is None:
+        return joints
+    columns = container.numbers(skin.inverse_bind_matrices, 16).astype(np.float64)
+    if len(columns) < len(joints):
+        raise ObjectError(
+            f"Skin {index} of the glTF has {len(joints)} joints and {len(columns)} inverse bind matrices."
+        )
+    return joints @ columns[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1)
 
 
 def _roots(document: Document) -> Sequence[int]:
@@ -106,7 +142,8 @@ def read_shape(container: Container, primitive: Primitive) -> Shape:
             raise ObjectError(f"A mesh of the glTF has {len(vertices)} positions and {len(values)} {what}.")
         if values is not None:
             check_numbers(values, "The glTF")
-    return Shape(primitive.material, vertices, normals, uvs, colours, faces)
+    pull = _pull(container, primitive, len(vertices)) if "JOINTS_0" in primitive.attributes else None
+    return Shape(primitive.material, vertices, normals, uvs, colours, faces, pull=pull)
 
 
 def _faces(container: Container, primitive: Primitive, count: int) -> NDArray[np.int32]:
@@ -190,27 +227,61 @@ def _vertex_colours(container: Container, primitive: Primitive) -> NDArray[np.fl
     return None if (colours > 0.999).all() else np.clip(colours, 0.0, 1.0)
 
 
-def placed(shape: Shape, matrix: Matrix, material: str) -> Part:
-    """The transformed shape of an instance, with its own texture coordinates or those of its unwrapping."""
+def _pull(container: Container, primitive: Primitive, count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """``Shape.pull`` of a primitive with joints. The first joint holds vertices without weights."""
+    joints, weights = [], []
+    for k in range(len(primitive.attributes)):
+        if f"JOINTS_{k}" not in primitive.attributes:
+            break
+        if f"WEIGHTS_{k}" not in primitive.attributes:
+            raise ObjectError(f"A mesh of the glTF has JOINTS_{k} and no WEIGHTS_{k}; export it again.")
+        joints.append(container.numbers(primitive.attributes[f"JOINTS_{k}"], 4).astype(np.int64))
+        weights.append(container.numbers(primitive.attributes[f"WEIGHTS_{k}"], 4).astype(np.float64))
+    if any(len(each) != count for each in joints + weights):
+        raise ObjectError("A mesh of the glTF has another number of joints or weights than of positions.")
+    shares = np.concatenate(weights, axis=1)
+    check_numbers(shares, "The glTF")
+    shares[shares.sum(1) <= 0] = np.eye(1, shares.shape[1])
+    return np.concatenate(joints, axis=1), shares / shares.sum(1, keepdims=True)
+
+
+def _blended(shape: Shape, joints: Matrix) -> Matrix:
+    """World transform of each vertex, (V, 4, 4), as the ``joints`` of a skin pull it (glTF 2.0, section 3.7.3)."""
+    if shape.pull is None:
+        raise ObjectError("A mesh of the glTF has a skin, but no JOINTS_0; export it again.")
+    numbers, weights = shape.pull
+    if numbers.max() >= len(joints):
+        raise ObjectError(f"A mesh of the glTF names joint {numbers.max()} of {len(joints)}; export it again.")
+    blended = np.zeros((len(numbers), 4, 4))
+    for column in range(numbers.shape[1]):
+        blended += weights[:, column, None, None] * joints[numbers[:, column]]
+    return blended
+
+
+def placed(shape: Shape, instance: Instance, material: str) -> Part:
+    """The shape of an instance in the world, with its own texture coordinates or those of its unwrapping."""
+    matrix = instance.matrix if instance.joints is None else _blended(shape, instance.joints)
     if (cut := shape.cut) is not None:
         normals = None if shape.normals is None else shape.normals[cut.source]
         shape = replace(shape, vertices=shape.vertices[cut.source], normals=normals, uvs=cut.uvs, faces=cut.faces)
+        matrix = matrix if instance.joints is None else matrix[cut.source]
     assert shape.uvs is not None
-    moved = shape.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    moved = (matrix[..., :3, :3] @ shape.vertices[..., None])[..., 0] + matrix[..., :3, 3]
     check_numbers(moved, "The glTF")
     vertices = moved.astype(np.float32)
-    faces = shape.faces if np.linalg.det(matrix[:3, :3]) >= 0 else np.ascontiguousarray(shape.faces[:, ::-1])
+    mirrored = np.median(np.linalg.det(matrix[..., :3, :3])) < 0
+    faces = np.ascontiguousarray(shape.faces[:, ::-1]) if mirrored else shape.faces
     if shape.normals is None:
         return _faceted(material, vertices[faces], shape.uvs[faces])
     return Part(material, vertices, _transformed(shape.normals, matrix), shape.uvs, faces)
 
 
 def _transformed(normals: NDArray[np.float32], matrix: Matrix) -> NDArray[np.float32]:
-    """Unit normals after ``matrix``, by cofactors: the matrix may be singular."""
-    a, b, c = matrix[:3, :3].T
-    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-    sign = -1.0 if np.linalg.det(matrix[:3, :3]) < 0 else 1.0
-    turned = normals.astype(np.float64) @ (sign * cofactors).T
+    """Unit normals after ``matrix``, one for all (4, 4) or for each (V, 4, 4), by cofactors: it may be singular."""
+    a, b, c = (matrix[..., :3, column] for column in range(3))
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
+    sign = np.where(np.linalg.det(matrix[..., :3, :3]) < 0, -1.0, 1.0)[..., None]
+    turned = sign * (cofactors @ normals.astype(np.float64)[..., None])[..., 0]
     lengths = np.linalg.norm(turned, axis=1, keepdims=True)
     return np.asarray(turned / np.maximum(lengths, 1e-30), np.float32)
 
