@@ -3,15 +3,15 @@
 import base64
 import binascii
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final, TypeVar
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from trompe_server.formats.gltf_schema import READ_EXTENSIONS, Document
+from trompe_server.formats.gltf_schema import READ_EXTENSIONS, Document, Draco, Primitive
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
 from trompe_shared.faults import faults_of
@@ -35,13 +35,15 @@ def at(items: Sequence[T], index: int, what: str) -> T:
 
 @dataclass(frozen=True)
 class Container:
-    """text: the JSON as in the file. buffers: at least as long as their declared lengths."""
+    """text: the JSON as in the file. buffers: at least as long as their declared lengths. decompressed: accessors of
+    which the buffers hold only compressed numbers."""
 
     upload: Upload
     text: bytes
     document: Document
     buffers: tuple[bytes, ...]
     binary: bool
+    decompressed: Mapping[int, NDArray[np.generic]] = field(default_factory=dict)
 
     def view(self, index: int) -> bytes:
         """Bytes of a buffer view."""
@@ -53,6 +55,8 @@ class Container:
 
     def raw(self, index: int) -> NDArray[np.generic]:
         """Stored numbers of an accessor, (count, components)."""
+        if index in self.decompressed:
+            return self.decompressed[index]
         accessor = at(self.document.accessors, index, "accessor")
         kind, width = np.dtype(COMPONENTS[accessor.component_type]), WIDTHS[accessor.type]
         what = f"Accessor {index}"
@@ -141,7 +145,40 @@ def open_container(upload: Upload) -> Container:
     text = chunks[0][1]
     document = _document(text)
     own = next((chunk for kind, chunk in chunks[1:2] if kind == BIN_CHUNK), None)
-    return Container(upload, text, document, _buffers(document, upload, own), binary)
+    container = Container(upload, text, document, _buffers(document, upload, own), binary)
+    primitives = [primitive for mesh in document.meshes for primitive in mesh.primitives]
+    compressed = [(primitive, primitive.draco) for primitive in primitives if primitive.draco is not None]
+    found = (accessors for each in compressed for accessors in _decompressed(container, *each))
+    return replace(container, decompressed=dict(found))
+
+
+def _decompressed(
+    container: Container, primitive: Primitive, draco: Draco
+) -> Iterator[tuple[int, NDArray[np.generic]]]:
+    """The accessors of a primitive that only Draco's bytes hold."""
+    import DracoPy  # type: ignore[import-not-found]
+
+    accessors = container.document.accessors
+    wanted = {name: index for name, index in primitive.attributes.items() if name in draco.attributes}
+    if primitive.indices is None or primitive.mode != 4:
+        raise ObjectError("A mesh of the glTF that Draco compresses is no list of triangles; export it again.")
+    if all(at(accessors, index, "accessor").buffer_view is not None for index in (*wanted.values(), primitive.indices)):
+        return  # the file has both
+    try:
+        mesh: Any = DracoPy.decode(container.view(draco.buffer_view))
+        values = {
+            index: mesh.get_attribute_by_unique_id(draco.attributes[name])["data"] for name, index in wanted.items()
+        } | {primitive.indices: mesh.faces.reshape(-1, 1)}
+    except Exception as error:
+        raise ObjectError(f"A mesh of the glTF cannot be decompressed by Draco ({error}); export it again.") from error
+    for index, numbers in values.items():
+        accessor = at(accessors, index, "accessor")
+        shape, declared = numbers.shape, (accessor.count, WIDTHS[accessor.type])
+        if shape != declared:
+            raise ObjectError(
+                f"Accessor {index} of the glTF has {declared} numbers, Draco's bytes {shape}; export it again."
+            )
+        yield index, numbers.astype(COMPONENTS[accessor.component_type])
 
 
 def _document(text: bytes) -> Document:

@@ -10,6 +10,7 @@ from trompe_shared.wavefront import MAX_FACES
 READ_EXTENSIONS: Final = (
     "KHR_texture_transform",
     "KHR_mesh_quantization",
+    "KHR_draco_mesh_compression",
     "KHR_materials_",
     "KHR_lights_punctual",
     "EXT_texture_webp",
@@ -82,6 +83,13 @@ class Accessor(_Part):
     sparse: Sparse | None = None
 
 
+class Draco(_Part):
+    """KHR_draco_mesh_compression: compressed bytes, and Draco's number of each attribute in them."""
+
+    buffer_view: Index
+    attributes: dict[str, Index]
+
+
 class Primitive(_Part):
     """Triangles of one material."""
 
@@ -89,6 +97,7 @@ class Primitive(_Part):
     indices: Index | None = None
     material: Index | None = None
     mode: Annotated[int, Field(ge=0, le=6)] = 4
+    draco: Draco | None = Field(default=None, validation_alias=AliasPath("extensions", "KHR_draco_mesh_compression"))
 
 
 class Mesh(_Part):
