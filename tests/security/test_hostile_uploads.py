@@ -219,6 +219,16 @@ def accessor(**changes: Any) -> bytes:
     return glb(document)
 
 
+def draco() -> bytes:
+    """A GLB whose positions are only in the bytes of a picture, as if Draco had compressed them."""
+    document = gltf_json()
+    del document["accessors"][0]["bufferView"]
+    document["accessors"].append({"componentType": 5125, "count": 3, "type": "SCALAR"})
+    compressed = {"KHR_draco_mesh_compression": {"bufferView": 2, "attributes": {"POSITION": 0}}}
+    document["meshes"][0]["primitives"][0] |= {"indices": 2, "extensions": compressed}
+    return glb(document)
+
+
 def sparse(count: int) -> dict[str, Any]:
     """Other values for rows whose numbers are the bits of positions."""
     return {
@@ -283,8 +293,9 @@ GLTFS = {
         "not valid",
     ),
     "a place beyond all bounds": (lambda: changed(nodes=[{"mesh": 0, "translation": [1e11, 0, 0]}]), "beyond 1e+06"),
-    "compressed meshes": (lambda: changed(extensionsRequired=["KHR_draco_mesh_compression"]), "draco"),
-    "a skin": (lambda: changed(nodes=[{"mesh": 0, "skin": 0}]), "skins"),
+    "compressed meshes": (lambda: changed(extensionsRequired=["EXT_meshopt_compression"]), "meshopt"),
+    "meshes that Draco did not compress": (lambda: draco(), "cannot be decompressed by Draco"),
+    "a skin that is not there": (lambda: changed(nodes=[{"mesh": 0, "skin": 0}]), "names skin 0, but has 0"),
     "lists where there should be names": (lambda: changed(meshes={"primitives": "all"}), "not valid at meshes"),
     "a chunk beyond the file": (lambda: glb(gltf_json()).replace(b"\0JSON", b"\xffJSON"), "beyond it"),
     "glTF of another version": (lambda: changed(asset={"version": "1.0"}), "glTF 2.0"),
