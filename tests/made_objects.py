@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from trompe_server.formats import read_object
 from trompe_server.formats.gltf_container import BIN_CHUNK
 from trompe_server.formats.gltf_write import glb
-from trompe_shared.object3d import encode_png, load_object
+from trompe_shared.object3d import Object3D, encode_png, load_object
 from trompe_shared.shipped import shipped_objects
 
 Json = dict[str, Any]
@@ -97,6 +98,11 @@ class Scene:
     def to_glb(self) -> bytes:
         document = self.document | {"buffers": [{"byteLength": len(self.data)}]}
         return glb(json.dumps(document).encode(), [(BIN_CHUNK, self.data)])
+
+
+def read(data: bytes | Scene) -> Object3D:
+    """The object in a GLB file or a scene."""
+    return read_object(data.to_glb() if isinstance(data, Scene) else data, name="scene.glb").obj
 
 
 Mesh = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]

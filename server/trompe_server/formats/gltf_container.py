@@ -160,10 +160,11 @@ def _decompressed(
 
     accessors = container.document.accessors
     wanted = {name: index for name, index in primitive.attributes.items() if name in draco.attributes}
+    read = [*wanted.values(), *([] if primitive.indices is None else [primitive.indices])]
+    if all(at(accessors, index, "accessor").buffer_view is not None for index in read):
+        return  # the file has both
     if primitive.indices is None or primitive.mode != 4:
         raise ObjectError("A mesh of the glTF that Draco compresses is no list of triangles; export it again.")
-    if all(at(accessors, index, "accessor").buffer_view is not None for index in (*wanted.values(), primitive.indices)):
-        return  # the file has both
     try:
         mesh: Any = DracoPy.decode(container.view(draco.buffer_view))
         values = {

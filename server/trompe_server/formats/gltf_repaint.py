@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from trompe_server.formats.assembly import free_name, repainted
 from trompe_server.formats.gltf import Model, Slot, load
 from trompe_server.formats.gltf_container import BIN_CHUNK, Container, split_glb
+from trompe_server.formats.gltf_schema import DRACO
 from trompe_server.formats.gltf_shapes import Shape
 from trompe_server.formats.gltf_write import Json, Writer, append, glb
 from trompe_server.formats.pictures import Pixels, decode
@@ -271,8 +272,6 @@ class _Editor(Writer):
 
 
 _BYTES: Final = "application/octet-stream"
-DRACO: Final = "KHR_draco_mesh_compression"
-"""Holds a compressed copy of a primitive."""
 SPECULAR_GLOSSINESS: Final = "KHR_materials_pbrSpecularGlossiness"
 """Holds colours that some viewers show in place of the base colour."""
 

@@ -7,10 +7,13 @@ from pydantic.alias_generators import to_camel
 
 from trompe_shared.wavefront import MAX_FACES
 
+DRACO: Final = "KHR_draco_mesh_compression"
+"""Holds the compressed numbers of a primitive, or a compressed copy of them."""
+
 READ_EXTENSIONS: Final = (
     "KHR_texture_transform",
     "KHR_mesh_quantization",
-    "KHR_draco_mesh_compression",
+    DRACO,
     "KHR_materials_",
     "KHR_lights_punctual",
     "EXT_texture_webp",
@@ -84,7 +87,7 @@ class Accessor(_Part):
 
 
 class Draco(_Part):
-    """KHR_draco_mesh_compression: compressed bytes, and Draco's number of each attribute in them."""
+    """Compressed bytes, and Draco's number of each attribute in them."""
 
     buffer_view: Index
     attributes: dict[str, Index]
@@ -97,7 +100,7 @@ class Primitive(_Part):
     indices: Index | None = None
     material: Index | None = None
     mode: Annotated[int, Field(ge=0, le=6)] = 4
-    draco: Draco | None = Field(default=None, validation_alias=AliasPath("extensions", "KHR_draco_mesh_compression"))
+    draco: Draco | None = Field(default=None, validation_alias=AliasPath("extensions", DRACO))
 
 
 class Mesh(_Part):

@@ -250,8 +250,10 @@ def _blended(shape: Shape, joints: Matrix) -> Matrix:
     if shape.pull is None:
         raise ObjectError("A mesh of the glTF has a skin, but no JOINTS_0; export it again.")
     numbers, weights = shape.pull
-    if numbers.max() >= len(joints):
-        raise ObjectError(f"A mesh of the glTF names joint {numbers.max()} of {len(joints)}; export it again.")
+    if wrong := {int(number) for number in (numbers.min(), numbers.max()) if not 0 <= number < len(joints)}:
+        raise ObjectError(
+            f"A mesh of the glTF names joint {wrong.pop()}, but its skin has {len(joints)}; export it again."
+        )
     blended = np.zeros((len(numbers), 4, 4))
     for column in range(numbers.shape[1]):
         blended += weights[:, column, None, None] * joints[numbers[:, column]]

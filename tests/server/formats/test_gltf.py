@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 
-from tests.made_objects import CORNERS, SQUARE, UVS, Scene
+from tests.made_objects import CORNERS, SQUARE, UVS, Scene, read
 from tests.small_models import corners, painted, refusal, same_paint
 from tests.surfaces import object_of
 from trompe_server.formats import read_object, repaint_file, write_glb
@@ -36,10 +36,6 @@ def textured(picture: Pixels = GRADIENT, **material: Any) -> Scene:
     scene = Scene()
     scene.square(scene.material(scene.texture(picture), **material))
     return scene
-
-
-def read(data: bytes | Scene) -> Object3D:
-    return read_object(data.to_glb() if isinstance(data, Scene) else data, name="scene.glb").obj
 
 
 def repainted(data: bytes, obj: Object3D) -> bytes:

@@ -6,9 +6,9 @@ import DracoPy  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 
-from tests.made_objects import CORNERS, SQUARE, UVS, Scene
+from tests.made_objects import CORNERS, SQUARE, UVS, Scene, read
 from tests.small_models import painted, refusal, same_paint
-from trompe_server.formats import read_object, repaint_file
+from trompe_server.formats import repaint_file
 from trompe_server.formats.gltf_container import open_container
 from trompe_server.formats.upload import Upload
 from trompe_shared.object3d import Object3D
@@ -34,10 +34,6 @@ def compressed(*, uvs: bool = True, data: bytes | None = None) -> Scene:
     return scene
 
 
-def read(data: Scene | bytes) -> Object3D:
-    return read_object(data.to_glb() if isinstance(data, Scene) else data, name="scene.glb").obj
-
-
 def shown(obj: Object3D) -> np.ndarray:
     """Positions and texture coordinates of the corners, in an order of their own."""
     rows = np.concatenate([np.hstack([part.vertices, part.uvs])[part.faces.ravel()] for part in obj.parts])
@@ -48,6 +44,15 @@ def test_a_compressed_mesh_is_read_as_it_was() -> None:
     plain = Scene()
     plain.square(plain.material(plain.texture(PLAIN)))
     np.testing.assert_allclose(shown(read(compressed())), shown(read(plain)), atol=1e-3)
+
+
+def test_of_a_compressed_copy_the_other_is_read_whatever_its_triangles() -> None:
+    plain, both = compressed(), Scene()
+    both.square(both.material(both.texture(PLAIN)))
+    strip: Any = both.document["meshes"][0]["primitives"][0]
+    strip |= {"mode": 5, "extensions": plain.document["meshes"][0]["primitives"][0]["extensions"]}
+    strip["indices"] = both.accessor(np.array([1, 2, 0, 3], "<u2"))
+    np.testing.assert_allclose(shown(read(both)), shown(read(plain)), atol=1e-3)
 
 
 @pytest.mark.parametrize("uvs", [True, False], ids=["textured", "unwrapped here"])

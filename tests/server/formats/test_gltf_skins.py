@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tests.made_objects import SQUARE, UVS, Scene
+from tests.made_objects import SQUARE, UVS, Scene, read
 from tests.small_models import painted, refusal, same_paint
-from trompe_server.formats import read_object, repaint_file
-from trompe_shared.object3d import Object3D
+from trompe_server.formats import repaint_file
 
 Matrix = NDArray[np.float64]
 SHARES = np.array([[1, 0, 0, 0], [0, 2, 0, 0], [0.5, 0.5, 0, 0], [0, 0, 0, 0]], "<f4")
@@ -53,10 +52,6 @@ def skinned(joints: list[dict[str, Any]], inverse: list[Matrix] | None = None, *
     scene.document["nodes"] = [{"mesh": 0, "skin": 0, "translation": [7, 8, 9]}, *chained]
     scene.document["scenes"] = [{"nodes": [0, 1]}]
     return scene
-
-
-def read(data: Scene | bytes) -> Object3D:
-    return read_object(data.to_glb() if isinstance(data, Scene) else data, name="scene.glb").obj
 
 
 @given(place, place, place, place)
@@ -100,6 +95,8 @@ def test_joints_that_are_not_there_are_refused() -> None:
 
     def refused(**changes: Any) -> str:
         scene = skinned([still, still], [np.eye(4)] * 2)
+        if "numbers" in changes:
+            changes["attributes"] = {"JOINTS_0": scene.accessor(changes.pop("numbers"))}
         attributes = scene.document["meshes"][0]["primitives"][0]["attributes"]
         for name, accessor in changes.pop("attributes", {}).items():
             attributes[name] = accessor
@@ -109,7 +106,9 @@ def test_joints_that_are_not_there_are_refused() -> None:
         return refusal(scene.to_glb(), "scene.glb")
 
     assert "Joint 9 of the glTF's skin 0 is not in the scene" in refused(joints=[1, 9])
-    assert "names joint 1 of 1" in refused(joints=[1])
+    assert "names joint 1, but its skin has 1" in refused(joints=[1])
+    below = np.full((4, 4), -3, "i2")
+    assert "names joint -3, but its skin has 2" in refused(numbers=below)
     assert "3 joints and 2 inverse bind matrices" in refused(joints=[1, 2, 1])
     assert "no WEIGHTS_0" in refused(attributes={"WEIGHTS_0": None})
     assert "no JOINTS_0" in refused(attributes={"JOINTS_0": None})
