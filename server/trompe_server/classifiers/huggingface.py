@@ -48,15 +48,19 @@ def load_huggingface(model: str) -> NamedNetwork:
             f"{model!r} cannot be loaded as an image classifier ({type(error).__name__}: {str(error)[:300]}). Give a "
             "repository of transformers' image classifiers with safetensors, or a .pt2 file."
         ) from error
-    labels = network.config.id2label
-    mean, std = _normalisation(settings)
+    mean, std = _normalisation(settings, model)
     whole = Normalised(_Logits(network, bgr=bool(settings.get("do_flip_channel_order"))), mean=mean, std=std)
-    return NamedNetwork(whole, _image_size(settings, model), [labels[index] for index in range(len(labels))])
+    return NamedNetwork(whole, _image_size(settings, model), _class_names(network.config.id2label))
 
 
 def huggingface_weights(model: str) -> Path:
     """The file with the weights of the repository ``model``. Raises ``ClassifierError``."""
     return hub_file(model, WEIGHTS, extra="hf")
+
+
+def _class_names(labels: Mapping[int, Any]) -> list[str] | None:
+    """The names in the order of the logits; ``None`` if they are not numbered from 0."""
+    return [str(labels[index]) for index in range(len(labels))] if set(labels) == {*range(len(labels))} else None
 
 
 def _settings(model: str) -> Mapping[str, Any]:
@@ -71,19 +75,24 @@ def _settings(model: str) -> Mapping[str, Any]:
     return settings
 
 
-def _normalisation(settings: Mapping[str, Any]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _normalisation(settings: Mapping[str, Any], model: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Mean and standard deviation of the three channels of images in [0, 1] that have the same effect as ``settings``.
 
     transformers multiplies pixels in [0, 255] by ``rescale_factor`` (1 / 255), subtracts 1 (``rescale_offset``),
     normalises, and divides by the standard deviation once more (``include_top``). Its processor that flips channels
-    never normalises, whatever the settings.
+    never normalises, whatever the settings. Raises ``ClassifierError`` if mean or standard deviation is missing: each
+    processor has another default.
     """
     rescaled = settings.get("do_rescale", True)
     white = 255 * (settings.get("rescale_factor") or 1 / 255) if rescaled else 255.0
     black = -1.0 if rescaled and settings.get("rescale_offset") else 0.0
     mean, std, divisor = np.zeros(3), np.ones(3), settings.get("image_std") or 1.0
     if settings.get("do_normalize", True) and "do_flip_channel_order" not in settings:
-        mean, std = mean + (settings.get("image_mean") or 0.0), std * divisor
+        if not (settings.get("image_mean") and settings.get("image_std")):
+            raise ClassifierError(
+                f"The preprocessor_config.json of {model!r} names no image_mean or no image_std; give a .pt2 file."
+            )
+        mean, std = mean + settings["image_mean"], std * divisor
     if settings.get("include_top"):
         std = std * divisor
     return tuple(((mean - black) / white).tolist()), tuple((std / white).tolist())

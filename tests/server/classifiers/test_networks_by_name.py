@@ -338,6 +338,24 @@ def test_a_repository_of_transformers_is_a_white_box(hub: Callable[[str], Path],
 
 
 @pytest.mark.parametrize(
+    ("labels", "classes"),
+    [
+        pytest.param({"0": 10, "1": 20, "2": 30}, ("10", "20", "30"), id="numbers as names"),
+        pytest.param({"1": "a", "2": "b", "3": "c"}, None, id="numbered from 1"),
+    ],
+)
+def test_class_names_of_transformers_are_those_of_the_logits(
+    labels: dict[str, Any], classes: tuple[str, ...] | None, hub: Callable[[str], Path]
+) -> None:
+    folder = hub("org/model")
+    vision_transformer(folder)
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"id2label": labels}))
+    (folder / "preprocessor_config.json").write_text('{"size": 32, "do_normalize": false}')
+    assert load_classifier("hf:org/model").classes == classes
+
+
+@pytest.mark.parametrize(
     ("processor", "settings"),
     [
         pytest.param("ViT", {"rescale_factor": 1 / 100}, id="another range"),
@@ -376,12 +394,15 @@ def test_a_repository_with_a_pickle_is_refused(hub: Callable[[str], Path]) -> No
     [
         pytest.param("{", "preprocessor_config.json of 'org/model' is not JSON", id="not JSON"),
         pytest.param("[]", "preprocessor_config.json of 'org/model' has no settings", id="a list"),
+        pytest.param('{"size": 32}', "config.json of 'org/model' names no image_mean or no image_std", id="no mean"),
     ],
 )
 def test_settings_of_images_that_cannot_be_read_are_refused(
     settings: str, message: str, hub: Callable[[str], Path]
 ) -> None:
-    (hub("org/model") / "preprocessor_config.json").write_text(settings)
+    folder = hub("org/model")
+    vision_transformer(folder)
+    (folder / "preprocessor_config.json").write_text(settings)
     with pytest.raises(ClassifierError, match=message):
         load_classifier("hf:org/model")
 
