@@ -41,15 +41,31 @@ def check_labels(labels: Sequence[int], n_classes: int, *, given: Sequence[objec
         )
 
 
-def check_indices(label: Sequence[str | int], victim: Classes, judges: Sequence[Classes]) -> None:
-    """Raise ``SpecError`` for a class given by its index if a judge has another number of classes."""
-    index = next((each for each in label if isinstance(each, int) or each.strip().isdecimal()), None)
+def check_judges(label: Sequence[str | int], victim: Classes, judges: Sequence[Classes]) -> None:
+    """Raise ``SpecError`` for a judge with other classes if ``label`` is an index, or the judge has no class names."""
+    indices = [int(each) for each in label if isinstance(each, int) or each.strip().isdecimal()]
     for judge in judges:
-        if index is not None and judge.n_classes != victim.n_classes:
-            raise SpecError(
-                f"The index {index} is another class for the judge {judge.name!r}: it has {judge.n_classes} classes, "
-                f"{victim.name!r} has {victim.n_classes}. Give the `label` by name."
-            )
+        if judge.n_classes != victim.n_classes:
+            _check_other_judge(indices, victim, judge)
+        elif judge.classes is not None and victim.classes is not None:
+            for index in indices:
+                if not _same_class(mine := victim.classes[index], its := judge.classes[index]):
+                    raise SpecError(
+                        f"The index {index} is another class for the judge {judge.name!r}: {its!r}, not {mine!r}. Give "
+                        "the `label` by name."
+                    )
+
+
+def _check_other_judge(indices: Sequence[int], victim: Classes, judge: Classes) -> None:
+    sizes = f"it has {judge.n_classes} classes, {victim.name!r} has {victim.n_classes}."
+    if judge.classes is None:
+        raise SpecError(
+            f"The judge {judge.name!r} needs class names of its own: {sizes} Upload it again with its names."
+        )
+    if indices:
+        raise SpecError(
+            f"The index {indices[0]} is another class for the judge {judge.name!r}: {sizes} Give the `label` by name."
+        )
 
 
 def check_top_k(top_k: int, n_others: int) -> None:
@@ -108,8 +124,8 @@ def check_same_classes(classifiers: Sequence[Classes]) -> None:
 
 
 def _same_class(one: str, other: str) -> bool:
-    """Whether one name has all words of the other, as "tench" and "tench, Tinca tinca"."""
-    words, others = (set(re.findall(r"\w+", name.casefold())) for name in (one, other))
+    """Whether one name has all words of the other, as "tree_frog" and "tree frog, tree-frog"."""
+    words, others = (set(re.findall(r"[^\W_]+", name.casefold())) for name in (one, other))
     return words <= others or others <= words
 
 

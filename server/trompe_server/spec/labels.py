@@ -48,7 +48,8 @@ def resolve_label(label: str | SupportsIndex, classes: Sequence[str] | None, n_c
         )
     wanted = label.strip().casefold()
     whole = [index for index, name in enumerate(classes) if name.casefold() == wanted]
-    fits = whole or [index for index, name in enumerate(classes) if wanted in _synonyms(name)]
+    exact = [index for index in whole if classes[index] == label]
+    fits = exact or whole or [index for index, name in enumerate(classes) if wanted in _synonyms(name)]
     if len(fits) != 1:
         raise _unclear(label, fits, classes, classifier)
     return fits[0]

@@ -155,8 +155,9 @@ def stocked(api: Api, template: Path) -> Api:
 
 
 def _inspect(path: str) -> dict[str, object]:
-    kinds = {b"W": {"white_box": True, "n_classes": 3}, b"B": {"white_box": False, "n_classes": 3}}
+    """A white box, a black box or one with a class for the background, by the first byte."""
+    kinds = {b"W": (True, 3), b"B": (False, 3), b"G": (False, 4)}
     found = kinds.get(Path(path).read_bytes()[:1])
     if found is None:
         raise ClassifierError("The classifier is broken.")
-    return found | {"image_size": [224, 224]}
+    return {"white_box": found[0], "n_classes": found[1], "image_size": [224, 224]}

@@ -72,11 +72,18 @@ REFUSED: list[tuple[dict[str, Any], int, str]] = [
     ({"ensemble": ["member"]}, 422, "class 1 is 'vase' for one and 'toilet tissue"),
     ({"ensemble": ["judge"]}, 422, "not by `ensemble`"),
     ({"label": "1", "judges": ["tiny"]}, 422, "is another class for the judge 'tiny'"),
+    (
+        {"label": "1", "judges": ["member"]},
+        422,
+        "another class for the judge 'member': 'toilet tissue, toilet paper', not",
+    ),
+    ({"label": "vase", "judges": ["shifted"]}, 422, "'shifted' needs class names of its own: it has 4 classes"),
 ]
 
 
 def test_a_job_that_names_what_is_not_there_is_refused_at_once(stocked: Api) -> None:
-    stocked.upload_classifier(b"B", "judge.onnx")
+    for data, file in ((b"B", "judge.onnx"), (b"G", "shifted.onnx")):
+        stocked.upload_classifier(data, file)
     stocked.upload_classifier(b"W2", "member.pt2", classes=json.dumps([CLASSES[0], *CLASSES[:0:-1]]))
     stocked.post("/v1/backgrounds", files={"file": ("beach.gif", GIF)})
     for spec, status, words in REFUSED:

@@ -64,5 +64,6 @@ def test_members_of_other_classes_are_refused(order: int) -> None:
 def test_longer_and_shorter_names_of_the_same_classes_agree() -> None:
     short = fake_classifier(n_classes=2, classes=("tench", "crane bird"))
     assert len(as_ensemble([short, fake_classifier(n_classes=2, classes=("tench, Tinca tinca", "crane"))])) == 2
+    assert len(as_ensemble([short, fake_classifier(n_classes=2, classes=("tench", "crane_bird"))])) == 2
     with pytest.raises(ClassifierError, match="class 1 is 'crane bird' for one and 'heron' for the other"):
         as_ensemble([short, fake_classifier(n_classes=2, classes=("tench", "heron"))])
