@@ -64,7 +64,7 @@ def check_contract(network: nn.Module, sample: Float[Tensor, "2 3 H W"], file: s
         difference = (network(sample[1:].repeat(2, 1, 1, 1)) - logits[1]).abs().max()
     if difference > SAME * logits.abs().max():
         raise broken(file, "its logits of an image depend on chance or on its batch: call eval() on the network first")
-    protocol.refuse_probabilities(logits.detach().cpu().numpy(), file)
+    protocol.refuse_probabilities(logits.detach().cpu().float().numpy(), file)
     gradient = torch.autograd.grad(logits.max(), images, allow_unused=True)[0] if logits.requires_grad else None
     if gradient is None or not gradient.any():
         raise broken(file, "its output has no gradient in the image")

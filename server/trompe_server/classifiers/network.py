@@ -34,7 +34,7 @@ class NetworkClassifier:
         self.network.requires_grad_(False)
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
-        """Logits of sRGB images in [0, 1] of size ``image_size``, differentiable in the images and on their device.
+        """Float32 logits of sRGB images in [0, 1] of size ``image_size``, differentiable in them and on their device.
 
         A graphics card plans a network anew for each number of images, which takes longer than 40 of them: fewer are
         filled up.
@@ -43,7 +43,7 @@ class NetworkClassifier:
         if given.is_cuda and 0 < len(given) < AT_ONCE:
             given = torch.cat([given, given.new_zeros(AT_ONCE - len(given), *given.shape[1:])])
         logits: Tensor = self.network(given)[: len(images)]
-        return logits.to(images.device)
+        return logits.to(images.device, torch.float32)
 
     @torch.no_grad()
     def scores(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:

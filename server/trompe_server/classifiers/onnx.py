@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from trompe_server.classifiers.contract import SAME, sample_images
 from trompe_server.classifiers.protocol import (
     BATCH,
     Images,
@@ -27,7 +28,7 @@ _WEIGHTS_APART: Final = re.compile("external data|GetFileLength", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class OnnxClassifier:
-    """An onnxruntime session; ``fixed_batch``: the batch size of its graph, if fixed."""
+    """An onnxruntime session; ``fixed_batch``: its only batch size, if it has one."""
 
     name: str
     session: Any
@@ -55,9 +56,9 @@ def load_onnx(path: Path, device: str = "cpu") -> OnnxClassifier:
     """
     session = _session(path, device)
     fixed_batch, size = _input(session, path.name)
-    noise = np.random.default_rng(0).random((1, 3, *size), np.float32)
+    images = sample_images(size).numpy()
     try:
-        logits = _run(session, noise, fixed_batch)
+        logits = _run(session, images[1:], fixed_batch)
     except Exception as error:
         raise broken(path.name, f"it does not run on one image ({str(error)[:300]})") from error
     if logits.ndim != 2 or logits.dtype != np.float32 or len(logits) != 1:
@@ -65,6 +66,8 @@ def load_onnx(path: Path, device: str = "cpu") -> OnnxClassifier:
     if not np.isfinite(logits).all():
         raise broken(path.name, "its output is not finite")
     refuse_probabilities(logits, path.name)
+    if fixed_batch is None and not _takes_batches(session, images):
+        fixed_batch = 1
     return OnnxClassifier(path.stem, session, size, logits.shape[1], fixed_batch)
 
 
@@ -86,6 +89,7 @@ def _session(path: Path, device: str) -> Any:
     providers = _providers(device)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
+    options.log_severity_level = 4  # errors are raised, too
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=providers)
@@ -112,6 +116,19 @@ def _input(session: Any, file: str) -> tuple[int | None, tuple[int, int]]:
             file, f"its input {shape} has no height and width: fix them with onnxruntime.tools.make_dynamic_shape_fixed"
         )
     return batch if isinstance(batch, int) else None, (height, width)
+
+
+def _takes_batches(session: Any, images: Logits) -> bool:
+    """Whether images get the same logits together as alone.
+
+    Not from a graph with a reshape for one image, nor if 8-bit activations are scaled by the range of the batch.
+    """
+    alone = np.concatenate([_run(session, image[None], None) for image in images])
+    try:
+        together = _run(session, images, None)
+    except Exception:  # of onnxruntime, which has no common class of errors
+        return False
+    return together.shape == alone.shape and bool(np.abs(together - alone).max() <= SAME * np.abs(alone).max())
 
 
 def _run(session: Any, images: Logits, fixed_batch: int | None) -> Logits:

@@ -107,7 +107,7 @@ def classifier_file(reference: str) -> Path:
     if reference.startswith(LOOKED_UP):
         zoo, model = _zoo(reference)
         return zoo.weights(model)
-    return Path(reference) if reference.endswith(tuple(LOADERS)) else torchvision_weights(reference)
+    return Path(reference) if reference.lower().endswith(tuple(LOADERS)) else torchvision_weights(reference)
 
 
 def _zoo(reference: str) -> tuple[_Zoo, str]:
@@ -125,11 +125,11 @@ def _by_name(reference: str, name: str | None, classes: Sequence[str] | None, de
 
 
 def _from_file(path: Path, name: str | None, classes: Sequence[str] | None, device: str) -> Classifier:
-    if path.suffix not in LOADERS:
+    if path.suffix.lower() not in LOADERS:
         raise ClassifierError(f"{str(path)!r} is not a supported classifier; give {KNOWN}.")
     if not path.is_file():
         raise ClassifierError(f"There is no classifier file {str(path)!r}; check the path, or give 'tiny'.")
-    loaded = LOADERS[path.suffix](path, device)
+    loaded = LOADERS[path.suffix.lower()](path, device)
     names = check_classes(classes, loaded.n_classes, path.name)
     return replace(loaded, name=name or path.stem, classes=names)
 

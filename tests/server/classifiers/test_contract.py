@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -110,13 +111,15 @@ def write_onnx(
     kind: int = TensorProto.FLOAT,
     n_classes: int = 7,
     last: str = "Identity",
+    inner: int = -1,
 ) -> Path:
-    """A network: mean over the image, then a linear layer."""
+    """A network: mean over the image, then a linear layer. ``inner``: the batch inside its graph, -1 for any."""
     weight = np.random.default_rng(0).normal(size=(3, n_classes)).astype(np.float32)
     nodes = [
         helper.make_node("Cast", ["image"], ["x"], to=TensorProto.FLOAT),
         helper.make_node("GlobalAveragePool", ["x"], ["pooled"]),
-        helper.make_node("Flatten", ["pooled"], ["flat"]),
+        helper.make_node("Constant", [], ["flattened"], value_ints=[inner, 3]),
+        helper.make_node("Reshape", ["pooled", "flattened"], ["flat"]),
         helper.make_node("MatMul", ["flat", "weight"], ["raw"]),
         helper.make_node(last, ["raw"], ["logits"]),
     ]
@@ -146,7 +149,7 @@ def white_box(path: Path | str) -> NetworkClassifier:
     scope="module",
     params=[
         *("fake", "pt2", "tiny", "resized", "score based"),
-        *("onnx", "onnx with a batch of 1", "onnx with a batch of 4"),
+        *("onnx", "onnx with a batch of 1", "onnx with a batch of 4", "onnx of one image inside"),
     ],
 )
 def classifier(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Classifier:
@@ -160,8 +163,13 @@ def classifier(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPath
         return load_classifier("tiny")
     if request.param == "pt2":
         return load_classifier(request.getfixturevalue("pt2"))
-    batches: dict[str, int | str] = {"onnx": "n", "onnx with a batch of 1": 1, "onnx with a batch of 4": 4}
-    return load_classifier(write_onnx(tmp_path_factory.mktemp("onnx") / "net.onnx", batch=batches[request.param]))
+    options: dict[str, dict[str, Any]] = {
+        "onnx": {},
+        "onnx with a batch of 1": {"batch": 1},
+        "onnx with a batch of 4": {"batch": 4},
+        "onnx of one image inside": {"inner": 1},
+    }
+    return load_classifier(write_onnx(tmp_path_factory.mktemp("onnx") / "net.onnx", **options[request.param]))
 
 
 def test_every_classifier_gives_float32_logits_for_any_number_of_images(classifier: Classifier) -> None:
@@ -243,13 +251,14 @@ def test_white_boxes_agree_with_their_own_predictions_and_train_nothing(pt2: Pat
         assert not any(parameter.requires_grad for parameter in classifier.network.parameters())
 
 
-def test_an_exported_network_is_read_with_its_size_classes_and_name(pt2: Path) -> None:
+def test_an_exported_network_is_read_with_its_size_classes_and_name(pt2: Path, tmp_path: Path) -> None:
     classifier = load_classifier(pt2, classes=list("abcdefg"))
     assert (classifier.image_size, classifier.n_classes, classifier.name) == (SIZE, 7, "net")
     assert classifier.classes == tuple("abcdefg")
     assert load_classifier(pt2, name="mine").name == "mine"
     tiny = load_classifier("tiny", name="mine", classes=list("abcdefgh"))
     assert (tiny.name, tiny.classes) == ("mine", tuple("abcdefgh"))
+    assert load_classifier(shutil.copy(pt2, tmp_path / "NET.PT2")).n_classes == 7
 
 
 def test_the_number_of_class_names_must_be_that_of_the_logits(pt2: Path, tmp_path: Path) -> None:
@@ -264,6 +273,15 @@ def test_an_exported_network_is_the_network_it_was(pt2: Path) -> None:
     torch.testing.assert_close(classifier.logits(images), source(images))
     gradients = [torch.autograd.grad(f(images).square().sum(), images)[0] for f in (classifier.logits, source)]
     torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64], ids=str)
+def test_logits_of_any_precision_become_float32(dtype: torch.dtype, tmp_path: Path) -> None:
+    network = white_box(export(Around(lambda net, x: net(x).to(dtype)), tmp_path / "net.pt2"))
+    images = noise(2)
+    logits = network.logits(fit_images(images, SIZE))
+    assert (logits.dtype, network.predict(images).dtype) == (torch.float32, np.float32)
+    torch.testing.assert_close(logits, trained(Net())(fit_images(images, SIZE)), atol=0.01, rtol=0.01)
 
 
 def logits_and_gradients(path: str | Path, device: str, count: int) -> list[torch.Tensor]:
@@ -375,6 +393,9 @@ def test_logits_without_a_gradient_are_the_same(function: Callable[[Any, Tensor]
             Around(lambda net, x: net(x).argmax(1)), {}, "its output for two images is torch.int64", id="class index"
         ),
         pytest.param(Around(lambda net, x: net(x).softmax(1)), {}, "ends in a softmax", id="probabilities"),
+        pytest.param(
+            Around(lambda net, x: net(x).softmax(1).bfloat16()), {}, "ends in a softmax", id="in half precision"
+        ),
         pytest.param(Around(lambda net, x: net(x) / 0), {}, "not finite", id="not finite"),
         pytest.param(Around(lambda net, x: (5 * net(x)).round()), {}, "no gradient in the image", id="rounded"),
         pytest.param(Around(lambda net, x: net(x).detach()), {}, "no gradient in the image", id="detached"),
