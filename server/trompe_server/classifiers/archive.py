@@ -20,6 +20,7 @@ import io
 import json
 import pickle
 import re
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -50,14 +51,18 @@ SIZE: Final = re.compile(
 TREE: Final = re.compile(r'builtins\.(tuple|list|dict)|null|\[("\w+"(, "\w+")*)?\]', re.ASCII)
 PLAIN: Final[Mapping[str, re.Pattern[str]]] = {"tree": TREE, "expr_str": SIZE, "target": TARGET}
 """What strings of a kind may be; all others are names."""
+DEVICE: Final = re.compile(rb'"type": "(?!cpu")\w+", "index": (\d+|null)')
+"""A device other than the CPU, in an archive's JSON."""
 PROSE: Final = frozenset({"metadata", "torch_version"})
 """Keys with text for people; torch never evaluates it."""
 
 
 def read_program(path: Path) -> ExportedProgram:
-    """Check and read the program in a ``.pt2`` file. Raises ``ClassifierError``."""
+    """Check and read the program in a ``.pt2`` file, onto the CPU. Raises ``ClassifierError``."""
     try:
         data = path.read_bytes()
+        if DEVICE.search(PT2ArchiveReader(io.BytesIO(data)).read_bytes("models/model.json")):
+            data = _on_cpu(data)
         _check(PT2ArchiveReader(io.BytesIO(data)), path.name)
         return load_pt2(io.BytesIO(data)).exported_programs["model"]
     except ClassifierError:
@@ -67,6 +72,18 @@ def read_program(path: Path) -> ExportedProgram:
             f"{path.name!r} cannot be read as an exported program ({type(error).__name__}: {str(error)[:300]}); "
             f"expected a file of torch.export.save from a version close to {torch.__version__}."
         ) from error
+
+
+def _on_cpu(data: bytes) -> bytes:
+    """The archive of a program exported on another device, which torch may not have here, without its sample inputs."""
+    moved = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(moved, "w") as new:
+        for name in old.namelist():
+            content = b"" if name.endswith("sample_inputs/model.pt") else old.read(name)
+            new.writestr(
+                name, DEVICE.sub(b'"type": "cpu", "index": null', content) if name.endswith(".json") else content
+            )
+    return moved.getvalue()
 
 
 def _check(archive: Any, file: str) -> None:

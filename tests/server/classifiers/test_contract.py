@@ -275,6 +275,15 @@ def test_an_exported_network_is_the_network_it_was(pt2: Path) -> None:
     torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
 
 
+def test_a_network_exported_on_a_graphics_card_is_read_without_one(pt2: Path, tmp_path: Path) -> None:
+    cpu, card = b'"type": "cpu", "index": null', b'"type": "cuda", "index": 0'
+    with zipfile.ZipFile(pt2) as old, zipfile.ZipFile(tmp_path / "card.pt2", "w") as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name).replace(cpu, card))
+    assert card in (tmp_path / "card.pt2").read_bytes()
+    np.testing.assert_array_equal(white_box(tmp_path / "card.pt2").predict(noise(2)), white_box(pt2).predict(noise(2)))
+
+
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64], ids=str)
 def test_logits_of_any_precision_become_float32(dtype: torch.dtype, tmp_path: Path) -> None:
     network = white_box(export(Around(lambda net, x: net(x).to(dtype)), tmp_path / "net.pt2"))
