@@ -33,24 +33,36 @@ def load_huggingface(model: str) -> NamedNetwork:
 
     Image size, normalisation and order of channels come from ``preprocessor_config.json``, class names from
     ``config.json``. The network computes in single precision. Raises ``ClassifierError`` if transformers or a file is
-    missing, and for a network that classifies no images.
+    missing, and for a network that classifies no images or has no trained head.
     """
     settings = _settings(model)
     folder = hub_file(model, "config.json", extra="hf").parent
     huggingface_weights(model)
+    network = _trained(folder, model)
+    mean, std = _normalisation(settings, model)
+    whole = Normalised(_Logits(network, bgr=bool(settings.get("do_flip_channel_order"))), mean=mean, std=std)
+    return NamedNetwork(whole, _image_size(settings, model), _class_names(network.config.id2label))
+
+
+def _trained(folder: Path, model: str) -> Any:
+    """The network with all its weights from ``folder``. Raises ``ClassifierError``."""
     transformers = import_extra("transformers", extra="hf")
     try:
-        network = transformers.AutoModelForImageClassification.from_pretrained(
-            folder, use_safetensors=True, trust_remote_code=False, local_files_only=True
-        ).float()
+        network, report = transformers.AutoModelForImageClassification.from_pretrained(
+            folder, use_safetensors=True, trust_remote_code=False, local_files_only=True, output_loading_info=True
+        )
     except Exception as error:  # what a repository contains decides its kind
         raise ClassifierError(
             f"{model!r} cannot be loaded as an image classifier ({type(error).__name__}: {str(error)[:300]}). Give a "
             "repository of transformers' image classifiers with safetensors, or a .pt2 file."
         ) from error
-    mean, std = _normalisation(settings, model)
-    whole = Normalised(_Logits(network, bgr=bool(settings.get("do_flip_channel_order"))), mean=mean, std=std)
-    return NamedNetwork(whole, _image_size(settings, model), _class_names(network.config.id2label))
+    missing = sorted(dict(network.named_parameters()).keys() & report["missing_keys"])
+    if missing:  # transformers draws them at random
+        raise ClassifierError(
+            f"{model!r} is not trained to classify images: its file lacks {', '.join(missing[:3])}. Give a repository "
+            "with a trained classifier, or a .pt2 file."
+        )
+    return network.float()
 
 
 def huggingface_weights(model: str) -> Path:

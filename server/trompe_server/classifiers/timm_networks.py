@@ -35,6 +35,10 @@ def timm_weights(model: str) -> Path:
     config = _timm(model).get_pretrained_cfg(model)
     if config is None or not config.hf_hub_id:
         raise ClassifierError(f"timm has no weights of {model!r} on its hub; give a .pt2 file.")
+    if not config.num_classes:
+        raise ClassifierError(
+            f"timm's weights of {model!r} ({config.tag}) have no classes: they give features. Name others, as NAME.TAG."
+        )
     return hub_file(config.hf_hub_id, WEIGHTS, extra="timm")
 
 

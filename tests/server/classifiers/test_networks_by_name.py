@@ -269,6 +269,8 @@ def test_names_and_weights_that_are_nowhere_are_errors(timm: Any, hub: Callable[
         load_classifier("timm:resnet5")
     with pytest.raises(ClassifierError, match=r"'model.safetensors' of 'timm/resnet18.*' is neither in the cache"):
         load_classifier("timm:resnet18")
+    with pytest.raises(ClassifierError, match=r"'vit_small_patch14_dinov2' \(lvd142m\) have no classes"):
+        load_classifier("timm:vit_small_patch14_dinov2")
     with pytest.raises(ClassifierError, match="expected ORG/MODEL"):
         load_classifier("hf:../secret")
     with pytest.raises(ClassifierError, match=r"'org/a--b' is neither in the cache.*Check the name"):
@@ -386,6 +388,16 @@ def test_a_repository_with_a_pickle_is_refused(hub: Callable[[str], Path]) -> No
         (folder / name).write_text("{}")
     torch.save({}, folder / "pytorch_model.bin")
     with pytest.raises(ClassifierError, match=r"'model.safetensors' of 'org/model'.*only safetensors are read"):
+        load_classifier("hf:org/model")
+
+
+def test_a_repository_without_a_trained_head_is_refused(hub: Callable[[str], Path]) -> None:
+    folder = hub("org/model")
+    vision_transformer(folder).vit.save_pretrained(folder)
+    (folder / "preprocessor_config.json").write_text('{"size": 32, "do_normalize": false}')
+    with pytest.raises(
+        ClassifierError, match=r"not trained to classify images: its file lacks classifier.bias, classi"
+    ):
         load_classifier("hf:org/model")
 
 
