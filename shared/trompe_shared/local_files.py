@@ -61,9 +61,12 @@ def classes_beside(path: Path) -> list[str] | None:
     if file is None:
         return None
     try:
-        names = json.loads(file.read_text("utf-8"))
+        names = json.loads(file.read_text("utf-8-sig"))
     except ValueError as error:
-        raise ClassifierError(f"The class names in {str(file)!r} are not JSON ({error}).") from error
+        raise ClassifierError(
+            f"The class names in {str(file)!r} are not JSON ({error}); expected a list of strings, in the order of the "
+            "logits."
+        ) from error
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ClassifierError(
             f"The class names in {str(file)!r} must be a JSON list of strings, in the order of the logits."

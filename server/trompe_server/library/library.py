@@ -175,7 +175,8 @@ class Library:
             elif len(classes) != found["n_classes"]:
                 raise ClassifierError(
                     f"{len(classes)} class names for a classifier of {found['n_classes']} classes: send one name per "
-                    "logit, in order."
+                    f"logit, in order. Clients read them from {Path(filename).stem}.classes.json, else "
+                    "imagenet_classes.json or classes.json, beside the file."
                 )
             info = ClassifierInfo.model_validate(
                 found | {"id": identity, "name": _named(name, filename), "classes": classes}
