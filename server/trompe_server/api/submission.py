@@ -6,7 +6,7 @@ from trompe_server.judgement.suites import suite_of
 from trompe_server.library import Library
 from trompe_server.spec.checks import (
     check_gradients,
-    check_judges,
+    check_indices,
     check_keep,
     check_mask_size,
     check_members,
@@ -44,7 +44,7 @@ def checked_spec(spec: JobRequest, library: Library) -> tuple[JobRequest, dict[s
     check_members([(member.name, member.white_box) for member in members])
     check_same_classes([classifier, *members])
     judges = [library.classifier(judge) for judge in spec.judges.networks]
-    check_judges(spec.goal.label, classifier, judges)
+    check_indices(spec.goal.label, classifier, judges)
     for other in (*members, *judges):
         resolve_labels(spec.goal.label, other.classes or classifier.classes, other.n_classes, other.name)
     victim = {"classifier": classifier.reference, "ensemble": [member.reference for member in members]}

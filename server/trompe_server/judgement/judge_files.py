@@ -21,6 +21,7 @@ from trompe_server.judgement.suites import Suite, suite_of
 from trompe_server.judgement.work import Kept, Timed, key_of
 from trompe_server.judging.judge import Judge
 from trompe_server.renderers import TargetRenderer
+from trompe_server.spec.checks import check_indices
 from trompe_server.spec.framing import Framing, framing_of
 from trompe_shared.api import JudgedNetwork, JudgementSpec, ViewOptions
 from trompe_shared.engine import EngineInfo
@@ -73,6 +74,7 @@ def _networks(spec: JudgementSpec, suite: Suite, sources: Sources) -> tuple[dict
     for reference in suite.networks:
         try:
             judge, record = sources.network(reference, spec.label)
+            check_indices(spec.label, next(iter(judges.values()), judge).network, [judge.network])
         except (ClassifierError, LabelError, SpecError) as error:
             record = JudgedNetwork(name=reference, reference=reference, missing=str(error))
         else:

@@ -118,7 +118,7 @@ Sources = LocalSources | StoredSources
 
 def network_file(reference: str) -> Path | None:
     """The file that ``reference`` names; ``None`` for a network by name."""
-    is_file = reference.endswith(CLASSIFIER_SUFFIXES) and not reference.startswith(LOOKED_UP)
+    is_file = reference.lower().endswith(CLASSIFIER_SUFFIXES) and not reference.startswith(LOOKED_UP)
     return Path(reference) if is_file else None
 
 

@@ -4,6 +4,7 @@ it opens. No torch.
 
 import re
 from collections.abc import Sequence
+from itertools import product
 from typing import Protocol
 
 from trompe_shared.api import JobSpec
@@ -41,31 +42,21 @@ def check_labels(labels: Sequence[int], n_classes: int, *, given: Sequence[objec
         )
 
 
-def check_judges(label: Sequence[str | int], victim: Classes, judges: Sequence[Classes]) -> None:
-    """Raise ``SpecError`` for a judge with other classes if ``label`` is an index, or the judge has no class names."""
-    indices = [int(each) for each in label if isinstance(each, int) or each.strip().isdecimal()]
-    for judge in judges:
+def check_indices(label: Sequence[str | int], victim: Classes, judges: Sequence[Classes]) -> None:
+    """Raise ``SpecError`` for a class of the victim given by its index that is another class for a judge."""
+    given = [each for each in map(str.strip, map(str, label)) if re.fullmatch(r"\d{1,18}", each)]
+    indices = [int(each) for each in given if int(each) < victim.n_classes]
+    for judge, index in product(judges, indices):
+        other = f"The index {index} is another class for the judge {judge.name!r}:"
         if judge.n_classes != victim.n_classes:
-            _check_other_judge(indices, victim, judge)
-        elif judge.classes is not None and victim.classes is not None:
-            for index in indices:
-                if not _same_class(mine := victim.classes[index], its := judge.classes[index]):
-                    raise SpecError(
-                        f"The index {index} is another class for the judge {judge.name!r}: {its!r}, not {mine!r}. Give "
-                        "the `label` by name."
-                    )
-
-
-def _check_other_judge(indices: Sequence[int], victim: Classes, judge: Classes) -> None:
-    sizes = f"it has {judge.n_classes} classes, {victim.name!r} has {victim.n_classes}."
-    if judge.classes is None:
-        raise SpecError(
-            f"The judge {judge.name!r} needs class names of its own: {sizes} Upload it again with its names."
-        )
-    if indices:
-        raise SpecError(
-            f"The index {indices[0]} is another class for the judge {judge.name!r}: {sizes} Give the `label` by name."
-        )
+            raise SpecError(
+                f"{other} it has {judge.n_classes} classes, {victim.name!r} has {victim.n_classes}. Give the `label` "
+                "by name, and class names with both."
+            )
+        if victim.classes is not None and judge.classes is not None:
+            mine, its = victim.classes[index], judge.classes[index]
+            if not _same_class(mine, its):
+                raise SpecError(f"{other} {its!r}, not {mine!r}. Give the `label` by name.")
 
 
 def check_top_k(top_k: int, n_others: int) -> None:

@@ -42,9 +42,10 @@ def resolve_label(label: str | SupportsIndex, classes: Sequence[str] | None, n_c
                 f"{digits[:MOST_DIGITS]} is not a class of {classifier!r}; its indices are 0..{n_classes - 1}."
             )
         return int(digits)
-    if classes is None:
+    if classes is None or len(classes) != n_classes:  # names that it borrows are those of another network
         raise LabelError(
-            f"{classifier!r} has no class names to find {label!r} in; give an index in 0..{n_classes - 1}."
+            f"{classifier!r} has no class names to find {label!r} in; give an index in 0..{n_classes - 1}, or "
+            "class names with it."
         )
     wanted = label.strip().casefold()
     whole = [index for index, name in enumerate(classes) if name.casefold() == wanted]

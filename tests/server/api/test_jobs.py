@@ -77,7 +77,7 @@ REFUSED: list[tuple[dict[str, Any], int, str]] = [
         422,
         "another class for the judge 'member': 'toilet tissue, toilet paper', not",
     ),
-    ({"label": "vase", "judges": ["shifted"]}, 422, "'shifted' needs class names of its own: it has 4 classes"),
+    ({"label": "vase", "judges": ["shifted"]}, 422, "'shifted' has no class names to find 'vase' in; give"),
 ]
 
 

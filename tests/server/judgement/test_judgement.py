@@ -1,6 +1,7 @@
 """Judgements of the mug over a fake renderer: figures, findings, page, and how one goes on where it stopped."""
 
 import io
+import json
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.job_runs import Recorder
+from tests.server.classifiers.test_contract import write_onnx
 from trompe_server.image_pipelines import SUITE
 from trompe_server.job.protocol import OnProgress
 from trompe_server.judgement.judge_files import judge_files
@@ -151,6 +153,18 @@ def test_a_label_counts_for_the_networks_that_know_it(judge: Judge, dark: Path) 
     (found,) = unknown.findings
     assert re.match("No figures of 'tiny': 'tiny' has no class 'coffee mug'; an example of a class", found.text)
     assert unknown.textures
+
+
+def test_an_index_counts_only_for_networks_with_the_first_ones_class_there(
+    judge: Judge, dark: Path, tmp_path: Path
+) -> None:
+    other = write_onnx(tmp_path / "other.onnx", n_classes=8)
+    (tmp_path / "classes.json").write_text(json.dumps([*"abcdefgh"]))
+    manifest = manifest_of(judge(dark, label=("5",), networks=["tiny", str(other)]), seconds=1.0)
+    assert manifest.networks[0].label_names == ["mug"]
+    assert (manifest.networks[1].missing or "").startswith(
+        "The index 5 is another class for the judge 'other': 'f', not 'mug'"
+    )
 
 
 def test_another_object_is_judged_by_itself_and_has_no_drop(judge: Judge, tmp_path: Path) -> None:
