@@ -3,6 +3,7 @@
 from trompe_server.pictures.contact_sheet import Verdict, representative, views_sheet
 from trompe_server.pictures.difference import difference_strip, texture_sheet
 from trompe_server.pictures.histogram import prediction_histogram
+from trompe_server.pictures.layout import printable
 from trompe_server.pictures.saliency import (
     heat_colours,
     heat_textures,
@@ -17,6 +18,7 @@ __all__ = [
     "heat_colours",
     "heat_textures",
     "prediction_histogram",
+    "printable",
     "representative",
     "saliency_object_sheet",
     "saliency_sheet",

@@ -22,6 +22,7 @@ from trompe_server.job import texture_attack
 from trompe_server.job.files import Spent
 from trompe_server.job.report import ReportData
 from trompe_server.job.report.models import model_files
+from trompe_server.job.report.pictures import short_names
 from trompe_server.job.report.warnings import _stronger, _wider
 from trompe_server.library import Library
 from trompe_server.pictures import Verdict
@@ -249,6 +250,11 @@ def test_more_views_are_advised_by_options_that_fit_the_job(options: dict[str, A
 )
 def test_a_stronger_attack_is_advised_by_the_options_that_limited_it(options: dict[str, Any], advice: str) -> None:
     assert _stronger(data_of(**options)) == advice
+
+
+def test_pictures_tell_classes_apart() -> None:
+    classes = ("crane, bird", "crane", "t\u00e9apot", "\u676f\u5b50", "\u6905\u5b50")
+    assert short_names(classes) == ["crane (0)", "crane (1)", "teapot", "?? (3)", "?? (4)"]
 
 
 @pytest.mark.usefixtures("pictures")

@@ -1,6 +1,7 @@
 """Pictures of the report."""
 
 from collections import Counter
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -13,6 +14,7 @@ from trompe_server.job.setup import JobSetup
 from trompe_server.pictures import (
     difference_strip,
     prediction_histogram,
+    printable,
     representative,
     saliency_object_sheet,
     saliency_sheet,
@@ -104,5 +106,14 @@ def _counts(logits: NDArray[np.float32], setup: JobSetup) -> Counter[str]:
 
 
 def _short_name(setup: JobSetup, index: int) -> str:
-    """The first of a class's names."""
-    return setup.judge.class_name(index).split(",")[0]
+    """The first of a class's names, with its number if a picture shows another class alike."""
+    classes = setup.classifier.classes
+    return setup.judge.class_name(index) if classes is None else short_names(tuple(classes))[index]
+
+
+@lru_cache(maxsize=1)
+def short_names(classes: tuple[str, ...]) -> list[str]:
+    """What pictures call ``classes``."""
+    first = [printable(name.split(",")[0]) for name in classes]
+    times = Counter(first)
+    return [f"{name} ({k})" if times[name] > 1 or "?" in name else name for k, name in enumerate(first)]
