@@ -65,6 +65,8 @@ def load_onnx(path: Path, device: str = "cpu") -> OnnxClassifier:
         raise broken(path.name, f"its output for one image is {logits.dtype} {logits.shape}")
     if not np.isfinite(logits).all():
         raise broken(path.name, "its output is not finite")
+    if not _alike(_run(session, images[1:], fixed_batch), logits):
+        raise broken(path.name, "its logits of an image depend on chance")
     refuse_probabilities(logits, path.name)
     if fixed_batch is None and not _takes_batches(session, images):
         fixed_batch = 1
@@ -128,7 +130,11 @@ def _takes_batches(session: Any, images: Logits) -> bool:
         together = _run(session, images, None)
     except Exception:  # of onnxruntime, which has no common class of errors
         return False
-    return together.shape == alone.shape and bool(np.abs(together - alone).max() <= SAME * np.abs(alone).max())
+    return _alike(together, alone)
+
+
+def _alike(some: Logits, others: Logits) -> bool:
+    return some.shape == others.shape and bool(np.abs(some - others).max() <= SAME * np.abs(others).max())
 
 
 def _run(session: Any, images: Logits, fixed_batch: int | None) -> Logits:
