@@ -46,6 +46,7 @@ def load_huggingface(model: str) -> NamedNetwork:
 
 def _trained(folder: Path, model: str) -> Any:
     """The network with all its weights from ``folder``. Raises ``ClassifierError``."""
+    import_extra("transformers.modeling_utils", extra="hf")  # tells of a torchvision for another torch
     transformers = import_extra("transformers", extra="hf")
     try:
         network, report = transformers.AutoModelForImageClassification.from_pretrained(

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Final
 
 import numpy as np
@@ -211,14 +212,25 @@ def test_without_torchvision_a_name_says_what_to_install(monkeypatch: pytest.Mon
         load_classifier("mobilenet_v2")
 
 
-def test_a_torchvision_for_another_torch_is_told_from_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_torchvision_for_another_torch_is_told_from_none(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, hub: Callable[[str], Path]
+) -> None:
     (tmp_path / "torchvision").mkdir()
     (tmp_path / "torchvision" / "__init__.py").write_text("raise RuntimeError('operator torchvision::nms is missing')")
     for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ClassifierError, match=r"another build of torch than .*torchvision::nms is missing"):
-        load_classifier("mobilenet_v2")
+    transformers = ModuleType("transformers")
+    transformers.__path__ = [str(tmp_path)]
+    monkeypatch.setitem(sys.modules, "transformers", transformers)
+    monkeypatch.delitem(sys.modules, "transformers.modeling_utils", raising=False)
+    (tmp_path / "modeling_utils.py").write_text("import torchvision")
+    folder = hub("org/model")
+    for name in ("preprocessor_config.json", "config.json", "model.safetensors"):
+        (folder / name).write_text("{}")
+    for reference in ("mobilenet_v2", "hf:org/model"):
+        with pytest.raises(ClassifierError, match=r"another build of torch than .*torchvision::nms is missing"):
+            load_classifier(reference)
 
 
 # Libraries with a prefix
