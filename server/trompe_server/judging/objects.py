@@ -42,7 +42,10 @@ Textures = Mapping[str, Texture]
 
 @dataclass(frozen=True)
 class _Triangles:
-    """Triangles of all parts: corners in radii of the object, coordinates, normals; name of material of each."""
+    """Triangles of all parts: corners in radii of the object, coordinates, normals; name of material of each.
+
+    Without those with two corners in one place: they show nothing, and programs drop them.
+    """
 
     corners: Float[np.ndarray, "F 3 3"]
     uvs: Float[np.ndarray, "F 3 2"]
@@ -55,7 +58,9 @@ class _Triangles:
             return np.concatenate([getattr(part, name)[part.faces] for part in obj.parts]).astype(np.float64)
 
         names = np.repeat([part.material for part in obj.parts], [len(part.faces) for part in obj.parts])
-        return cls(gathered("vertices") / radius, gathered("uvs"), gathered("normals"), names)
+        corners = gathered("vertices")
+        shown = (corners != np.roll(corners, 1, axis=1)).any(axis=2).all(axis=1)
+        return cls(corners[shown] / radius, gathered("uvs")[shown], gathered("normals")[shown], names[shown])
 
     def __len__(self) -> int:
         return len(self.corners)

@@ -129,6 +129,13 @@ def test_each_two_textures_of_the_same_triangles_are_compared() -> None:
         assert [(each.texture, each.texels_altered > 0.9) for each in changes] == [(names[0], False), (names[1], True)]
 
 
+def test_triangles_that_show_nothing_may_come_and_go() -> None:
+    collapsed = with_parts(MUG, lambda part: replace(part, faces=np.vstack([part.faces, part.faces[:9, [0, 0, 1]]])))
+    for pair in (ObjectPair(MUG, collapsed), ObjectPair(collapsed, MUG)):
+        assert pair.is_one
+        assert pair.findings() == []
+
+
 def test_triangles_in_one_place_are_told_apart_by_their_materials() -> None:
     (part,), (material,) = MUG.parts, MUG.materials.values()
     decal = encode_png(255 - MUG.textures[material.albedo])
