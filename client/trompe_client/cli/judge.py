@@ -1,7 +1,7 @@
 """``trompe judge``: on this machine, or on a server."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -61,9 +61,9 @@ def judge(
     """
     given = {name: value for name, value in options.items() if value not in (None, ())}
     if verify is not None:
-        if before is not None or out is not None or given:
-            raise click.UsageError("--verify takes a manifest alone.")
-        sys.exit(_verify(verify))
+        if before is not None or out is not None or given.keys() - {"renderers"}:
+            raise click.UsageError("--verify takes a manifest alone, and --renderer for one that you trust.")
+        sys.exit(_verify(verify, given.get("renderers", ())))
     if before is None or after is None or out is None or "label" not in given:
         raise click.UsageError("Give two files, --label and --out: trompe judge BEFORE AFTER --label mug --out DIR")
     spec = JudgementSpec.of(before, after, **given)
@@ -99,14 +99,14 @@ def _here(name: str) -> Callable[..., Any]:
     return function
 
 
-def _verify(file: Path) -> int:
-    """Print the faults of a manifest; the exit code."""
+def _verify(file: Path, trusted: Collection[str]) -> int:
+    """Print the faults of a manifest; the exit code. trusted: renderers of it that may run."""
     try:
         manifest = Manifest.model_validate_json(file.read_bytes())
     except ValidationError as error:
         raise SpecError(f"{file} is not a manifest of trompe judge ({error.error_count()} faults).") from error
     faults = []
-    for fault in _here("verify")(manifest, file.parent):
+    for fault in _here("verify")(manifest, file.parent, trusted):
         faults.append(fault)
         if not as_json():
             click.echo(fault)

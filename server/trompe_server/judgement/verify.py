@@ -11,7 +11,7 @@ Not checked: margins; of image pipelines the intervals of ``a_drop`` and the fig
 the averages over views; seconds and versions.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
@@ -58,10 +58,13 @@ TOLERANCE: Final = 0.02
 """By which other hardware may move the largest change of a view."""
 
 
-def verify(manifest: Manifest, folder: Path, *, generator: np.random.Generator) -> Iterator[str]:
+def verify(
+    manifest: Manifest, folder: Path, *, trusted: Collection[str] = (), generator: np.random.Generator
+) -> Iterator[str]:
     """The faults of a manifest that lies in ``folder``, each in a sentence; of a malformed one those of its form alone.
 
-    generator: draws the views that are rendered again, at most ``VIEWS_AGAIN``.
+    trusted: renderers ``module:Class`` or HOST:PORT that may be asked; a manifest of others could name code of theirs,
+    or a host that gets the files. generator: draws the views that are rendered again, at most ``VIEWS_AGAIN``.
     """
     if malformed := list(_form(manifest)):
         yield from malformed
@@ -85,7 +88,14 @@ def verify(manifest: Manifest, folder: Path, *, generator: np.random.Generator) 
         yield from _figures(manifest, pair, judges)
         index = np.sort(generator.permutation(len(manifest.views))[:VIEWS_AGAIN]).tolist()
         for renderer in manifest.renderers:
-            if renderer.engine is not None:
+            if renderer.engine is None:
+                continue
+            if ":" in renderer.name and renderer.name not in trusted:
+                yield (
+                    f"The renderer {renderer.name!r} was not asked again: it is code or a host that the manifest names. "
+                    "If you trust it, name it by --renderer."
+                )
+            else:
                 yield from _again(manifest, renderer, sources, pair, judges, index)
 
 
@@ -197,9 +207,13 @@ def _textures_and_findings(manifest: Manifest, pair: ObjectPair) -> Iterator[str
         if each.texture in changes:
             what = f"The texture {each.texture!r}"
             yield from _differences(what, each, changes[each.texture], TextureChange.model_fields)
-    for finding in findings_of(manifest, pair):
+    found = findings_of(manifest, pair)
+    for finding in found:
         if finding not in manifest.findings:
             yield f"The manifest lacks a finding: {finding.text}"
+    for finding in manifest.findings:
+        if finding not in found:
+            yield f"The manifest has a finding that does not hold: {finding.text}"
 
 
 def _figures(manifest: Manifest, pair: ObjectPair, judges: Mapping[str, Judge]) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -28,10 +28,13 @@ def judge_here(spec: JudgementSpec, out: Path, on_progress: Callable[[Progress],
     return manifest
 
 
-def verify_here(manifest: Manifest, folder: Path) -> Iterator[str]:
-    """The faults of a manifest that lies in ``folder``, each in a sentence; random views are rendered again."""
+def verify_here(manifest: Manifest, folder: Path, trusted: Collection[str]) -> Iterator[str]:
+    """The faults of a manifest that lies in ``folder``, each in a sentence; random views are rendered again.
+
+    trusted: renderers ``module:Class`` or HOST:PORT that may be asked.
+    """
     import numpy as np
 
     from trompe_server.judgement.verify import verify
 
-    return verify(manifest, folder, generator=np.random.default_rng())
+    return verify(manifest, folder, trusted=trusted, generator=np.random.default_rng())

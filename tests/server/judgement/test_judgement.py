@@ -29,7 +29,7 @@ from trompe_server.library import Library
 from trompe_server.pages.judgement import judgement_page
 from trompe_server.renderers import TargetRenderer
 from trompe_server.storage.folders import LocalArtifacts
-from trompe_shared.api import AS_RENDERED, JudgementSpec, Manifest, Progress, Visibility
+from trompe_shared.api import AS_RENDERED, Finding, JudgementSpec, Manifest, Progress, Visibility
 from trompe_shared.errors import RendererError, RendererLostError, SpecError
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
@@ -332,6 +332,11 @@ def easier(manifest: Manifest, _dark: Path) -> Manifest:
     return manifest.model_copy(update={"views": [manifest.views[0], manifest.views[0], *manifest.views[2:]]})
 
 
+def foreign(manifest: Manifest, _dark: Path) -> Manifest:
+    """A renderer whose name would import a module."""
+    return Manifest.model_validate_json(manifest.model_dump_json().replace('"fake"', '"foreign:Engine"'))
+
+
 def labelled(manifest: Manifest, _dark: Path) -> Manifest:
     return manifest.model_copy(update={"suite": "standard-1"})
 
@@ -342,6 +347,13 @@ CHANGES: list[list[tuple[Change, str]]] = [
     [(lied, r"View 2 after, tiny in fake: '\w+' with margin [+-]\d+\.\d\d, the manifest says '\w+'")],
     [(repainted, r"dark\.zip has changed: its sha256 is ")],
     [(gone, "The file after cannot be read again")],
+    [(foreign, "'foreign:Engine' was not asked again: it is code or a host")],
+    [
+        (
+            whole(findings=[Finding(kind="material", text="The maps differ.")]),
+            "has a finding that does not hold: The maps differ",
+        ),
+    ],
     [
         (better(a_after=0.123), r"as rendered: a_after is 0\.\d+, the manifest says 0\.123"),
         (better(a_drop_interval=(0.1, 0.2)), r"a_drop_interval is .*, the manifest says \(0\.1, 0\.2\)"),
