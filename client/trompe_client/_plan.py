@@ -90,7 +90,7 @@ AttackPlan = Plan[JobRequest]
 
 def _job_request(*, object: str, **options: Any) -> JobRequest:
     try:
-        return JobRequest.model_validate({"object": object, **in_parts(options)})
+        return JobRequest.model_validate({"object": object, "goal": {}, **in_parts(options)})
     except ValidationError as error:
         raise SpecError(f"Invalid options: {'; '.join(map(_by_keyword, faults_of(error)))}.") from error
 

@@ -39,6 +39,8 @@ OF_JOBS: Final = dict.fromkeys(
 JUDGED: Final = [name for name in JudgementRequest.model_fields if name not in OF_JOBS]
 FRACTION: Final = re.compile(r"^(\d+(?:\.\d+)?)/(\d+)$")
 
+MOST_SEEDS: Final = 1000
+
 Options = dict[str, Any]
 
 
@@ -110,7 +112,20 @@ def _judgement(options: Options) -> Options:
 
 
 def _seeds(given: Any) -> Any:
-    return list(range(given)) if isinstance(given, int) and not isinstance(given, bool) else given
+    if not isinstance(given, int) or isinstance(given, bool):
+        return given
+    if given > MOST_SEEDS:
+        raise ValueError(f"{given} is the number of seeds, at most {MOST_SEEDS}; for this one seed write [{given}]")
+    return list(range(given))
+
+
+def _objects(given: Any) -> Any:
+    """An object of a table may be without options."""
+    if given != "shipped" and not isinstance(given, Mapping | AssetsFolder):
+        raise ValueError("expected shipped, {assets: FOLDER}, or a table of objects such as {mug: {}, chair: {}}")
+    if not isinstance(given, Mapping) or "assets" in given:
+        return given
+    return {name: {} if options is None else options for name, options in given.items()}
 
 
 class _Schema(BaseModel):
@@ -133,11 +148,12 @@ class Experiment(_Schema):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]{0,62}$")]
     description: str = ""
     base: Annotated[Options, AfterValidator(_base)] = Field(default_factory=dict)
-    objects: (
+    objects: Annotated[
         Literal["shipped"]
         | AssetsFolder
-        | Annotated[dict[str, Annotated[Options, AfterValidator(_object)]], Field(min_length=1)]
-    )
+        | Annotated[dict[str, Annotated[Options, AfterValidator(_object)]], Field(min_length=1)],
+        BeforeValidator(_objects),
+    ]
     grid: Annotated[list[Annotated[Options, AfterValidator(_grid)]], BeforeValidator(_grids), Field(min_length=1)] = (
         Field(default=[{}])
     )
@@ -155,6 +171,17 @@ class Experiment(_Schema):
         return self.artifacts + ([f"*{ADVERSARIAL}.zip"] if self.judgement is not None else [])
 
 
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that is given twice, of which PyYAML takes the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        for number, key in enumerate(keys):
+            if key.value in {each.value for each in keys[:number]}:
+                raise yaml.MarkedYAMLError(problem=f"{key.value!r} is given twice", problem_mark=key.start_mark)
+        return super().construct_mapping(node, deep)
+
+
 def shipped_experiments() -> dict[str, Path]:
     """The shipped files by name."""
     folder = Path(str(resources.files("trompe_experiments"))) / "files"
@@ -170,7 +197,7 @@ def load_experiment(source: str | Path) -> Experiment:
     """Read and check a file, or a shipped one by its name. Raises ``SpecError``."""
     path = experiment_file(source)
     try:
-        read = yaml.safe_load(path.read_text("utf-8"))
+        read = yaml.load(path.read_text("utf-8"), _Loader)
     except FileNotFoundError as error:
         raise SpecError(
             f"No experiment {str(source)!r}. Give a file, or one of {', '.join(shipped_experiments())}."

@@ -279,6 +279,8 @@ def test_what_comes_with_trompe_can_be_planned(name: str, assets: Path) -> None:
         pytest.param({"judgement": {"views": 0}}, "views: .* greater than or equal to 1", id="value of a judgement"),
         pytest.param({"judgement": {"suite": "standard-1"}}, "leave out `suite`", id="suite of a judgement"),
         pytest.param({"judgement": {"renderers": ["three", "cycles"]}}, "one of `renderers`", id="renderers"),
+        pytest.param({"objects": ["mug"]}, "objects: expected shipped, .* a table of objects", id="list of objects"),
+        pytest.param({"seeds": 20261127}, r"number of seeds, at most 1000; .* write \[20261127\]", id="one seed"),
         pytest.param({"grd": {}}, "unknown key 'grd'; keys: name,", id="part"),
         pytest.param({"name": "no spaces"}, "name", id="name"),
     ],
@@ -330,12 +332,17 @@ def test_what_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "bad.yaml").write_text("name: [")
     with pytest.raises(SpecError, match="is not YAML"):
         load_experiment(tmp_path / "bad.yaml")
+    (tmp_path / "twice.yaml").write_text("name: a\nobjects: {mug: {}}\ngrid: {tau: [0.1]}\ngrid: {tau: [0.2]}\n")
+    with pytest.raises(SpecError, match=r"'grid' is given twice\s.*line 4"):
+        load_experiment(tmp_path / "twice.yaml")
     (tmp_path / "list.yaml").write_text("- 1")
     with pytest.raises(SpecError, match="must be a table"):
         load_experiment(tmp_path / "list.yaml")
     with pytest.raises(ClassifierError, match="There is no classifier file"):
         planned(base={"classifier": "nowhere.pt2"})
     monkeypatch.delenv("TROMPE_ASSETS", raising=False)
+    with pytest.raises(SpecError, match="Job stored, base: Invalid options: `label`: Field required"):
+        planned(objects={"stored": None})
     with pytest.raises(SpecError, match="needs the environment variable TROMPE_ASSETS"):
         planned(objects={"assets": "$TROMPE_ASSETS"})
 

@@ -92,8 +92,8 @@ def verify(
                 continue
             if ":" in renderer.name and renderer.name not in trusted:
                 yield (
-                    f"The renderer {renderer.name!r} was not asked again: it is code or a host that the manifest names. "
-                    "If you trust it, name it by --renderer."
+                    f"The renderer {renderer.name!r} was not asked again: it is code or a host that the manifest "
+                    "names. If you trust it, name it by --renderer."
                 )
             else:
                 yield from _again(manifest, renderer, sources, pair, judges, index)
