@@ -96,7 +96,8 @@ def _conclude(rows: Sequence["ResultRow"], folder: Path) -> None:
 @with_client
 def show(client: Client, what: str) -> None:
     """Show the results in a folder, or the jobs of the experiment NAME on a server."""
-    from trompe_experiments.terminal import read_results, results_table
+    from trompe_experiments.table import read_results
+    from trompe_experiments.terminal import results_table
 
     rows = read_results(what) if Path(what).exists() else _on_server(Service(client), what)
     if not rows:

@@ -14,9 +14,8 @@ from trompe_experiments.pareto import Cost, configurations, pareto_markdown, spe
 from trompe_experiments.stability.chart import stability_chart, stability_markdown
 from trompe_experiments.style import Drawing, stamp_of
 from trompe_experiments.surrogates import surrogates_chart, surrogates_markdown, surrogates_of, with_all_surrogates
-from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, read_table
+from trompe_experiments.table import PREDICTIONS, PredictionRow, ResultRow, read_results, read_table
 from trompe_shared.comparison import grouped
-from trompe_shared.errors import SpecError
 
 MOST_PANELS = 12
 
@@ -52,9 +51,7 @@ class Data:
 
 def read_data(folder: Path) -> Data:
     """The tables of a folder; predictions may be missing. Raises ``SpecError``."""
-    rows = read_table(folder / RESULTS, ResultRow)
-    if not rows:
-        raise SpecError(f"{str(folder / RESULTS)!r} has no rows yet; `trompe experiment run` writes them as jobs end.")
+    rows = read_results(folder)
     predictions = read_table(folder / PREDICTIONS, PredictionRow, optional=True)
     judgements = read_table(folder / JUDGEMENTS, JudgedRow, optional=True)
     return Data(folder, tuple(rows), tuple(predictions), tuple(judgements))

@@ -274,7 +274,7 @@ def _cell(value: object) -> object:
 def read_table(path: Path, kind: type[R], *, optional: bool = False) -> list[R]:
     """The rows of a CSV file; none for a missing ``optional`` one. Raises ``SpecError``."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets write a byte order mark
             return [kind.model_validate(_filled(row, kind)) for row in csv.DictReader(file)]
     except FileNotFoundError as error:
         if optional:
@@ -283,6 +283,16 @@ def read_table(path: Path, kind: type[R], *, optional: bool = False) -> list[R]:
     except (ValidationError, csv.Error, UnicodeDecodeError) as error:
         told = " ".join(str(error).splitlines()[:3])
         raise SpecError(f"{str(path)!r} is not a {kind.__name__} table of this version ({told}).") from error
+
+
+def read_results(folder: str | Path) -> list[ResultRow]:
+    """The rows of an experiment's folder, or of a CSV file. Raises ``SpecError``, also if there are none."""
+    path = Path(folder)
+    table = path / RESULTS if path.is_dir() else path
+    rows = read_table(table, ResultRow)
+    if not rows:
+        raise SpecError(f"{str(table)!r} has no rows yet; `trompe experiment run` writes them as jobs end.")
+    return rows
 
 
 def _filled(row: Mapping[str, str], kind: type[_Row]) -> dict[str, str | None]:

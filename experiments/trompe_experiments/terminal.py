@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from trompe_experiments.markdown import figure_words
-from trompe_experiments.table import RESULTS, ResultRow, read_table
+from trompe_experiments.table import ResultRow, read_results
 from trompe_shared.comparison import average, grouped
 from trompe_shared.errors import SpecError
 
@@ -22,12 +22,6 @@ Pair = tuple[list[ResultRow], list[ResultRow]]
 """Rows of one setting in two experiments."""
 
 
-def read_results(folder: str | Path) -> list[ResultRow]:
-    """The rows of an experiment's folder, or of a CSV file. Raises ``SpecError``."""
-    path = Path(folder)
-    return read_table(path / RESULTS if path.is_dir() else path, ResultRow)
-
-
 def results_table(rows: Sequence[ResultRow]) -> RenderableType:
     """A line for each setting (object, classifier, configuration) with means over seeds; then the mean of all rows."""
     table = _table(["seeds", "surrogate", "target", "A_drop", "held-out A_drop", "N%", "s"])
@@ -37,7 +31,9 @@ def results_table(rows: Sequence[ResultRow]) -> RenderableType:
         cells += [_spread(group, "held_out_a_drop"), _mean(group, "texels_altered"), _mean(group, "seconds", ".0f")]
         table.add_row(first.object, first.classifier, first.configuration, str(len(group)), *cells)
     drop, held_out = _mean(rows, "target_a_drop"), _mean(rows, "held_out_a_drop")
-    return Group(table, Text(f"mean of {len(rows)} rows: target A_drop {drop}, held-out A_drop {held_out}"))
+    return Group(
+        table, Text(f"mean of {len(rows)} rows, without n.a.: target A_drop {drop}, held-out A_drop {held_out}")
+    )
 
 
 def failures(rows: Iterable[ResultRow]) -> list[str]:

@@ -500,6 +500,7 @@ def test_the_projects_own_results_are_in_step_with_their_data() -> None:
 
 def test_an_experiment_without_rows_is_told(tmp_path: Path) -> None:
     write_table(tmp_path / RESULTS, [])
-    told = CliRunner().invoke(main, ["experiment", "report", str(tmp_path)])
-    assert told.exit_code == 2
-    assert "has no rows yet" in told.output
+    for command in (["report"], ["show"], ["compare", str(tmp_path)]):
+        told = CliRunner().invoke(main, ["experiment", *command, str(tmp_path)])
+        assert told.exit_code == 2
+        assert "has no rows yet" in told.output

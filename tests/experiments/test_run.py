@@ -30,8 +30,8 @@ from trompe_experiments.plan import Plan, Row, plan_experiment
 from trompe_experiments.progress import Tracked, experiment_display
 from trompe_experiments.run import run_experiment
 from trompe_experiments.service import Service
-from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, RowId, read_table
-from trompe_experiments.terminal import change, compared, differences, failures, read_results
+from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, ResultRow, RowId, read_results, read_table
+from trompe_experiments.terminal import change, compared, differences, failures
 from trompe_server import renderers
 from trompe_server.api.examples import RESULT as EXAMPLE
 from trompe_shared.api import Job, JobRequest, JobSpec, JobState, JudgementSpec, Problem, Progress, Result
@@ -369,7 +369,10 @@ def test_folders_are_shown_and_compared_even_without_the_columns_of_later_versio
     new, old = tmp_path / "new", tmp_path / "old"
     ran(plan_of(), service, new)
     old.mkdir()
-    with (new / RESULTS).open(newline="") as source, (old / RESULTS).open("w", newline="") as copy:
+    with (
+        (new / RESULTS).open(newline="") as source,
+        (old / RESULTS).open("w", newline="", encoding="utf-8-sig") as copy,
+    ):
         rows = csv.DictReader(source)
         columns = [name for name in rows.fieldnames or [] if name not in {"image_pipeline", "target", "views_per_step"}]
         writer = csv.DictWriter(copy, columns, extrasaction="ignore")
@@ -468,7 +471,7 @@ def test_the_jobs_of_an_experiment_are_found_on_a_server(
     judgement = Job(id="j", state=JobState.succeeded, spec=spec, created=datetime.now(UTC), worker=None)
     monkeypatch.setattr(service, "jobs", lambda name: [judgement, *attacks(name)])
     monkeypatch.setattr(cli, "Service", lambda client: service)
-    assert "mean of 4 rows: target A_drop 0.35" in invoked("show", "small")
+    assert "mean of 4 rows, without n.a.: target A_drop 0.35" in invoked("show", "small")
     assert "no job of an experiment 'other'" in invoked("show", "other", status=1)
 
 
