@@ -112,8 +112,7 @@ class AsyncClient(_Connected["AsyncPort"]):
         classifier: str | None = None,
     ) -> AsyncIterator[AsyncJobHandle]:
         """As ``Client.jobs``."""
-        found = JobState(state) if state else None
-        wanted = _core.job_filter(labels, state=found, object=object, classifier=classifier)
+        wanted = _core.job_filter(labels, state=state or None, object=object, classifier=classifier)
         async for job in pages(self.port, wanted):
             yield AsyncJobHandle(self, job)
 
@@ -262,8 +261,7 @@ class Client(_Connected["BlockingPort"]):
 
         A job must have all ``labels``. ``object`` and ``classifier`` are ids, or names of shipped ones.
         """
-        found = JobState(state) if state else None
-        wanted = _core.job_filter(labels, state=found, object=object, classifier=classifier)
+        wanted = _core.job_filter(labels, state=state or None, object=object, classifier=classifier)
         return (JobHandle(self, job) for job in iterate(pages(self.port, wanted)))
 
     objects = blocking(AsyncClient.objects)

@@ -22,11 +22,14 @@ class Connection:
 
     @classmethod
     def find(cls, url: str | None, *, token: str | None, timeout: float, transport: Any) -> "Connection":
-        """Defaults are TROMPE_SERVER and TROMPE_TOKEN. Raises ``SpecError`` for a wrong address."""
+        """Defaults are TROMPE_SERVER and TROMPE_TOKEN. Raises ``SpecError`` for a wrong address or token."""
         address = url or os.environ.get("TROMPE_SERVER") or DEFAULT_SERVER
         if not _is_url(address):
             raise SpecError(f"The server's URL must be http://HOST:PORT or https://HOST, got {address!r}.")
-        return cls(address.rstrip("/"), token or os.environ.get("TROMPE_TOKEN") or None, timeout, transport)
+        secret = (token or os.environ.get("TROMPE_TOKEN") or "").strip()  # a file's last line has an end
+        if not (secret.isascii() and secret.isprintable()):
+            raise SpecError("The access token has characters that no token has; copy it again, or see TROMPE_TOKEN.")
+        return cls(address.rstrip("/"), secret or None, timeout, transport)
 
 
 def _is_url(text: str) -> bool:

@@ -6,6 +6,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.client.conftest import zipped
@@ -139,6 +140,11 @@ def test_a_background_is_a_colour_or_a_picture_file(tmp_path: Path) -> None:
 def test_a_wrong_option_is_named_before_any_server_is_asked(option: dict[str, Any], words: str) -> None:
     with pytest.raises(SpecError, match=words):
         plan_attack("mug", **{"label": 0} | option)
+
+
+def test_a_label_or_several_are_names_or_indices_of_any_library() -> None:
+    for label in (5, np.int64(5), [np.int64(5)], "5"):
+        assert [int(each) for each in plan_attack("mug", label=label).request({}).goal.label] == [5]
 
 
 def test_an_ensemble_and_judges_are_files_or_names_one_or_several(tmp_path: Path) -> None:

@@ -152,7 +152,26 @@ def test_a_problem_document_becomes_a_typed_error(status: int, error: type[APIEr
         answering(status, body) as client,
         pytest.raises(error, match=r"Wrong\. epsilon: too large\. tau: too small\."),
     ):
+        list(client.jobs(state="no state of ours"))
+
+
+def test_a_token_may_end_with_its_line_and_a_wrong_one_is_told_without_being_shown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = list[httpx.Request]()
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        asked.append(request)
+        return httpx.Response(200, content=b"[]")
+
+    monkeypatch.setenv("TROMPE_TOKEN", "trompe_1\n")
+    with Client(transport=httpx.MockTransport(answer)) as client:
         client.objects()
+    assert asked[0].headers["Authorization"] == "Bearer trompe_1"
+    for wrong in ("trömpe", "trompe\n_2"):
+        with pytest.raises(SpecError, match="token has characters") as caught:
+            Client(token=wrong)
+        assert wrong not in str(caught.value)
 
 
 def test_an_answer_of_some_other_server_is_quoted() -> None:

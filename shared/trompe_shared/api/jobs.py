@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from types import NoneType, UnionType
-from typing import Annotated, Any, Final, Literal, Self, Union, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, Self, SupportsIndex, Union, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.fields import FieldInfo
@@ -118,7 +118,7 @@ CONDITIONS: Final[dict[Conditions, ViewRanges]] = {
 
 
 def _as_list(given: Any) -> Any:
-    return [given] if isinstance(given, str | int) else given
+    return [given] if isinstance(given, str | SupportsIndex) else given
 
 
 ClassNames = Annotated[
