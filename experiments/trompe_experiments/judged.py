@@ -54,9 +54,8 @@ class JudgedRow(RowId):
         drops = {pipeline: each.a_drop for pipeline, each in through.items() if each is not None}
         found, seen = through.get(AS_RENDERED), manifest.renderers[0].visibility
         if found is None:
-            raise SpecError(
-                f"{name}, {place.configuration}: {manifest.findings[0].text if manifest.findings else 'no figures'}"
-            )
+            why = [each.text for each in manifest.findings if each.kind in {"network", "renderer"}] or ["no figures"]
+            raise SpecError(f"{name}, {place.configuration}: {why[0]}")
         low, high = found.a_drop_interval or (None, None)
         return cls(
             **place.model_dump(),
@@ -80,8 +79,8 @@ def judge_all(
 ) -> list[JudgedRow]:
     """Judge all painted objects in ``folder``, and write the table. Rows of equal judgements are kept.
 
-    seconds: of each job, by key. show: gets a line before each judgement, and for each painting that is missing.
-    Raises ``ClientError``, and ``SpecError`` for a judgement without figures.
+    seconds: of each job, by key. show: gets a line before each judgement, for each painting that is missing, and for
+    each judgement without figures. Raises ``ClientError``.
     """
     path, options = folder / JUDGEMENTS, json.dumps(plan.experiment.judgement, sort_keys=True)
     known = {row.key: row for row in read_table(path, JudgedRow, optional=True)}
@@ -95,7 +94,11 @@ def judge_all(
                     continue
                 show(f"judging {name}, {place.configuration}")
                 manifest = _judgement(plan, own[0], after, service, key=key)
-                known[key] = JudgedRow.of(place, name, manifest, seconds.get(place.key))
+                try:
+                    known[key] = JudgedRow.of(place, name, manifest, seconds.get(place.key))
+                except SpecError as error:
+                    show(str(error))
+                    continue
             rows.append(known[key].model_copy(update=place.model_dump() | {"key": key, "object": name}))
             write_table(path, rows, JudgedRow)
     return rows

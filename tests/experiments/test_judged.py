@@ -20,7 +20,6 @@ from trompe_experiments.run import run_experiment
 from trompe_experiments.table import read_table
 from trompe_server.api.examples import MANIFEST as EXAMPLE
 from trompe_shared.api import Job, JudgementRequest, Manifest
-from trompe_shared.errors import SpecError
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
@@ -127,11 +126,23 @@ def test_without_cases_each_configuration_of_the_grid_is_a_method(tmp_path: Path
     assert methods == ["| no change", "| noise", "| epsilon 0.02", "| epsilon 0.05"]
 
 
-def test_a_judgement_without_figures_says_why(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    empty = Manifest.model_validate(EXAMPLE | {"cells": []})
-    monkeypatch.setattr(JudgingService, "judge", lambda *_args, **_options: empty)
-    with pytest.raises(SpecError, match=f"mug, {NOTHING}: The texture is 512"):
-        judged(plan, JudgingService(), tmp_path)
+def test_a_judgement_without_figures_says_why_and_the_others_go_on(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finding = {"kind": "network", "text": "No figures of 'tiny'."}
+    empty = Manifest.model_validate(EXAMPLE | {"cells": [], "findings": [*EXAMPLE["findings"], finding]})
+    judge = JudgingService.judge
+
+    def once(service: JudgingService, *args: Any, **options: Any) -> Manifest:
+        found = judge(service, *args, **options)
+        return empty if len(service.judged) == 1 else found
+
+    monkeypatch.setattr(JudgingService, "judge", once)
+    told = list[str]()
+    rows = judged(plan, JudgingService(), tmp_path, told.append)
+    assert told[1] == f"mug, {NOTHING}: No figures of 'tiny'."
+    assert [row.configuration for row in rows if row.object == "mug"] == ["noise", "weak", "strong"]
+    assert len(rows) == 7
 
 
 @given(epsilon=st.floats(0.004, 1), seed=st.integers(0, 9))
