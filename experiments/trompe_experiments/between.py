@@ -39,7 +39,7 @@ def between_chart(rows: Sequence[ResultRow]) -> Drawing:
 
 def between_markdown(rows: Sequence[ResultRow]) -> str:
     """A line for each change of the images: mean drop, and the mean share of the undisturbed drop that is kept, at
-    most 1."""
+    most 1, where there is one."""
     attacks = grouped(rows, lambda row: row.image_pipeline)
     head = ["in between", *(f"{attack}: {what}" for attack in attacks for what in ("A_drop", "kept"))]
     lines = [
@@ -50,7 +50,7 @@ def between_markdown(rows: Sequence[ResultRow]) -> str:
 
 def _line(rows: Sequence[ResultRow], change: str) -> list[str]:
     drops = [(_drop(row, change), row.held_out_a_drop) for row in rows]
-    kept = [min(1.0, through / plain) for through, plain in drops if through is not None and plain]
+    kept = [min(1.0, through / plain) for through, plain in drops if through is not None and plain and plain > 0]
     return [figure_words(average(through for through, _ in drops)), f"**{figure_words(average(kept))}**"]
 
 

@@ -72,11 +72,12 @@ def test_drops_through_changes_of_the_images_are_compared_with_the_undisturbed_o
         row(image_pipeline="robust", held_out_a_drop=0.8, pipeline_drops="half size 0.600 | grain 0.800"),
         row(image_pipeline="robust", object="pot", held_out_a_drop=0.4, pipeline_drops="half size 0.100 | grain n.a."),
         row(image_pipeline="none", held_out_a_drop=1.0, pipeline_drops="half size 0.200 | grain 0.500"),
+        row(image_pipeline="none", object="pot", held_out_a_drop=-0.02, pipeline_drops="half size 0.200 | grain 0.500"),
     ]
     lines = [[*map(str.strip, line.split("|")[1:-1])] for line in between_markdown(rows).splitlines()]
     assert lines[0] == ["in between", "robust: A_drop", "robust: kept", "none: A_drop", "none: kept"]
     assert lines[2:] == [
-        ["nothing", "0.60", "**1.00**", "1.00", "**1.00**"],
+        ["nothing", "0.60", "**1.00**", "0.49", "**1.00**"],
         ["half size", "0.35", "**0.50**", "0.20", "**0.20**"],
         ["grain", "0.80", "**1.00**", "0.50", "**0.50**"],
     ]
