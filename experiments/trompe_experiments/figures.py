@@ -16,6 +16,7 @@ from trompe_experiments.style import Drawing, stamp_of
 from trompe_experiments.surrogates import surrogates_chart, surrogates_markdown, surrogates_of, with_all_surrogates
 from trompe_experiments.table import PREDICTIONS, PredictionRow, ResultRow, read_results, read_table
 from trompe_shared.comparison import grouped
+from trompe_shared.errors import SpecError
 
 MOST_PANELS = 12
 
@@ -35,7 +36,13 @@ class Data:
         return stamp_of([*self.rows, *self.predictions, *self.judgements])
 
     def draw(self, name: str) -> list[Path]:
-        """Draw the figure ``name`` into ``figures`` as SVG and PNG; returns their paths."""
+        """Draw the figure ``name`` into ``figures`` as SVG and PNG; returns their paths.
+
+        Raises ``SpecError`` if it does not suit the rows.
+        """
+        if not FIGURES[name].fits(self):
+            others = ", ".join(figures_of(self)) or "none"
+            raise SpecError(f"The figure {name!r} does not suit the rows of {str(self.folder)!r}. Suitable: {others}.")
         return FIGURES[name].draw(self).save(self.folder / "figures", name, stamp=self.stamp)
 
     @property

@@ -485,13 +485,17 @@ def test_a_document_is_filled_from_its_data_and_falls_outdated_with_them(tmp_pat
     assert CliRunner().invoke(main, ["experiment", "fill", str(document), "--check"]).exit_code == 0
 
 
-def test_a_document_says_what_is_not_measured_yet_and_refuses_figures_that_do_not_exist(tmp_path: Path) -> None:
+def test_a_document_says_what_is_not_measured_yet_and_refuses_figures_that_do_not_exist_or_fit(tmp_path: Path) -> None:
     document = tmp_path / "results.md"
     document.write_text(DOCUMENT)
     fill(document)
     assert "*Not measured yet: experiments/some/results.csv is missing.*" in document.read_text()
     document.write_text(DOCUMENT.replace("table_one", "table_two"))
     with pytest.raises(SpecError, match="unknown figure 'table_two'; figures: table_one, scatter"):
+        fill(document)
+    written(tmp_path / "experiments" / "some", [row(target_a_drop=None)])
+    document.write_text(DOCUMENT.replace("table_one", "scatter"))
+    with pytest.raises(SpecError, match=r"'scatter' does not suit the rows of .*some'\. Suitable: none"):
         fill(document)
 
 
