@@ -46,7 +46,7 @@ def _gradients(
 ) -> Iterator[Float[Tensor, "batch H W 3"]]:
     """dL/dI by batch; zero where not finite."""
     for start in range(0, len(images), BATCH):
-        batch = torch.from_numpy(images[start : start + BATCH]).float().div(255)
+        batch = torch.from_numpy(np.ascontiguousarray(images[start : start + BATCH])).float().div(255)
         inputs = batch.permute(0, 3, 1, 2).requires_grad_()
         losses = (goal.losses(member.logits(inputs), clamped=False).sum() for member in members)
         gradient = torch.stack([torch.autograd.grad(loss, inputs)[0] for loss in losses]).mean(0)

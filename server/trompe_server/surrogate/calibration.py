@@ -29,6 +29,7 @@ from trompe_server.surrogate.surrogate import (
 )
 from trompe_server.surrogate.tone import Ask, ToneMap, measure_tone_map
 from trompe_shared.api import SurrogateModel
+from trompe_shared.errors import RendererError
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D
 from trompe_shared.opacity import opacity_of
@@ -322,10 +323,15 @@ def calibrate(
     it is known, before most of the probes. deterministic: equal views give equal images whatever the number of their
     noise; otherwise the noise is measured. All images of a view share it, so that they differ by the paint alone.
     tone_map: gives the target's tone curve, if it is needed. A few trial views decide; the other views are probed
-    afterwards.
+    afterwards. Raises ``RendererError`` for images of another shape or type.
     """
+    clean = _checked(clean, views, size=clean.shape[1:3])
+
+    def asked(painted: Object3D, some: Sequence[View]) -> Image8:
+        return _checked(ask(painted, some), some, size=clean.shape[1:3])
+
     trial = _Trial(
-        *(obj, views, clean, ask, generator, backdrops),
+        *(obj, views, clean, asked, generator, backdrops),
         deterministic=deterministic,
         tone_map=tone_map,
         device=torch.device(device),
@@ -345,6 +351,16 @@ def calibrate(
     renders = trial.renders + len(greys) * (len(views) - len(trial.views))
     tone = trial.tone if sampling.encoding == "measured" else None
     return Calibration(model, reason, sampling, greys, probes, fidelity, renders, tone, trial.noise)
+
+
+def _checked(images: Image8, views: Sequence[View], *, size: tuple[int, ...]) -> Image8:
+    expected = (len(views), *size, 3)
+    if images.shape != expected or images.dtype != np.uint8:
+        raise RendererError(
+            f"The target gave images of shape {images.shape} and type {images.dtype}; expected {expected}, "
+            "(views, H, W, 3), and uint8, sRGB."
+        )
+    return np.ascontiguousarray(images)
 
 
 class _Trial:

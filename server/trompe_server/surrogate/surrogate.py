@@ -543,7 +543,7 @@ def curve_surrogate(
     probes: the target's images of ``obj`` painted in each grey, (greys, views, H, W, 3) uint8. tone: for a sampling
     model with ``encoding`` "measured", with two greys. backdrops: as for ``diffuse_surrogate``.
     """
-    base = torch.from_numpy(clean).to(geometry.device)
+    base = torch.from_numpy(np.ascontiguousarray(clean)).to(geometry.device)
     shown = [torch.from_numpy(probe).to(base.device) for probe in probes]
     uncovered = _behind(geometry, views, backdrops)
     texels = painted(obj, geometry.device).texels(geometry)

@@ -1,5 +1,6 @@
 """One attack without a service: random renderers, views of one's own, and none."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,7 @@ from tests.job_runs import CHAIR, Recorder
 from trompe_server import attack_object
 from trompe_server.attack import ViewDistribution
 from trompe_shared.engine import EngineInfo
-from trompe_shared.errors import SpecError
+from trompe_shared.errors import RendererError, SpecError
 
 VIEWS = ViewDistribution(1.5, (0, 40)).sample(7, generator=np.random.default_rng(0))
 OPTIONS: dict[str, Any] = {"label": "chair", "views": VIEWS[:5], "held_out": VIEWS[5:], "steps": 1}
@@ -33,6 +34,39 @@ def test_held_out_views_are_not_needed() -> None:
     assert attacked.target.views == 5
     assert all(views for _, views in target.asked)
     assert {view.noise for _, views in target.asked for view in views} == {0}
+
+
+class Changed(Recorder):
+    """A target whose images come as ``change`` makes them."""
+
+    def __init__(self, change: Callable[[Any], Any]) -> None:
+        super().__init__()
+        object.__setattr__(self, "change", change)
+
+    def render(self, *args: Any, **options: Any) -> Any:
+        return self.change(super().render(*args, **options))  # type: ignore[attr-defined]
+
+
+def test_a_targets_images_may_lie_in_memory_as_they_like() -> None:
+    plain, mirrored = (
+        attack_object(CHAIR, "tiny", target=target, **OPTIONS)
+        for target in (Recorder(), Changed(lambda images: np.ascontiguousarray(images[..., ::-1])[..., ::-1]))
+    )
+    assert plain.painted.to_zip() == mirrored.painted.to_zip()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(lambda images: images / 255, id="floats"),
+        pytest.param(lambda images: images[..., 0], id="grey"),
+        pytest.param(lambda images: images[..., [0, 1, 2, 0]], id="alpha"),
+        pytest.param(lambda images: images[:-1], id="one less"),
+    ],
+)
+def test_images_of_another_kind_are_refused_in_words(change: Callable[[Any], Any]) -> None:
+    with pytest.raises(RendererError, match=r"The target gave images of shape .* expected \(5, "):
+        attack_object(CHAIR, "tiny", target=Changed(change), **OPTIONS)
 
 
 def test_a_picture_behind_the_object_is_refused_at_once() -> None:
