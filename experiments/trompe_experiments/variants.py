@@ -89,7 +89,7 @@ def export_variants(
     unknown = sorted(set(names) - set(shipped_objects()))
     if unknown:
         raise SpecError(f"No shipped object {', '.join(unknown)}; objects: {', '.join(shipped_objects())}.")
-    chosen = list(names or shipped_objects())
+    chosen = list(dict.fromkeys(names or shipped_objects()))
     experiment = Experiment(
         name="variants",
         base=ATTACK | {"epsilon": epsilon},

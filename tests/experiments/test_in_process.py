@@ -219,7 +219,7 @@ def test_variants_are_zips_and_labelled_pictures_from_views_that_train_and_test_
     for name, value in SMALL.items():
         monkeypatch.setitem(ATTACK, name, value)
     out, service = tmp_path / "out", InProcess(tmp_path / "jobs")
-    asked = {"names": ["ball"], "per_object": 1, "views": 5, "size": SIZE, "epsilon": 0.1}
+    asked = {"names": ["ball", "ball"], "per_object": 1, "views": 5, "size": SIZE, "epsilon": 0.1}
     attacked = export_variants(out, service, FakeTarget(), show=Silent(), **asked)  # type: ignore[arg-type]
     made = list((out / "objects").glob("*.zip"))
     rows = list(csv.DictReader((out / "labels.csv").read_text().splitlines()))

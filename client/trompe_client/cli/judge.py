@@ -17,6 +17,7 @@ from trompe_client.cli.following import deliver, follow
 from trompe_client.cli.options import flag_of
 from trompe_client.cli.output import print_json, say
 from trompe_shared.api import (
+    JOB_RESULT,
     JUDGEMENT_OPTIONS,
     MANIFEST,
     MANIFEST_PAGE,
@@ -66,6 +67,8 @@ def judge(
         sys.exit(_verify(verify, given.get("renderers", ())))
     if before is None or after is None or out is None or "label" not in given:
         raise click.UsageError("Give two files, --label and --out: trompe judge BEFORE AFTER --label mug --out DIR")
+    if server is None and after.startswith(JOB_RESULT):
+        raise click.UsageError(f"{after!r} is the result of a job on a server: add --server, or give its file.")
     spec = JudgementSpec.of(before, after, **given)
     out.mkdir(parents=True, exist_ok=True)
     if server is None:

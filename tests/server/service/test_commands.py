@@ -222,6 +222,7 @@ WRONG = [
     pytest.param(["mug", "nowhere.glb", "--label", "mug", "--out", "out"], 2, "no file 'nowhere.glb'", id="no file"),
     pytest.param(["mug", "notes.txt", "--label", "mug", "--out", "out"], 2, "is not a zip archive", id="no model"),
     pytest.param(["mug", "mug", "--label", "mug", "--out", "o", "--suite", "s"], 2, "standard-1", id="no such suite"),
+    pytest.param(["mug", "job:1", "--label", "mug", "--out", "o"], 2, "a job on a server: add --server", id="a job"),
     pytest.param(["--verify", "notes.txt"], 2, "notes.txt is not a manifest", id="no manifest"),
     pytest.param(["mug", "--verify", "notes.txt"], 2, "--verify takes a manifest alone", id="a manifest and a file"),
 ]
