@@ -67,6 +67,10 @@ def attack_object(
     the classifier, as for a job. The same arguments give the same bytes. Raises ``TrompeError`` for inputs that cannot
     be read or do not fit together.
     """
+    if image_pipeline not in SAFE_MARGINS:
+        raise SpecError(f"Unknown image pipeline {image_pipeline!r}; choose one of {', '.join(SAFE_MARGINS)}.")
+    if seed < 0:
+        raise SpecError(f"`seed` must be 0 or more, got {seed}.")
     if views is not None and not len(views):
         raise SpecError("There are no `views` to attack: give at least one, or leave `views` out for random ones.")
     obj = obj if isinstance(obj, Object3D) else _load(obj)

@@ -69,15 +69,17 @@ def test_images_of_another_kind_are_refused_in_words(change: Callable[[Any], Any
         attack_object(CHAIR, "tiny", target=Changed(change), **OPTIONS)
 
 
-def test_a_picture_behind_the_object_is_refused_at_once() -> None:
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        pytest.param({"held_out": [replace(VIEWS[0], backdrop="sea")]}, "picture behind the object", id="backdrop"),
+        pytest.param({"views": []}, "no `views` to attack: give at least one", id="views"),
+        pytest.param({"image_pipeline": "strong"}, "'strong'; choose one of none, robust, transfer", id="pipeline"),
+        pytest.param({"seed": -1}, "`seed` must be 0 or more, got -1", id="seed"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused_at_once(options: dict[str, Any], error: str) -> None:
     target = Recorder()
-    with pytest.raises(SpecError, match="picture behind the object"):
-        attack_object(CHAIR, "tiny", target=target, **OPTIONS | {"held_out": [replace(VIEWS[0], backdrop="sea")]})
-    assert target.asked == []
-
-
-def test_an_attack_on_no_views_is_refused_at_once() -> None:
-    target = Recorder()
-    with pytest.raises(SpecError, match="no `views` to attack: give at least one"):
-        attack_object(CHAIR, "tiny", target=target, **OPTIONS | {"views": []})
+    with pytest.raises(SpecError, match=error):
+        attack_object(CHAIR, "tiny", target=target, **OPTIONS | options)
     assert target.asked == []
