@@ -1,6 +1,8 @@
-"""FBX: mesh and materials through assimp's command line as OBJ, in metres.
+"""FBX: mesh and materials through assimp's command line as OBJ, in metres, y upwards.
 
-A repaint replaces textures only, beside the FBX and inside a binary one.
+Versions of assimp differ in what they do about units and axes, and write no base colour of a physical material as OBJ,
+so it gets a file without the former and with the latter under its usual name. A repaint replaces textures only, beside
+the FBX and inside a binary one.
 """
 
 import re
@@ -8,11 +10,13 @@ import shutil
 import struct
 import subprocess
 import tempfile
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trompe_server.formats.assembly import assemble, repainted, safe_name
 from trompe_server.formats.fbx_tree import MAGIC, Tree, parse_tree
@@ -26,18 +30,56 @@ from trompe_shared.object3d import Object3D, object_from_files, with_alpha_of
 CENTIMETRE: Final = 0.01
 """Metres of FBX's default unit."""
 TIMEOUT: Final = 60.0
-_BINARY: Final = re.compile(rb"S\x0f\0\0\0UnitScaleFactorS\x06\0\0\0doubleS\x06\0\0\0NumberS\0\0\0\0D(.{8})", re.DOTALL)
-_TEXT: Final = re.compile(rb'"UnitScaleFactor"(?:[^\n,]*,){4}\s*([0-9]+(?:\.[0-9]*)?(?:[eE][+-]?[0-9]{1,3})?)')
+AXES: Final = (b"CoordAxis", b"UpAxis", b"FrontAxis")
+"""Settings of the axes to the right, upwards and to the viewer: by default 0, 1, 2."""
+PLACEMENT: Final = ((b"Translation", slice(2), 0.0), (b"Rotation", slice(2, 3), 0.0), (b"Scaling", slice(2), 1.0))
+"""Properties of textures, the numbers of each that count, and their value for a texture in its place."""
+_NUMBER: Final = rb"-?[0-9]+(?:\.[0-9]*)?(?:[eE][+-]?[0-9]{1,3})?"
+_STRING: Final = rb"S.\0\0\0"
+_SETTINGS: Final = re.compile(rb'(%s|")(UnitScaleFactor|%s)' % (_STRING, b"|".join(AXES)), re.DOTALL)
+_BASE_COLOUR: Final = rb"(?:3dsMax|Maya)\|(?:\w+\|)?(?:base_?[cC]olor(?:_map)?|TEX_color_map)(?:\|file)?"
+_LINK: Final = re.compile(rb"(?s)%s%s\Z" % (_STRING, _BASE_COLOUR))
+_TEXT_LINK: Final = re.compile(rb'("OP",\s*\d+,\s*\d+,\s*)"%s"' % _BASE_COLOUR)
+
+
+def _values(data: bytes, name: bytes) -> Iterator[tuple[float, ...]]:
+    """The numbers of each property of a name, in a binary or text file."""
+    head = b"S" + struct.pack("<I", len(name)) + re.escape(name)
+    values = rb"(?:%s\w*){3}(?:I(.{4})|D(.{8})(?:D(.{8})D(.{8}))?)" % _STRING
+    for found in re.finditer(head + values, data, re.DOTALL):
+        yield tuple(struct.unpack("<i" if len(each) == 4 else "<d", each)[0] for each in found.groups() if each)
+    for found in re.finditer(rb'"%s"(?:[^\n,]*,){4}\s*(%s(?:\s*,\s*%s)*)' % (name, _NUMBER, _NUMBER), data):
+        yield tuple(map(float, found[1].split(b",")))
+
+
+def _setting(data: bytes, name: bytes, default: float) -> float:
+    return next(_values(data, name), (default,))[0]
+
+
+def _axes(data: bytes) -> tuple[list[int], NDArray[np.float32]]:
+    """(Numbers of the axes to the right, upwards and to the viewer, their signs). Raises ``ObjectError``."""
+    numbers = [_setting(data, name, default) for default, name in enumerate(AXES)]
+    if sorted(numbers) != [0, 1, 2]:
+        raise ObjectError(f"The axes of the FBX, {numbers}, are not three directions; export it again.")
+    signs = [-1 if _setting(data, name + b"Sign", 1) < 0 else 1 for name in AXES]
+    return [int(number) for number in numbers], np.array(signs, np.float32)
+
+
+def _refuse_placed_textures(data: bytes) -> None:
+    for name, which, idle in PLACEMENT:
+        if moved := [values for values in _values(data, name) if any(value != idle for value in values[which])]:
+            raise ObjectError(
+                f"The FBX scales, turns or moves a texture ({name.decode()} {moved[0]}), which is not supported; apply "
+                "that to the texture coordinates in a modelling program."
+            )
 
 
 def unit(data: bytes) -> float:
     """The file's unit of length in metres. Raises ``ObjectError`` outside 1e-6 to 1e6 cm."""
-    found = _BINARY.search(data)
-    text = _TEXT.search(data)
-    factor = struct.unpack("<d", found[1])[0] if found else float(text[1]) if text else 1.0
+    factor = _setting(data, b"UnitScaleFactor", 1.0)
     if not 1e-6 <= factor <= 1e6:
         raise ObjectError(f"The unit of length of the FBX is {factor:g} cm; set a sensible unit and export it again.")
-    return float(factor) * CENTIMETRE
+    return factor * CENTIMETRE
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
@@ -61,14 +103,33 @@ def _tree(data: bytes) -> Tree | None:
 
 def read(upload: Upload) -> Object3D:
     """Read an FBX and its textures; one inside counts more than a file beside it. Raises ``ObjectError``."""
-    scale, tree = unit(upload.data), _tree(upload.data)
+    scale, (axes, signs), tree = unit(upload.data), _axes(upload.data), _tree(upload.data)
+    _refuse_placed_textures(upload.data)
     beside = {name: data for name, data in upload.flat().items() if not name.lower().endswith((".obj", ".mtl"))}
     inside = tree.pictures() if tree is not None else {}
-    bare = upload.data if tree is None or not inside else tree.with_pictures(dict.fromkeys(inside)).to_bytes()
-    obj = object_from_files(dissolved(complete({**beside, **inside, **_converted(bare)})))
-    parts = [replace(part, vertices=part.vertices * np.float32(scale)) for part in obj.parts]
+    converted = _converted(_plain(upload.data, tree, inside))
+    obj = object_from_files(dissolved(complete({**beside, **inside, **converted})))
+    mirrored = np.linalg.det(np.eye(3)[axes] * signs) < 0
+    parts = [
+        replace(
+            part,
+            vertices=part.vertices[:, axes] * signs * np.float32(scale),
+            normals=part.normals[:, axes] * signs,
+            faces=np.ascontiguousarray(part.faces[:, ::-1]) if mirrored else part.faces,
+        )
+        for part in obj.parts
+    ]
     images = {name: obj.files[name] for m in obj.materials.values() for name in (m.albedo, m.normal) if name}
     return assemble(safe_name(upload.stem), parts, obj.materials, images)
+
+
+def _plain(data: bytes, tree: Tree | None, inside: Collection[str]) -> bytes:
+    """The file for assimp: without pictures, units and axes, with base colours as diffuse colours."""
+    if tree is None:
+        data = _TEXT_LINK.sub(rb'\1"DiffuseColor"', data)
+    elif inside or re.search(_BASE_COLOUR, data):
+        data = tree.with_pictures(dict.fromkeys(inside)).with_links(_LINK, b"DiffuseColor").to_bytes()
+    return _SETTINGS.sub(lambda found: found[1] + found[2].lower(), data)
 
 
 def _converted(data: bytes) -> dict[str, bytes]:

@@ -1,5 +1,6 @@
 """Binary FBX as a tree of nodes, to find and replace the pictures inside."""
 
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -52,6 +53,10 @@ class Tree:
     def with_pictures(self, pictures: dict[str, bytes | None]) -> "Tree":
         """The tree with other image files; ``None`` removes a file."""
         return replace(self, nodes=tuple(_replaced(node, pictures) for node in self.nodes))
+
+    def with_links(self, name: re.Pattern[bytes], new: bytes) -> "Tree":
+        """The tree with the property ``new`` of materials in connections to a property that matches ``name``."""
+        return replace(self, nodes=tuple(_linked(node, name, _string(new)) for node in self.nodes))
 
     def _videos(self) -> Iterator[Node]:
         for top in self.nodes:
@@ -121,6 +126,18 @@ def _picture(video: Node) -> tuple[str, Node | None]:
     inside = content is not None and content.properties[:1] == b"R" and len(content.properties) > 5
     name = named.properties[5:].decode("utf-8", "replace") if named is not None else ""
     return base_name(name), content if inside else None
+
+
+def _string(value: bytes) -> bytes:
+    """The property of a text."""
+    return b"S" + struct.pack("<I", len(value)) + value
+
+
+def _linked(node: Node, name: re.Pattern[bytes], new: bytes) -> Node:
+    if node.name != b"Connections":
+        return node
+    links = (replace(link, properties=name.sub(lambda _: new, link.properties)) for link in node.children or ())
+    return replace(node, children=tuple(links))
 
 
 def _replaced(node: Node, pictures: dict[str, bytes | None]) -> Node:

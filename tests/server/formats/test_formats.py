@@ -1,6 +1,7 @@
 """OBJ, SAILenv, FBX, PLY and STL: what is missing is made, what is there comes back as it was."""
 
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -11,6 +12,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from tests.small_models import corners, painted, refusal, same_paint, with_picture_inside
 from trompe_server.formats import FORMATS, import_file, read_object, repaint_file, repaint_limited, write_glb
@@ -272,6 +274,49 @@ def test_a_picture_inside_an_fbx_is_painted_there_and_beside(beside: str | None,
     new = painted(obj).textures["red.png"]
     for data in (*parse_tree(after["t.fbx"]).pictures().values(), *(after[name] for name in files if name != "t.fbx")):
         assert (decode_rgb(data, "red.png") == new).all()
+
+
+@needs_assimp
+@pytest.mark.parametrize("kind", ["fbxa", "fbx"])
+def test_an_fbx_stands_upright_whatever_its_axes(kind: str, tmp_path: Path) -> None:
+    data = fbx_of("newmtl red\n", tmp_path, kind=kind)
+    data = data if kind == "fbxa" else parse_tree(data).to_bytes()  # assimp does not read what it wrote
+
+    def turned(axes: dict[str, int]) -> NDArray[np.float32]:
+        changed = data
+        for name, value in axes.items():
+            head = rb'"%s"(?:[^,]*,){4}|\0%s(?:S.\0\0\0\w*){3}I' % (name.encode(), name.encode())
+            new = str(value).encode() if kind == "fbxa" else struct.pack("<i", value)
+            changed = re.sub(rb"(?s)(%s)(?:-?\d|.{4})" % head, lambda found, new=new: found[1] + new, changed)
+        return corners(read_object(changed, name="t.fbx").obj)
+
+    x, y, z = np.moveaxis(turned({}), -1, 0)
+    lying = turned({"UpAxis": 2, "FrontAxis": 1, "FrontAxisSign": -1})
+    np.testing.assert_array_equal(lying, np.stack([x, z, -y], axis=-1))
+    mirrored = turned({"CoordAxisSign": -1})[:, ::-1]  # its triangles face outwards, too
+    np.testing.assert_array_equal(mirrored, np.stack([-x, y, z], axis=-1))
+    with pytest.raises(ObjectError, match="not three directions"):
+        turned({"UpAxis": 2})
+
+
+@needs_assimp
+@pytest.mark.parametrize("kind", ["fbxa", "fbx"])
+@pytest.mark.parametrize("name", ["Maya|baseColor", "3dsMax|main|base_color_map", "Maya|TEX_color_map|file"])
+def test_the_base_colour_of_a_physical_material_in_an_fbx_is_read(name: str, kind: str, tmp_path: Path) -> None:
+    data = fbx_of("newmtl red\nmap_Kd red.png\n", tmp_path, kind=kind)
+    if kind == "fbx":
+        link = re.compile(rb"S\x0c\0\0\0DiffuseColor\Z")
+        data = parse_tree(data).with_links(link, name.encode()).to_bytes()
+    else:
+        data = re.sub(rb'("OP".*)"DiffuseColor"', lambda found: found[1] + b'"%s"' % name.encode(), data)
+    assert name.encode() in data
+    obj, _ = comes_back(pack_zip({"t.fbx": data, "red.png": encode_png(PICTURE)}), "t.zip")
+    assert (obj.textures["red.png"] == PICTURE).all()
+
+
+def test_a_texture_that_an_fbx_scales_or_moves_is_refused() -> None:
+    text = b'; FBX 7.3.0\nP: "Translation", "Vector", "", "A",0,0,0\nP: "Scaling", "Vector", "", "A",2,1,1\n'
+    assert "scales, turns or moves a texture (Scaling (2.0, 1.0, 1.0))" in refusal(text, "t.fbx")
 
 
 def test_two_pictures_of_one_name_inside_an_fbx_are_refused() -> None:
