@@ -5,6 +5,7 @@ import json
 import os
 import posixpath
 import re
+import unicodedata
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
@@ -217,11 +218,16 @@ def base_name(path: str) -> str:
 
 
 def named(name: str, files: Collection[str]) -> str | None:
-    """The file ``name`` among ``files``, or the only one that differs in capitals alone."""
+    """The file ``name`` among ``files``, or the only one that differs in capitals or the coding of accents alone."""
     if name in files:
         return name
-    alike = [file for file in files if file.casefold() == name.casefold()]
+    alike = [file for file in files if spelling(file) == spelling(name)]
     return alike[0] if len(alike) == 1 else None
+
+
+def spelling(name: str) -> str:
+    """What a name has in common with its copies on systems that ignore capitals (Windows) or split accents (macOS)."""
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def pack_zip(files: Mapping[str, bytes]) -> bytes:

@@ -37,6 +37,8 @@ MAX_TEXELS: Final = 2 * MAX_TEXTURE_SIDE**2
 MAX_RATIO: Final = 200
 """Largest ratio of unpacked to packed size, for archives that unpack to more than ``MUCH``."""
 MUCH: Final = 64 * 2**20
+UTF_8: Final = 0x800
+"""Flag of a zip's member whose name is UTF-8, not code page 437."""
 SPHERE_STEPS: Final = 100
 """Steps of the search for the smallest sphere around an object; the error falls with their number."""
 IMAGE_FORMATS: Final = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF", "GIF")
@@ -279,12 +281,20 @@ def _check_size(members: list[zipfile.ZipInfo], packed: int) -> None:
 
 
 def _checked_path(info: zipfile.ZipInfo) -> PurePosixPath:
-    path = PurePosixPath(info.filename.replace("\\", "/"))
+    path = PurePosixPath(_name_of(info).replace("\\", "/"))
     if path.is_absolute() or ".." in path.parts or re.match("[A-Za-z]:", info.filename):
         raise ObjectError(f"The archive holds {info.filename[:80]!r}, which leads out of it; zip one folder.")
     if stat.S_ISLNK(info.external_attr >> 16):
         raise ObjectError(f"The archive holds the link {info.filename[:80]!r}; put the file itself there.")
     return path
+
+
+def _name_of(info: zipfile.ZipInfo) -> str:
+    """The name of a member; macOS writes UTF-8 without saying so."""
+    try:
+        return info.filename if info.flag_bits & UTF_8 else info.filename.encode("cp437").decode()
+    except UnicodeError:
+        return info.filename
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:

@@ -19,6 +19,8 @@ from trompe_shared.local_files import base_name
 MAX_FACES: Final = 2_000_000
 LARGEST: Final = 1e6
 """Largest coordinate (metres) and texture coordinate."""
+NO_MATERIAL: Final = "default"
+"""Material of faces without one."""
 _WIDTHS: Final = {"v": 3, "vt": 2, "vn": 3}
 MAX_LINE: Final = 2**20
 """Characters of a line: enough for a polygon with a hundred thousand corners."""
@@ -80,7 +82,7 @@ class _Reader:
         self.numbers = {kind: array("d") for kind in _WIDTHS}
         self.colours = array("d")
         self.corners: dict[str, array[int]] = {}
-        self.material = "default"
+        self.material = NO_MATERIAL
         self._triangles = 0
 
     def read(self, text: str) -> None:
@@ -129,7 +131,7 @@ class _Reader:
             if words[0] == "v" and len(words) >= 7:
                 self.colours.extend([float(word) for word in words[-3:]])
         elif words[0] == "usemtl":
-            self.material = line.split(maxsplit=1)[1].strip()
+            self.material = line.strip()[len("usemtl") :].strip() or NO_MATERIAL
 
     def _corner(self, word: str) -> tuple[int, int, int]:
         fields = [*word.split("/"), "", ""][:3]

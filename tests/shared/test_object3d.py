@@ -17,7 +17,7 @@ from PIL import Image
 from tests.small_models import large_png, zipped
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import pack_zip
-from trompe_shared.object3d import decode_rgb, encode_png, load_object, object_from_files
+from trompe_shared.object3d import decode_rgb, encode_png, load_object, object_from_files, unpack
 from trompe_shared.wavefront import parse_mtl, parse_obj
 
 MESH = """# a triangle
@@ -431,6 +431,15 @@ def test_an_image_that_is_too_large_or_empty_is_refused_undecoded(side: int, wor
     message = refusal(with_files(paint__png=large_png(side, side)))
     assert "paint.png" in message
     assert word in message
+
+
+def test_names_in_utf_8_are_read_whether_the_zip_says_so_or_not() -> None:
+    """macOS does not; others write code page 437."""
+    names = {b"caf\xc3\xa9.png": "caf\xe9.png", b"caf\x82.png": "caf\xe9.png"}
+    for raw, name in names.items():
+        data = zipped({"x" * len(raw): b"picture"}).replace(b"x" * len(raw), raw)
+        assert unpack(data) == {name: b"picture"}
+    assert unpack(zipped({"\u6728.png": b"wood"})) == {"\u6728.png": b"wood"}
 
 
 ARCHIVE = zipped(FILES)

@@ -180,9 +180,10 @@ class TextureInfo(_Part):
 
     @property
     def placement(self) -> tuple[int, UvTransform]:
-        """The set of texture coordinates and their transform."""
+        """The set of texture coordinates and their transform, which no longer names one."""
         transform = self.transform or UvTransform()
-        return (self.tex_coord if transform.tex_coord is None else transform.tex_coord), transform
+        which = self.tex_coord if transform.tex_coord is None else transform.tex_coord
+        return which, transform.model_copy(update={"tex_coord": None})
 
 
 class Pbr(_Part):

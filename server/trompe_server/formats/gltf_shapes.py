@@ -104,8 +104,7 @@ def _triangles(document: Document, mesh: int) -> int:
     for primitive in at(document.meshes, mesh, "mesh").primitives:
         source = primitive.attributes.get("POSITION", 0) if primitive.indices is None else primitive.indices
         corners = at(document.accessors, source, "accessor").count
-        material = None if primitive.material is None else at(document.materials, primitive.material, "material")
-        sides = 2 if material is not None and material.double_sided else 1
+        sides = 2 if _material(document, primitive).double_sided else 1
         count += sides * (corners // 3 if primitive.mode == 4 else corners)
     return count
 
@@ -168,10 +167,14 @@ def _faces(container: Container, primitive: Primitive, count: int) -> NDArray[np
     return faces.astype(np.int32)
 
 
+def _material(document: Document, primitive: Primitive) -> Material:
+    return Material() if primitive.material is None else at(document.materials, primitive.material, "material")
+
+
 def _uvs(container: Container, primitive: Primitive) -> NDArray[np.float32] | None:
     """Texture coordinates (V, 2) of the material's maps, v upwards, or ``None``."""
     document = container.document
-    material = Material() if primitive.material is None else at(document.materials, primitive.material, "material")
+    material = _material(document, primitive)
     if not material.maps:
         which, transform = 0, UvTransform()
     else:
@@ -218,12 +221,21 @@ def _check_wrapping(document: Document, material: Material, uvs: NDArray[np.floa
 
 
 def _vertex_colours(container: Container, primitive: Primitive) -> NDArray[np.float64] | None:
-    """Linear colours (V, 3) of vertices; ``None`` if there are none or all are white."""
+    """Linear colours (V, 3) of vertices; ``None`` if there are none or all are white.
+
+    Raises ``ObjectError`` for alpha that shows.
+    """
     if "COLOR_0" not in primitive.attributes:
         return None
     index = primitive.attributes["COLOR_0"]
     width = 4 if at(container.document.accessors, index, "accessor").type == "VEC4" else 3
-    colours = container.numbers(index, width)[:, :3].astype(np.float64)
+    colours, alpha = np.split(container.numbers(index, width).astype(np.float64), [3], axis=1)
+    material = _material(container.document, primitive)
+    if material.alpha_mode != "OPAQUE" and (alpha < 0.999).any():
+        raise ObjectError(
+            f"Material {material.name or primitive.material!r} has vertex colours with alpha, which is not supported; "
+            "bake it into its base colour texture."
+        )
     return None if (colours > 0.999).all() else np.clip(colours, 0.0, 1.0)
 
 

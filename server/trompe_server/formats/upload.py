@@ -6,10 +6,15 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Final
 from urllib.parse import unquote
 
 from trompe_shared.errors import ObjectError
-from trompe_shared.local_files import base_name, named, pack_zip
+from trompe_shared.local_files import PICTURE_SUFFIXES, base_name, named, pack_zip, spelling
+
+
+_FLAT: Final = (".obj", ".mtl", ".json", *PICTURE_SUFFIXES)
+"""Endings of files that are read by their name without folders."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +54,20 @@ class Upload:
 
     def _elsewhere(self, name: str) -> str | None:
         """The only file of a name in any folder."""
-        alike = [path for path in self.files if base_name(path).casefold() == name.casefold() and not is_litter(path)]
+        alike = [path for path in self.files if spelling(base_name(path)) == spelling(name) and not is_litter(path)]
         return alike[0] if len(alike) == 1 else None
 
     def flat(self) -> dict[str, bytes]:
-        """The files by name without folders, but litter. Raises ``ObjectError`` if two names are equal."""
+        """The files by name without folders, but litter and equal names of files that are not read.
+
+        Raises ``ObjectError`` if the names of two others are equal.
+        """
         paths = [path for path in self.files if not is_litter(path)]
         count = Counter(map(base_name, paths))
-        if len(count) < len(paths):
-            one, other, *_ = (path for path in paths if count[base_name(path)] > 1)
-            raise ObjectError(f"{one!r} and {other!r} have the same name; rename one of them.")
-        return {base_name(path): self.files[path] for path in paths}
+        equal = [path for path in paths if count[base_name(path)] > 1]
+        if read := [path for path in equal if path.lower().endswith(_FLAT)]:
+            raise ObjectError(f"{read[0]!r} and {read[1]!r} have the same name; rename one of them.")
+        return {base_name(path): self.files[path] for path in paths if path not in equal}
 
     def with_flat(self, files: Mapping[str, bytes]) -> "Upload":
         """The upload with files replaced, by name without folders; new ones go beside the mesh."""
@@ -74,8 +82,8 @@ class Upload:
 
 
 def is_litter(path: str) -> bool:
-    """Whether a file is hidden or a cache of Windows."""
-    return base_name(path).startswith(".") or base_name(path).lower() == "thumbs.db"
+    """Whether a file is hidden or left by Windows."""
+    return base_name(path).startswith(".") or base_name(path).lower() in {"thumbs.db", "desktop.ini"}
 
 
 @contextmanager

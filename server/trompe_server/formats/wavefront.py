@@ -21,7 +21,7 @@ from trompe_shared.object3d import (
     object_from_files,
     with_alpha_of,
 )
-from trompe_shared.wavefront import Part, Surface, obj_text, parse_mtl, parse_surfaces, textured
+from trompe_shared.wavefront import NO_MATERIAL, Part, Surface, obj_text, parse_mtl, parse_surfaces, textured
 
 
 def read(upload: Upload) -> Object3D:
@@ -88,8 +88,11 @@ def _respelled(line: str, files: Mapping[str, bytes]) -> str:
 
 
 def _encoded(text: str, before: bytes) -> bytes:
-    """``text`` in the encoding of the file ``before`` the change."""
-    return text.encode(encoding_of(before), "replace")
+    """``text`` in the encoding of the file ``before`` the change, or in UTF-8 if that lacks a character."""
+    try:
+        return text.encode(encoding_of(before))
+    except UnicodeEncodeError:
+        return text.encode()
 
 
 def dissolved(files: Mapping[str, bytes]) -> dict[str, bytes]:
@@ -138,6 +141,7 @@ class _Completion:
             names = dict.fromkeys(surface.material for surface in self._surfaces)
             self._libraries = {f"{self._mesh[:-4]}.mtl": "".join(f"newmtl {name}\n" for name in names)}
         texts = dict(self._libraries)
+        self._define_missing()
         for surface in self._surfaces:
             self._add(surface)
         changed = {name: text for name, text in self._libraries.items() if text != texts[name]}
@@ -146,6 +150,17 @@ class _Completion:
             written = libraries(self._text, self._libraries).values()
             changed[self._mesh] = obj_text(tuple(self._parts), libraries=written)
         return self._files | {name: _encoded(text, self._files.get(name, b"")) for name, text in changed.items()}
+
+    def _maps(self) -> dict[str, dict[str, str]]:
+        return {name: maps for text in reversed(self._libraries.values()) for name, maps in parse_mtl(text).items()}
+
+    def _define_missing(self) -> None:
+        """Define the material of faces without one in a mesh that has materials; the mesh will name it."""
+        used = {surface.material for surface in self._surfaces}
+        if used > {NO_MATERIAL} and NO_MATERIAL not in self._maps():
+            first, text = next(iter(self._libraries.items()))
+            self._libraries[first] = f"{text}\nnewmtl {NO_MATERIAL}\n"
+            self._rewritten = True
 
     def _refuse_unnamed_pictures(self) -> None:
         """Raise ``ObjectError`` if the mesh is ready for a picture that no material names."""
@@ -157,7 +172,7 @@ class _Completion:
             )
 
     def _add(self, surface: Surface) -> None:
-        maps = {name: found for text in reversed(self._libraries.values()) for name, found in parse_mtl(text).items()}
+        maps = self._maps()
         if surface.material not in maps:
             raise ObjectError(
                 f"{self._mesh!r} uses the undefined material {surface.material!r}; the .mtl defines "

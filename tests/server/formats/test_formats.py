@@ -74,6 +74,31 @@ def test_pictures_in_other_capitals_are_found_where_only_one_is_meant() -> None:
     assert "Red.PNG" in refusal(pack_zip(files | {"RED.png": encode_png(PICTURE)}), "t.zip")
 
 
+@pytest.mark.parametrize(
+    ("name", "mtl"),
+    [
+        pytest.param("e\u0301.png", "\xe9.png".encode(), id="split in the zip"),
+        pytest.param("e\u0301.png", "\xe9.png".encode("latin-1"), id="Latin-1 in the MTL, which has no split ones"),
+        pytest.param("\xe9.png", "e\u0301.png".encode(), id="split in the MTL"),
+    ],
+)
+def test_pictures_with_accents_are_found_however_they_are_coded(name: str, mtl: bytes) -> None:
+    files = {"t.obj": OBJ.encode(), "t.mtl": b"newmtl red\nmap_Kd %s\n" % mtl, name: encode_png(PICTURE)}
+    assert (comes_back(pack_zip(files), "t.zip")[0].textures[name] == PICTURE).all()
+
+
+def test_faces_without_a_material_are_grey_beside_others() -> None:
+    for line in ("", "usemtl \n"):
+        mesh = OBJ.replace("usemtl red\n", f"{line}f 1/1 2/2 3/3\nusemtl red\n")
+        files = {"t.obj": mesh.encode(), "t.mtl": b"newmtl red\nmap_Kd red.png\n", "red.png": encode_png(PICTURE)}
+        obj, out = comes_back(pack_zip(files), "t.zip")
+        assert obj.textures["default_albedo.png"][0, 0].tolist() == [204] * 3
+        assert b"usemtl default\n" in unpack(out)["t.obj"]
+        assert b"newmtl default\n" in unpack(out)["t.mtl"]
+    nameless = pack_zip(files | {"t.obj": OBJ.replace("usemtl red\n", "").encode()})
+    assert "undefined material 'default'" in refusal(nameless, "t.zip")
+
+
 def test_capitals_change_in_whole_names_alone_and_an_mtl_keeps_its_encoding() -> None:
     mtl = "newmtl red\nmap_Kd \xe9\\a.png\nnewmtl other\nmap_Kd data.png\nmap_d my a.png\n".encode("latin-1")
     pictures = dict.fromkeys(("A.png", "data.png", "my a.png"), encode_png(PICTURE))
@@ -84,10 +109,12 @@ def test_capitals_change_in_whole_names_alone_and_an_mtl_keeps_its_encoding() ->
 
 
 def test_two_files_of_one_name_are_named_unless_the_system_left_them() -> None:
-    litter = dict.fromkeys(("a/.DS_Store", "b/.DS_Store", "._t.obj", "a/Thumbs.db", "b/Thumbs.db"), b"?")
+    litter = dict.fromkeys(("a/.DS_Store", "b/.DS_Store", "._t.obj", "a/Thumbs.db", "b/desktop.ini"), b"?")
     files = {"t.obj": OBJ.encode(), "t.mtl": MTL.encode(), **litter}
     assert litter.items() <= unpack(comes_back(pack_zip(files), "t.zip")[1]).items()
-    assert "'a/x.txt' and 'b/x.txt'" in refusal(pack_zip(files | {"a/x.txt": b"1", "b/x.txt": b"2"}), "t.zip")
+    notes = {"a/x.txt": b"1", "b/x.txt": b"2"}
+    assert notes.items() <= unpack(comes_back(pack_zip(files | notes), "t.zip")[1]).items()
+    assert "'a/x.png' and 'b/x.png'" in refusal(pack_zip(files | {"a/x.png": b"1", "b/x.png": b"2"}), "t.zip")
 
 
 def test_an_obj_with_textures_in_a_folder_of_their_own_keeps_its_folders() -> None:

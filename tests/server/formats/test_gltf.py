@@ -171,6 +171,15 @@ def test_texture_coordinates_are_moved_by_khr_texture_transform() -> None:
     np.testing.assert_allclose(part.uvs[part.faces].reshape(-1, 2), np.stack([v + 0.5, 1 + u], axis=1), atol=1e-6)
 
 
+def test_maps_in_one_place_may_say_so_in_different_ways() -> None:
+    scene = textured()
+    material, shift = scene.document["materials"][0], {"offset": [0.5, 0.0]}
+    info = material["pbrMetallicRoughness"]["baseColorTexture"]
+    info["extensions"] = {"KHR_texture_transform": shift | {"texCoord": 0}}
+    material["normalTexture"] = {"index": 0, "extensions": {"KHR_texture_transform": shift}}
+    assert read(scene).parts[0].uvs[:, 0].max() == 1.5
+
+
 def test_the_set_of_texture_coordinates_that_the_material_names_is_read() -> None:
     scene = Scene()
     material = scene.material(scene.texture(GRADIENT))
@@ -269,6 +278,12 @@ def test_what_cannot_be_shown_is_refused_with_a_reason() -> None:
     shade = both.accessor(np.full((4, 3), 0.5, "<f4"))
     both.square(both.material(both.texture(GRADIENT)), COLOR_0=shade)
     assert "bake" in refusal(both.to_glb(), "scene.glb")
+
+    for mode in ("BLEND", "MASK"):
+        faded = Scene()
+        alpha = faded.accessor(np.array([[1, 1, 1, a] for a in (1, 1, 0, 1)], "<f4"))
+        faded.square(faded.material(faded.texture(GRADIENT), alphaMode=mode), COLOR_0=alpha)
+        assert "vertex colours with alpha" in refusal(faded.to_glb(), "scene.glb")
 
     older = textured(extensions={"KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": {"index": 0}}})
     del older.document["materials"][0]["pbrMetallicRoughness"]
