@@ -12,7 +12,6 @@ from urllib.parse import unquote
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import PICTURE_SUFFIXES, base_name, named, pack_zip, spelling
 
-
 _FLAT: Final = (".obj", ".mtl", ".json", *PICTURE_SUFFIXES)
 """Endings of files that are read by their name without folders."""
 
