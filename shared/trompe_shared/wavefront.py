@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import base_name
+from trompe_shared.polygons import unfold
 
 MAX_FACES: Final = 2_000_000
 LARGEST: Final = 1e6
@@ -82,6 +83,8 @@ class _Reader:
         self.numbers = {kind: array("d") for kind in _WIDTHS}
         self.colours = array("d")
         self.corners: dict[str, array[int]] = {}
+        self.fans: dict[str, array[int]] = {}
+        """The first triangle and the number of triangles of each larger polygon of a material."""
         self.material = NO_MATERIAL
         self._triangles = 0
 
@@ -118,6 +121,8 @@ class _Reader:
             if self._triangles > MAX_FACES:
                 raise ObjectError(f"{self.file!r} has more than {MAX_FACES} triangles; simplify the mesh.")
             triangles = self.corners.setdefault(self.material, array("q"))
+            if len(ring) > 3:
+                self.fans.setdefault(self.material, array("q")).extend((len(triangles) // 9, len(ring) - 2))
             for k in range(1, len(ring) - 1):
                 triangles.extend(ring[0] + ring[k] + ring[k + 1])
         elif words[0] in self.numbers:
@@ -155,7 +160,7 @@ def _number(line: re.Match[str]) -> int:
 
 
 def parse_obj(text: str, file: str) -> tuple[Part, ...]:
-    """The parts of an OBJ text, one per material, in the order of first use. Polygons are split into fans.
+    """The parts of an OBJ text, one per material, in the order of first use. Polygons are split into triangles.
 
     Raises ``ObjectError`` for an unreadable line, and for a mesh without triangles, without UVs or with absurd numbers.
     """
@@ -192,7 +197,10 @@ def parse_surfaces(text: str, file: str) -> tuple[Surface, ...]:
             )
     if "colour" in arrays:
         arrays["colour"] = in_unit(arrays["colour"])
-    return tuple(_surface(material, corners, arrays) for material, corners in reader.corners.items())
+    return tuple(
+        _surface(material, corners, reader.fans.get(material, array("q")), arrays)
+        for material, corners in reader.corners.items()
+    )
 
 
 def in_unit(colours: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -204,8 +212,12 @@ def _rows(values: "array[float] | array[int]", width: int) -> NDArray[Any]:
     return np.array(values).reshape(-1, width)
 
 
-def _surface(material: str, corners: "array[int]", arrays: dict[str, NDArray[np.float32]]) -> Surface:
-    unique, inverse = np.unique(_rows(corners, 3), axis=0, return_inverse=True)
+def _surface(
+    material: str, corners: "array[int]", fans: "array[int]", arrays: dict[str, NDArray[np.float32]]
+) -> Surface:
+    rows = _rows(corners, 3)
+    unfold(rows.reshape(-1, 3, 3), arrays["v"], _rows(fans, 2))
+    unique, inverse = np.unique(rows, axis=0, return_inverse=True)
     faces = inverse.reshape(-1, 3).astype(np.int32)
     vertex, texture, given = unique.T
     smooth = smooth_normals(arrays["v"], vertex, faces)

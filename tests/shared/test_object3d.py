@@ -213,6 +213,39 @@ def test_polygons_are_split_into_fans() -> None:
     assert corners[1:, :, :2].tolist() == np.array(fan, float).tolist()
 
 
+STAR = [(float(np.cos(k * np.pi / 5)) * (1 + k % 2), float(np.sin(k * np.pi / 5)) * (1 + k % 2)) for k in range(10)]
+
+
+@pytest.mark.parametrize(
+    "outline",
+    [
+        pytest.param([(0, 0), (2, 2), (0, 1), (-2, 2)], id="an arrow head"),
+        pytest.param([(2, 2), (0, 1), (-2, 2), (0, 0)], id="an arrow head from another corner"),
+        pytest.param([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], id="an L"),
+        pytest.param([(0, 0), (1, 0), (2, 0), (2, 1), (1, 0.2), (0, 1)], id="corners on a line"),
+        pytest.param([(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 3), (3, 3), (3, 1), (1, 1)], id="a hole"),
+        pytest.param(STAR, id="a star"),
+    ],
+)
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_triangles_of_a_concave_polygon_cover_it_once(outline: list[tuple[float, float]], mirror: int) -> None:
+    mesh = "".join(f"v {x} {mirror * y} {x - y}\nvt {x} {y}\n" for x, y in outline)
+    mesh += "f " + " ".join(f"{k}/{k}" for k in range(1, len(outline) + 1))
+    corners, normals = only_part(mesh)
+    x, y = np.array(outline).T
+    areas = mirror * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2]
+    assert areas.min() >= -1e-6
+    assert areas.sum() == pytest.approx((x * np.roll(y, -1) - y * np.roll(x, -1)).sum(), rel=1e-5)
+    assert (mirror * normals[..., 2] > 0).all()
+
+
+def test_a_concave_polygon_with_too_many_corners_is_refused() -> None:
+    ring = [(np.cos(k / 200) * (1 + k % 2), np.sin(k / 200) * (1 + k % 2)) for k in range(1200)]
+    mesh = "".join(f"v {x} {y} 0\nvt 0 0\n" for x, y in ring)
+    with pytest.raises(ObjectError, match="concave polygon with 1200 corners; at most 1000"):
+        parse_obj(mesh + "f " + " ".join(f"{k}/{k}" for k in range(1, 1201)), "thing.obj")
+
+
 def test_negative_indices_count_from_the_last_statement() -> None:
     relative = MESH.replace("f 1/1 2/2 3/3", "f -3/-3 -2/-2 -1/-1")
     mesh = relative + "v 5 5 5\nvt 1 1\nf -1/-1 -2/2 -3/-4\n"

@@ -314,7 +314,7 @@ def test_an_fbx_stands_upright_whatever_its_axes(kind: str, tmp_path: Path) -> N
         for name, value in axes.items():
             head = rb'"%s"(?:[^,]*,){4}|\0%s(?:S.\0\0\0\w*){3}I' % (name.encode(), name.encode())
             new = str(value).encode() if kind == "fbxa" else struct.pack("<i", value)
-            changed = re.sub(rb"(?s)(%s)(?:-?\d|.{4})" % head, lambda found, new=new: found[1] + new, changed)
+            changed = re.sub(rb"(?s)(%s)(?:-?\d|.{4})" % head, rb"\g<1>" + new, changed)
         return corners(read_object(changed, name="t.fbx").obj)
 
     x, y, z = np.moveaxis(turned({}), -1, 0)
