@@ -41,13 +41,14 @@ TYPES: Final = {"char": "i1", "uchar": "u1", "int": "i4", "uint": "u4", "float":
 @dataclass(frozen=True)
 class _Header:
     """size: bytes in the file. textures: their file names. corner_uvs: whether faces list the coordinates of their
-    corners."""
+    corners. face_colours: whether faces have colours."""
 
     text: bytes
     size: int
     rows: int
     textures: tuple[str, ...]
     corner_uvs: bool
+    face_colours: bool
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
@@ -75,6 +76,11 @@ def _read(upload: Upload) -> tuple[Object3D, str | None]:
     header = _header(upload.data)
     surface = _surface(upload.data, header)
     if not header.textures or surface.uvs is None:
+        if surface.colours is None and header.face_colours:
+            raise ObjectError(
+                "The PLY has colours of faces, which are not supported; turn them into colours of vertices and save it "
+                "again."
+            )
         return painted_object(upload.stem, surface, DEFAULT_COLOUR if surface.colours is None else WHITE), None
     if len(header.textures) > 1:
         raise ObjectError(
@@ -101,7 +107,8 @@ def _header(data: bytes) -> _Header:
         raise ObjectError(f"The PLY file ends too early: its header announces {rows} rows; save it again.")
     names = dict.fromkeys(re.findall(rb"^comment TextureFile +(.+?)\s*$", text, re.MULTILINE))
     textures = tuple(name.decode("utf-8", "replace") for name in names)
-    return _Header(text, found.end(), rows, textures, b" texcoord" in text)
+    coloured = any(element[1] == b"face" and b" red\n" in element[3] for element in ELEMENT.finditer(text))
+    return _Header(text, found.end(), rows, textures, b" texcoord" in text, coloured)
 
 
 def _lines(rows: bytes) -> list[bytes]:

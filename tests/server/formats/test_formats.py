@@ -408,6 +408,15 @@ def test_a_ply_with_two_textures_is_refused() -> None:
     assert "2 textures, a.png, b.png; one is supported" in refusal(mesh, "t.ply")
 
 
+def test_a_ply_with_colours_of_faces_alone_is_refused() -> None:
+    mesh = ply("0 0 0, 1 0 0, 1 1 0", "3 0 1 2 9 9 9")
+    rgb = b"".join(b"property uchar %s\n" % name for name in (b"red", b"green", b"blue"))
+    coloured = mesh.replace(b"vertex_indices\n", b"vertex_indices\n" + rgb)
+    assert "colours of faces" in refusal(coloured, "t.ply")
+    both = re.sub(rb"\n(\d \d 0)", rb"\n\1 7 7 7", coloured).replace(b"element face", rgb + b"element face")
+    assert (read_object(both, name="t.ply").obj.textures["t_albedo.png"] == 7).all()
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [pytest.param(b"\n", end, id=repr(end)) for end in (b"\r", b"\r\n")]
