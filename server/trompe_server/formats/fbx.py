@@ -10,7 +10,7 @@ import shutil
 import struct
 import subprocess
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -108,6 +108,7 @@ def read(upload: Upload) -> Object3D:
     beside = {name: data for name, data in upload.flat().items() if not name.lower().endswith((".obj", ".mtl"))}
     inside = tree.pictures() if tree is not None else {}
     converted = _converted(_plain(upload.data, tree, inside))
+    _refuse_equal_names(converted)
     obj = object_from_files(dissolved(complete({**beside, **inside, **converted})))
     mirrored = np.linalg.det(np.eye(3)[axes] * signs) < 0
     parts = [
@@ -121,6 +122,18 @@ def read(upload: Upload) -> Object3D:
     ]
     images = {name: obj.files[name] for m in obj.materials.values() for name in (m.albedo, m.normal) if name}
     return assemble(safe_name(upload.stem), parts, obj.materials, images)
+
+
+def _refuse_equal_names(converted: Mapping[str, bytes]) -> None:
+    """Raise ``ObjectError`` for two materials of one name, which an OBJ cannot tell apart."""
+    found: dict[bytes, bytes] = {}
+    for library in (data for name, data in converted.items() if name.endswith(".mtl")):
+        for name, _, definition in (entry.partition(b"\n") for entry in library.split(b"newmtl ")[1:]):
+            if found.setdefault(name.strip(), definition.strip()) != definition.strip():
+                raise ObjectError(
+                    f"The FBX has two materials called {name.strip().decode(errors='replace')!r}; rename one of them "
+                    "and export it again."
+                )
 
 
 def _plain(data: bytes, tree: Tree | None, inside: Collection[str]) -> bytes:

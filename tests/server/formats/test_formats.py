@@ -270,9 +270,9 @@ def test_smaller_textures_come_back_at_their_size_and_other_maps_at_their_own(mu
 # FBX
 
 
-def fbx_of(materials: str, folder: Path, *, kind: str = "fbxa") -> bytes:
-    """An FBX of the square, as assimp writes it: in text, or in binary (``fbx``)."""
-    (folder / "t.obj").write_text(OBJ)
+def fbx_of(materials: str, folder: Path, *, kind: str = "fbxa", mesh: str = OBJ) -> bytes:
+    """An FBX of the square or another mesh, as assimp writes it: in text, or in binary (``fbx``)."""
+    (folder / "t.obj").write_text(mesh)
     (folder / "t.mtl").write_text(materials)
     subprocess.run(["assimp", "export", "t.obj", "t.fbx", f"-f{kind}"], cwd=folder, check=True, capture_output=True)
     return (folder / "t.fbx").read_bytes()
@@ -339,6 +339,14 @@ def test_the_base_colour_of_a_physical_material_in_an_fbx_is_read(name: str, kin
     assert name.encode() in data
     obj, _ = comes_back(pack_zip({"t.fbx": data, "red.png": encode_png(PICTURE)}), "t.zip")
     assert (obj.textures["red.png"] == PICTURE).all()
+
+
+@needs_assimp
+def test_two_materials_of_one_name_in_an_fbx_are_refused(tmp_path: Path) -> None:
+    data = fbx_of(MTL, tmp_path, mesh=f"{OBJ}usemtl other\nf 1/1 2/2 3/3\n")
+    assert read_object(data, name="t.fbx").obj.materials.keys() == {"red", "other"}
+    alike = data.replace(b"Material::other", b"Material::red")
+    assert "two materials called 'red'; rename one" in refusal(alike, "t.fbx")
 
 
 def test_a_texture_that_an_fbx_scales_or_moves_is_refused() -> None:
