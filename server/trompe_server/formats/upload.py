@@ -35,21 +35,19 @@ class Upload:
         return base_name(self.main).rsplit(".", 1)[0] or "object"
 
     def beside(self, uri: str) -> str:
-        """The path of a relative URI in the mesh file, in other capitals or folders if only such a file is there.
+        """The path of a URI in the mesh file, in other capitals or folders if only such a file is there.
 
-        Raises ``ObjectError`` for a URI outside the mesh's folder.
+        Programs write paths of the machine they ran on. Raises ``ObjectError`` for a file that the upload lacks.
         """
         path = posixpath.normpath(posixpath.join(posixpath.dirname(self.main), unquote(uri).replace("\\", "/")))
+        found = named(path, self.files) or self._elsewhere(base_name(path))
+        if found is not None:
+            return found
         if ":" in uri or path.startswith(("/", "..")):
             raise ObjectError(
                 f"{self.main!r} names {uri[:80]!r}; only files below its own folder are read. Put the file there."
             )
-        found = named(path, self.files) or self._elsewhere(base_name(path))
-        if found is None:
-            raise ObjectError(
-                f"{self.main!r} names {uri[:80]!r}, which is missing; zip the model together with its files."
-            )
-        return found
+        raise ObjectError(f"{self.main!r} names {uri[:80]!r}, which is missing; zip the model together with its files.")
 
     def _elsewhere(self, name: str) -> str | None:
         """The only file of a name in any folder."""

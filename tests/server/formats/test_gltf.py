@@ -508,6 +508,17 @@ def external(ending: str = "png") -> dict[str, bytes]:
     }
 
 
+@pytest.mark.parametrize(
+    "uri", ["C:\\\\scans\\\\skin.png", "file:///home/me/skin.png", "/home/me/skin.png", "../skin.png"]
+)
+def test_a_picture_is_found_by_its_name_if_its_path_is_of_another_machine(uri: str) -> None:
+    files = external()
+    files["square.gltf"] = files["square.gltf"].replace(b"my%20maps/skin.png", uri.encode())
+    obj = read_object(pack_zip(files), name="square.zip").obj
+    out = unpack(repaint_file(pack_zip(files), painted(obj), name="square.zip").data)
+    assert [name for name in files if files[name] != out[name]] == ["my maps/skin.png"]
+
+
 @pytest.mark.parametrize("picture", ["my maps/skin.png", "My Maps/SKIN.png", "Skin.png", "other/skin.png"])
 def test_of_a_folder_only_the_picture_changes_whatever_its_capitals_and_place(picture: str) -> None:
     files = external()
