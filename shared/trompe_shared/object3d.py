@@ -180,7 +180,12 @@ def open_image(data: bytes, name: str) -> Iterator[Image.Image]:
             yield image
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise ObjectError(f"Texture {name!r} is too large ({error}); {MAX_TEXTURE_SIDE} a side are read.") from error
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, struct.error) as error:
+    except UnidentifiedImageError as error:
+        raise ObjectError(
+            f"Texture {name!r} cannot be read as an image (it is none of {', '.join(IMAGE_FORMATS)}). Save it again as "
+            "a PNG."
+        ) from error
+    except (OSError, ValueError, SyntaxError, struct.error) as error:
         raise ObjectError(f"Texture {name!r} cannot be read as an image ({error}). Save it again as a PNG.") from error
 
 

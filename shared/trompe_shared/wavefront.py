@@ -189,9 +189,11 @@ def parse_surfaces(text: str, file: str) -> tuple[Surface, ...]:
     with np.errstate(over="ignore"):  # infinite in single precision is refused below
         arrays = {kind: _rows(values, _WIDTHS.get(kind, 3)).astype(np.float32) for kind, values in numbers.items()}
     for kind, values in arrays.items():
+        if kind == "vn":
+            continue  # triangles without area have any normals
         if not np.isfinite(values).all():
             raise ObjectError(f"{file!r} has a {kind!r} statement with a number that is not finite.")
-        if kind != "vn" and values.size and np.abs(values).max() > LARGEST:
+        if values.size and np.abs(values).max() > LARGEST:
             raise ObjectError(
                 f"{file!r} has a {kind!r} statement with a number beyond {LARGEST:g}; positions are metres."
             )
@@ -244,7 +246,8 @@ def smooth_normals(
 
 def _normalised(vectors: NDArray[np.floating], *, fallback: NDArray[np.floating]) -> NDArray[np.float32]:
     lengths = np.linalg.norm(vectors.astype(np.float64), axis=1, keepdims=True)
-    return np.where(lengths > 1e-12, vectors / np.maximum(lengths, 1e-12), fallback).astype(np.float32)
+    sound = (lengths > 1e-12) & np.isfinite(lengths)
+    return np.where(sound, vectors / np.where(sound, lengths, 1), fallback).astype(np.float32)
 
 
 def obj_text(parts: tuple[Part, ...], *, libraries: Iterable[str] = ()) -> str:

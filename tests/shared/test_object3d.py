@@ -256,8 +256,9 @@ def test_negative_indices_count_from_the_last_statement() -> None:
 
 def test_given_normals_are_made_unit_and_missing_ones_computed() -> None:
     given = MESH.replace("f 1/1 2/2 3/3", "vn 0 3 4\nvn 0 0 0\nf 1/1/1 2/2/1 3/3/2")
-    normals = only_part(given)[1][0]
-    np.testing.assert_allclose(normals, np.array([[0, 0.6, 0.8], [0, 0.6, 0.8], [0, 0, 1]]), atol=1e-6)
+    for missing in ("0 0 0", "nan nan nan", "0 inf 0"):
+        normals = only_part(given.replace("vn 0 0 0", f"vn {missing}"))[1][0]
+        np.testing.assert_allclose(normals, np.array([[0, 0.6, 0.8], [0, 0.6, 0.8], [0, 0, 1]]), atol=1e-6)
     assert (only_part(MESH)[1] == [0, 0, 1]).all()
 
 
