@@ -23,7 +23,7 @@ from trompe_server.formats.assembly import (
 )
 from trompe_server.formats.upload import Upload, refusing
 from trompe_shared.errors import ObjectError
-from trompe_shared.local_files import base_name
+from trompe_shared.local_files import PICTURE_SUFFIXES, base_name
 from trompe_shared.object3d import Material, Object3D, decode_alpha, encode_png, with_alpha_of
 from trompe_shared.wavefront import MAX_FACES, Part, Surface, in_unit, smooth_normals
 
@@ -76,11 +76,8 @@ def _read(upload: Upload) -> tuple[Object3D, str | None]:
     header = _header(upload.data)
     surface = _surface(upload.data, header)
     if not header.textures or surface.uvs is None:
-        if surface.colours is None and header.face_colours:
-            raise ObjectError(
-                "The PLY has colours of faces, which are not supported; turn them into colours of vertices and save it "
-                "again."
-            )
+        if surface.colours is None:
+            _refuse_unread(upload, header, surface)
         return painted_object(upload.stem, surface, DEFAULT_COLOUR if surface.colours is None else WHITE), None
     if len(header.textures) > 1:
         raise ObjectError(
@@ -94,6 +91,20 @@ def _read(upload: Upload) -> tuple[Object3D, str | None]:
     return assemble(safe_name(upload.stem), [part], materials, {file: upload.files[path]}), path
 
 
+def _refuse_unread(upload: Upload, header: _Header, surface: Surface) -> None:
+    """Raise ``ObjectError`` for colours that an object without colours of vertices would lack."""
+    if header.face_colours:
+        raise ObjectError(
+            "The PLY has colours of faces, which are not supported; make them colours of vertices and save it again."
+        )
+    pictures = sorted(name for name in upload.files if name.lower().endswith(tuple(PICTURE_SUFFIXES)))
+    if pictures and not header.textures and (surface.uvs is not None or header.corner_uvs):
+        raise ObjectError(
+            f"The PLY has texture coordinates, but does not say what {pictures[:4]} is for. Add the line "
+            "'comment TextureFile NAME' to its header, or leave the pictures away for a plain object."
+        )
+
+
 def _header(data: bytes) -> _Header:
     """Facts of the header that trimesh does not check or tell. Raises ``ObjectError``."""
     found = HEADER.match(data[:MAX_HEADER])
@@ -105,7 +116,7 @@ def _header(data: bytes) -> _Header:
         raise ObjectError(f"The PLY's header announces {rows} rows; at most {3 * MAX_FACES} are read.")
     if b"format ascii" in text and len(_lines(data[found.end() :])) < rows:
         raise ObjectError(f"The PLY file ends too early: its header announces {rows} rows; save it again.")
-    names = dict.fromkeys(re.findall(rb"^comment TextureFile +(.+?)\s*$", text, re.MULTILINE))
+    names = dict.fromkeys(re.findall(rb"^comment TextureFile +(.+?)\s*$", text, re.MULTILINE | re.IGNORECASE))
     textures = tuple(name.decode("utf-8", "replace") for name in names)
     coloured = any(element[1] == b"face" and b" red\n" in element[3] for element in ELEMENT.finditer(text))
     return _Header(text, found.end(), rows, textures, b" texcoord" in text, coloured)

@@ -416,6 +416,16 @@ def test_a_ply_with_two_textures_is_refused() -> None:
     assert "2 textures, a.png, b.png; one is supported" in refusal(mesh, "t.ply")
 
 
+def test_a_ply_that_names_none_of_the_pictures_beside_it_is_refused() -> None:
+    mesh = ply("0 0 0 0 0, 1 0 0 1 0, 1 1 0 1 1", "3 0 1 2", columns="s t")
+    for each in (mesh, ply(SQUARE, "3 0 1 2 6 0 0 1 0 1 1, 3 0 2 3 6 0 0 1 1 0 1", corners="texcoord")):
+        assert "does not say what ['t.png'] is for" in refusal(pack_zip({"t.ply": each, "t.png": b""}), "t.zip")
+    assert (read_object(mesh, name="t.ply").obj.textures["t_albedo.png"] == 204).all()
+    named = mesh.replace(b"comment", b"comment texturefile t.png")
+    obj, _ = comes_back(pack_zip({"t.ply": named, "t.png": encode_png(PICTURE)}), "t.zip")
+    assert (obj.textures["t.png"] == PICTURE).all()
+
+
 def test_a_ply_with_colours_of_faces_alone_is_refused() -> None:
     mesh = ply("0 0 0, 1 0 0, 1 1 0", "3 0 1 2 9 9 9")
     rgb = b"".join(b"property uchar %s\n" % name for name in (b"red", b"green", b"blue"))
