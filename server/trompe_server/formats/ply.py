@@ -25,6 +25,7 @@ from trompe_server.formats.upload import Upload, refusing
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import PICTURE_SUFFIXES, base_name
 from trompe_shared.object3d import Material, Object3D, decode_alpha, encode_png, with_alpha_of
+from trompe_shared.polygons import unfold
 from trompe_shared.wavefront import MAX_FACES, Part, Surface, in_unit, smooth_normals
 
 MATERIAL: Final = "surface"
@@ -126,14 +127,17 @@ def _lines(rows: bytes) -> list[bytes]:
     return [line for line in rows.splitlines() if line.strip()]
 
 
-def _regular(data: bytes, header: _Header) -> bytes:
-    """``data`` as trimesh reads it: nothing after the last row, polygons of one size in a binary file."""
+def _regular(data: bytes, header: _Header) -> tuple[bytes, list[NDArray[Any]]]:
+    """``data`` as trimesh reads it: nothing after the last row, polygons of one size in a binary file; its polygons."""
     text, position, body = header.text, header.size, []
     if b"format ascii" in text:
-        return text + b"\n".join(_lines(data[position:])[: header.rows])
+        rows = _lines(data[position:])[: header.rows]
+        return text + b"\n".join(rows), _polygons_of_text(rows, text)
+    found: list[NDArray[Any]] = []
     order = ">" if b"format binary_big_endian" in text else "<"
     for element in ELEMENT.finditer(header.text):
         polygons, end = _polygons(data, position, element, order)
+        found += polygons
         if len({len(polygon) for polygon in polygons}) > 1:
             if header.corner_uvs and header.textures:
                 raise ObjectError(f"The PLY has texture coordinates of polygons of different sizes. {REMEDY}")
@@ -144,7 +148,18 @@ def _regular(data: bytes, header: _Header) -> bytes:
         else:
             body.append(data[position:end])
         position = end
-    return text + b"".join(body)
+    return text + b"".join(body), found
+
+
+def _polygons_of_text(rows: list[bytes], header: bytes) -> list[NDArray[Any]]:
+    """Vertex indices of the polygons in the rows of faces that begin with them."""
+    first = 0
+    for element in ELEMENT.finditer(header):
+        some = rows[first : first + int(element[2])]
+        if re.match(rb"property +list +\w+ +\w+ +vertex_ind(ices|ex)\n", element[3]):
+            return [np.array(words[1 : 1 + int(words[0])], np.int64) for words in map(bytes.split, some)]
+        first += len(some)
+    return []
 
 
 def _polygons(data: bytes, position: int, element: re.Match[bytes], order: str) -> tuple[list[NDArray[Any]], int]:
@@ -179,15 +194,17 @@ def _surface(data: bytes, header: _Header) -> Surface:
         from trimesh.exchange.ply import load_ply  # takes a second to import
         from trimesh.geometry import triangulate_quads
 
-        loaded: dict[str, Any] = load_ply(io.BytesIO(_regular(data, header)), fix_texture=split, skip_materials=True)
+        regular, listed = _regular(data, header)
+        loaded: dict[str, Any] = load_ply(io.BytesIO(regular), fix_texture=split, skip_materials=True)
         vertices, polygons = _floats(loaded.get("vertices")), loaded.get("faces")
         if vertices is None or polygons is None or polygons.shape[1:] < (3,) or polygons.dtype.kind not in "iu":
             raise ObjectError("The PLY holds no mesh: it needs vertices with x, y, z, and faces with vertex_indices.")
         faces = triangulate_quads(polygons)
+        _check_faces(faces, len(vertices))
+        faces = faces if split else _unfolded(faces, listed, vertices)
         uvs = _floats(loaded["visual"].uv) if "visual" in loaded and (split or not header.corner_uvs) else None
         normals = None if split else _floats(loaded.get("vertex_normals"))
         colours = None if split else _colours(loaded.get("vertex_colors"))
-    _check_faces(faces, len(vertices))
     for values in (vertices, uvs):
         if values is not None:
             check_numbers(values, "The PLY")
@@ -197,6 +214,17 @@ def _surface(data: bytes, header: _Header) -> Surface:
             positions, index = np.unique(vertices, axis=0, return_inverse=True)
         normals = smooth_normals(positions, index, faces)
     return Surface(MATERIAL, vertices, normals, faces.astype(np.int32), uvs, colours)
+
+
+def _unfolded(faces: NDArray[Any], polygons: list[NDArray[Any]], vertices: NDArray[np.float32]) -> NDArray[Any]:
+    """``faces``, unless some of the ``polygons`` are concave: then all of these as triangles."""
+    sizes = np.array([len(polygon) - 2 for polygon in polygons if len(polygon) > 2])
+    if sizes.max(initial=1) == 1:
+        return faces
+    fans = np.array([(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)], np.int64)
+    triangles = fans.copy()
+    unfold(triangles[..., None], vertices, np.stack([np.cumsum(sizes) - sizes, sizes], axis=1))
+    return faces if (triangles == fans).all() else triangles
 
 
 def _floats(values: Any) -> NDArray[np.float32] | None:

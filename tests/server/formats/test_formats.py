@@ -492,15 +492,17 @@ def binary(text: bytes, order: str) -> bytes:
         pytest.param("4 0 1 2 3, 3 0 1 2, 5 0 1 4 2 3", 6, id="on average squares"),
         pytest.param("5 0 1 4 2 3", 3, id="a pentagon"),
         pytest.param("4 0 1 2 3, 4 1 4 2 3", 4, id="squares"),
+        pytest.param("4 1 2 3 5, 4 0 1 2 3", 4, id="concave"),
+        pytest.param("4 1 2 3 5, 3 0 1 3", 3, id="concave, and a triangle"),
     ],
 )
 def test_polygons_of_any_size_are_split_in_a_ply(faces: str, count: int, order: str) -> None:
-    text = ply(f"{SQUARE}, 2 0 0", faces)
+    text = ply(f"{SQUARE}, 2 0 0, 0.8 0.8 0", faces)
     found = corners(read_object(binary(text, order) if order else text + b"more\n", name="t.ply").obj)
     assert len(found) == count
     area = np.linalg.norm(np.cross(found[:, 1] - found[:, 0], found[:, 2] - found[:, 0]), axis=1).sum() / 2
     polygons = [[int(word) for word in face.split()[1:]] for face in faces.split(", ")]
-    points = np.array([*(row.split() for row in SQUARE.split(", ")), (2, 0, 0)], float)
+    points = np.array([*(row.split() for row in SQUARE.split(", ")), (2, 0, 0), (0.8, 0.8, 0)], float)
     rings = [points[polygon] for polygon in polygons]
     assert area == pytest.approx(sum(abs(np.cross(ring, np.roll(ring, -1, 0)).sum(0)[2]) / 2 for ring in rings))
 
