@@ -172,6 +172,34 @@ frozen = keeping(lambda known, now: [known.setdefault(each.model.shape, each) fo
 by_name = keeping(lambda known, now: [known.setdefault(each.model.obj.name, each) for each in now])
 
 
+def paint_by_name(engine: Engine) -> Engine:
+    """The first texture with a file name is kept for all objects."""
+    known: dict[str, Picture] = {}
+
+    def aim(world: Snapshot, *_: int) -> Snapshot:
+        def other(each: Instance) -> Instance:
+            shown = {name: known.setdefault(name, texture) for name, texture in each.model.obj.textures.items()}
+            return replace(each, model=model_of(each.model.obj.with_textures(shown)))
+
+        return replace(world, instances=tuple(map(other, world.instances)))
+
+    return Wrong(engine, aim=aim)
+
+
+def centred(world: Snapshot, *_: int) -> Snapshot:
+    def moved(each: Instance) -> Instance:
+        pose = np.eye(4)
+        pose[:3, 3] = -np.concatenate([part.vertices for part in each.model.obj.parts]).mean(axis=0)
+        return replace(each, pose=pose)
+
+    return replace(world, instances=tuple(map(moved, world.instances)))
+
+
+def between(near: float, far: float) -> Aim:
+    """Shows objects at these distances alone."""
+    return lambda world, *_: world if near < np.linalg.norm(world.camera[:3, 3]) < far else replace(world, instances=())
+
+
 def grain(sigma: float, seed: Callable[[Snapshot], int | None]) -> See:
     return lambda picture, world: picture + np.random.default_rng(seed(world)).normal(0, sigma, picture.shape)
 
@@ -268,6 +296,10 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "late": ("late texture", keeping(late)),
     "earlier objects": ("stale scene", keeping(hoarded)),
     "cached by name": ("stale object", by_name),
+    "textures cached by file name": ("stale texture", paint_by_name),
+    "centred": ("moved object", aimed(centred)),
+    "cut off at 0.2 m": ("clipped", aimed(between(0.2, 100))),
+    "cut off at 5 m": ("clipped", aimed(between(0.01, 5))),
     "light reversed": ("light reversed", lit(lambda light, _: turned(light, -np.eye(3)))),
     "light mirrored": ("light direction", lit(lambda light, _: turned(light, np.diag([-1, 1, 1])))),
     "z up": ("light direction", lit(lambda light, _: turned(light, np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])))),
@@ -276,6 +308,7 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "no light": ("light missing", lit(lambda light, _: replace(light, intensity=0.0))),
     "constant light": ("light intensity", lit(lambda light, _: replace(light, intensity=0.6))),
     "white light": ("light colour", lit(lambda light, _: replace(light, color=(255, 255, 255)))),
+    "a sky of its own": ("extra light", aimed(lambda world, *_: replace(world, ambient=(world.ambient[0] + 0.2,) * 3))),
     "no ambient light": ("ambient missing", aimed(lambda world, *_: replace(world, ambient=(0.0, 0.0, 0.0)))),
     "3 levels off": ("background", seen(on_object(lambda asked: asked + 3 * np.sign(127 - asked), background=True))),
     "background not encoded": ("background", seen(on_object(lambda asked: 255 * linear(asked), background=True))),

@@ -17,6 +17,8 @@ REMEDIES: Final[Mapping[str, str]] = {
     "background": "Fill the background with Snapshot.background, sRGB, after any tone mapping and dithering.",
     "stale scene": "Remove the objects of the last picture that are not in Snapshot.instances.",
     "stale object": "Find cached objects by HashedModel.key, not by name or number.",
+    "stale texture": "Find cached textures by HashedModel.albedos, not by file name.",
+    "moved object": "Place Snapshot.instances by their poses: do not centre or scale them. Right is +x, up is +y.",
     "mirrored": "Flip the columns: picture[:, ::-1]. Trompe's world is right-handed.",
     "upside down": "Flip the rows: picture[::-1]. OpenGL reads row 0 at the bottom.",
     "axes": "Right is +x, up is +y, and the camera looks along its own -z; convert z-up engines at the root.",
@@ -40,11 +42,13 @@ REMEDIES: Final[Mapping[str, str]] = {
     "light intensity": "Multiply the light by WorldLight.intensity (and by pi where the engine divides by it).",
     "light colour": "Multiply the light by WorldLight.color / 255, linear.",
     "ambient missing": "Add Snapshot.ambient, light from all sides, to the directional lights.",
+    "extra light": "Take all light from Snapshot.lights and Snapshot.ambient: switch off the engine's own sky and lights.",
     "frozen texture": "Read obj.textures (obj.files keeps the old paint); find cached textures by HashedModel.albedos.",
     "late texture": "Finish the upload of a texture before the picture is drawn.",
+    "clipped": "Clip nothing between 0.1 and 10 m.",
     "slow": "A job takes about 1,000 pictures: use fewer samples, or several workers.",
 }
-FINAL: Final = {"invisible", "untextured", "stale scene", "stale object", "axes"}
+FINAL: Final = {"invisible", "untextured", "stale scene", "stale object", "stale texture", "moved object", "axes"}
 """Faults after which other questions have no answer."""
 
 

@@ -51,7 +51,7 @@ class Render(Protocol):
 
 
 def check(render: Render, info: EngineInfo) -> Findings:
-    """Ask a renderer for about 25 pictures and say, question by question, whether it keeps Trompe's conventions.
+    """Ask a renderer for about 30 pictures and say, question by question, whether it keeps Trompe's conventions.
 
     ``info``: what it says of itself. After a fault that leaves other questions without an answer, these are not asked.
     """
@@ -146,7 +146,7 @@ def channels(look: _Look, _: EngineInfo) -> Findings:
         yield fault("invisible", "The picture of a ball near the origin shows nothing.")
         return
     colour = median(picture, there.mask)
-    if np.ptp(colour) < 0.15 * colour.max():
+    if not _colourful(colour):
         yield fault("untextured", f"An orange ball appears grey: {colour.round()}.")
         return
     look.channels = [int(k) for k in np.argsort(-colour, kind="stable")]
@@ -155,6 +155,10 @@ def channels(look: _Look, _: EngineInfo) -> Findings:
         yield ok("channels", "red, green, blue.")
     else:
         yield fault("channel order", f"The channels come as {order}.")
+
+
+def _colourful(colour: NDArray[np.float64]) -> bool:
+    return bool(np.ptp(colour) >= 0.15 * colour.max())
 
 
 def background(look: _Look, _: EngineInfo) -> Findings:
@@ -169,18 +173,21 @@ def background(look: _Look, _: EngineInfo) -> Findings:
 
 def objects(look: _Look, _: EngineInfo) -> Findings:
     """The orange ball, and a white one somewhere else."""
-    masks = []
-    for obj in (ORANGE, BESIDE):
-        there = blob(look.raw(obj, FRONT))
-        masks.append(np.zeros(SQUARE, bool) if there is None else there.mask)
-    before, now = masks
+    pictures = [look.raw(obj, FRONT) for obj in (ORANGE, BESIDE)]
+    blobs = map(blob, pictures)
+    before, now = (np.zeros(SQUARE, bool) if there is None else there.mask for there in blobs)
     kept = (before & now).sum() / max(int(before.sum()), 1)
-    if kept < 0.5:
-        yield ok("objects", "nothing is left of an earlier request.")
-    elif (now & ~before).sum() < 0.5 * before.sum():
-        yield fault("stale object", "A new object of the same name looks like the one before it.")
-    else:
+    orange = now.any() and _colourful(median(pictures[1], now))
+    if kept >= 0.5 and (now & ~before).sum() >= 0.5 * before.sum():
         yield fault("stale scene", "The object of an earlier request is still in the picture.")
+    elif kept >= 0.5 and orange:
+        yield fault("stale object", "A new object of the same name looks like the one before it.")
+    elif kept >= 0.5:
+        yield fault("moved object", "A ball at x = 0.32 m appears where one at x = -0.3 m did.")
+    elif orange:
+        yield fault("stale texture", "A white object has the orange texture of the one before it.")
+    else:
+        yield ok("objects", "nothing is left of an earlier request.")
 
 
 HALF: Final = 0.25
@@ -382,21 +389,25 @@ TOLERANCE: Final = 30.0
 
 
 def light(look: _Look, _: EngineInfo) -> Findings:
-    """A white ball in ambient light alone, and in directional light alone from two sides."""
-    soft = look.at(BALL, _lit(Light(intensity=0.0, ambient=0.6), SIDES[0]))
+    """A white ball in ambient light alone, in none, and in directional light alone from two sides."""
+    soft, unlit = (look.at(BALL, _lit(Light(intensity=0.0, ambient=ambient), SIDES[0])) for ambient in (0.6, 0.0))
     rows, columns = np.indices(SQUARE) + 0.5 - SQUARE[0] / 2
     x, y = (places / _pixels(BALL_RADIUS, SQUARE, 2.0) for places in (columns, -rows))
     inside = np.hypot(x, y) < 0.95
     normals = np.stack([x, y, np.sqrt(np.clip(1 - x**2 - y**2, 0, None))], axis=-1)[inside]
     if level(soft, inside) < 20:
         yield fault("ambient missing", "A white ball in ambient light alone is dark.")
+    if (seen := level(unlit, inside)) > 20:
+        look.dims = False
+        yield fault("extra light", f"A white ball without light has a brightness of {seen:.0f} of 255.")
     hard = [look.at(BALL, _lit(SUN, side)) for side in SIDES]
     if max(float(np.percentile(picture[inside], 95)) for picture in hard) < 20:
         yield fault("light missing", "A white ball in directional light alone is dark.")
         return
     guesses = [_brightest(normals, picture[inside].mean(axis=1)) for picture in hard]
     yield from _direction(guesses)
-    yield from _colour(look, hard[0], inside)
+    if look.dims:
+        yield from _colour(look, hard[0], inside)
 
 
 def _brightest(normals: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -466,6 +477,17 @@ def repaint(look: _Look, _: EngineInfo) -> Findings:
         yield fault("frozen texture", "A new texture on the same mesh does not show.")
 
 
+NEAR_AND_FAR: Final = {0.11: plate(0.03, plain(240, 240, 240)), 9.9: plate(2.7, plain(240, 240, 240))}
+"""A square at each distance."""
+
+
+def depths(look: _Look, _: EngineInfo) -> Findings:
+    """A near object and a far one."""
+    for distance, obj in NEAR_AND_FAR.items():
+        if blob(look.at(obj, _lit(LIGHT, Camera(distance, 0, 0)))) is None:
+            yield fault("clipped", f"A square {distance} m before the camera is missing.")
+
+
 def once_more(look: _Look, info: EngineInfo) -> Findings:
     """The first picture again, after all others."""
     if look.repeats and not np.array_equal(look.first, last := look.raw(ORANGE, FRONT)):
@@ -490,6 +512,7 @@ QUESTIONS: Final[tuple[Callable[[_Look, EngineInfo], Findings], ...]] = (
     lens,
     gamma,
     repaint,
+    depths,
     once_more,
     speed,
 )

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 
 import click
 
@@ -15,9 +16,18 @@ from trompe_shared.sailenv_client import SailenvTarget
 
 
 def check_engine(name: str, settings: Mapping[str, str]) -> bool:
-    """Check an engine in this process, print what is found and return whether there is no fault."""
-    engine = engine_maker(name, settings)()
-    return _report(EngineRender(engine), engine.info)
+    """Check an engine in this process, print what is found and return whether there is no fault.
+
+    It runs outside the main thread, as in a worker.
+    """
+    make = engine_maker(name, settings)
+
+    def report() -> bool:
+        engine = make()
+        return _report(EngineRender(engine), engine.info)
+
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(report).result()
 
 
 def check_at(address: str) -> bool:
