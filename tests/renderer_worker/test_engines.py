@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -22,6 +23,7 @@ from tests.served import ancestry, process_table, wait_until
 from tests.surfaces import object_of, quad
 from tests.wire import Wire, boxes, linear, on_screen, plain
 from tests.worker_process import Worker, started
+from trompe_renderer.engines.engine import draw
 from trompe_renderer.engines.loading import ENGINES, engine_maker
 from trompe_server.formats import read_object
 from trompe_server.renderers import SailenvTarget
@@ -305,6 +307,43 @@ def test_a_missing_package_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPa
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(RendererError, match=r"engine three cannot be imported.*pip install 'trompe\[three\]'"):
         engine_maker("three", {})
+
+
+def test_an_engine_may_draw_all_pictures_into_the_same_memory() -> None:
+    canvas = np.zeros((2, 3, 3), np.uint8)
+
+    def render(world: Any, **_: int) -> Picture:
+        canvas[:] = world
+        return canvas
+
+    engine: Any = SimpleNamespace(info=EngineInfo("canvas", "1"), render=render)
+    pictures = [draw(engine, level, width=3, height=2) for level in (1, 2)]  # type: ignore[arg-type]
+    assert [int(each.mean()) for each in pictures] == [1, 2]
+
+
+class NoInfo:
+    info: Any = None
+
+    def render(self) -> None: ...
+
+
+class Tuples(NoInfo):
+    info = EngineInfo("blender", (4, 2, 0))  # type: ignore[arg-type]
+
+
+class Fixed(NoInfo):
+    @property
+    def info(self) -> EngineInfo:
+        return EngineInfo("fixed", "1")
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [(NoInfo, "no attribute"), (Tuples, "version: Input should be a valid string"), (Fixed, "setter")],
+)
+def test_an_engine_without_a_usable_identity_is_refused(kind: type[NoInfo], reason: str) -> None:
+    with pytest.raises(RendererError, match=f"needs an attribute `info`.*{reason}"):
+        engine_maker(f"{__name__}:{kind.__name__}", {})()
 
 
 def test_a_picture_of_the_wrong_kind_is_refused() -> None:

@@ -253,13 +253,14 @@ class _Engine:
 
     def __init__(self) -> None:
         self.info, self.broken, self.now = ENGINE, False, 0.0
+        self.failure: type[BaseException] = RuntimeError
         self.sleep: Callable[[float], None] = time.sleep
 
     def render(self, world: Snapshot, *, width: int, height: int) -> Any:
         if world.instances:
-            raise RuntimeError("out of memory")
+            raise self.failure("out of memory")
         if self.broken:
-            raise RuntimeError("context lost")
+            raise self.failure("context lost")
         self.now += world.ambient[0]
         return np.zeros((height, width, 3), np.uint8)
 
@@ -274,8 +275,10 @@ def draw(thread: RenderThread, *, fails: bool = False, seconds: float = 0.0, age
     return thread.run(lambda engine: engine.render(world, width=4, height=4), agent=agent)
 
 
-def test_an_engine_counts_as_lost_when_not_even_an_empty_picture_can_be_drawn() -> None:
+@pytest.mark.parametrize("failure", [RuntimeError, SystemExit])
+def test_an_engine_counts_as_lost_when_not_even_an_empty_picture_can_be_drawn(failure: type[BaseException]) -> None:
     engine, lost = _Engine(), list[str]()
+    engine.failure = failure
     thread = thread_of(engine, lost=lost.append)
     for _ in range(2):
         with pytest.raises(RuntimeError, match="out of memory"):

@@ -61,9 +61,12 @@ def noise_seed(world: Snapshot) -> int:
 
 
 def draw(engine: Engine, world: Snapshot, *, width: int, height: int) -> NDArray[np.uint8]:
-    """``engine.render``. Raises ``RendererError`` if the result is not a picture of this size."""
+    """A copy of what ``engine.render`` gives: an engine may draw each picture into the same memory.
+
+    Raises ``RendererError`` if it is not a picture of this size.
+    """
     picture = engine.render(world, width=width, height=height)
     kind, shape = getattr(picture, "dtype", type(picture).__name__), getattr(picture, "shape", ())
     if kind != np.uint8 or shape != (height, width, 3):
         raise RendererError(f"The engine {engine.info.name} gave {kind} {shape}; expected uint8 {(height, width, 3)}.")
-    return picture
+    return np.array(picture, order="C")

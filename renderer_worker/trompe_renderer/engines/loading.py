@@ -12,7 +12,7 @@ import click
 
 from trompe_renderer.engines.engine import Engine
 from trompe_shared.engine import EngineInfo
-from trompe_shared.errors import RendererError
+from trompe_shared.errors import ProtocolError, RendererError
 
 ENGINES: Final[Mapping[str, tuple[str, str]]] = {
     "pyrender": ("PyrenderEngine", "pip install 'trompe[renderer]'"),
@@ -38,10 +38,13 @@ def engine_maker(name: str, settings: Mapping[str, str]) -> Callable[[], Engine]
 
     def make() -> Engine:
         engine: Engine = kind(options(**values)) if options else kind(**values)
-        info = getattr(engine, "info", None)
-        if not isinstance(info, EngineInfo):
-            raise RendererError(f"The engine {name} has no `info`, an EngineInfo (docs/engines.md).")
-        engine.info = replace(info, name=name, settings=", ".join(filter(None, [info.settings, *changed])))
+        try:
+            info = EngineInfo.from_text(engine.info.to_text())
+            engine.info = replace(info, name=name, settings=", ".join(filter(None, [info.settings, *changed])))
+        except (AttributeError, TypeError, ProtocolError) as error:
+            raise RendererError(
+                f"The engine {name} needs an attribute `info`, an EngineInfo of texts that can be replaced: {error}"
+            ) from error
         return engine
 
     return make

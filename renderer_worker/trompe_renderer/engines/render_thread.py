@@ -117,6 +117,10 @@ class RenderThread:
             return work(self._engine)
         except TrompeError:
             raise
+        except SystemExit as error:
+            failure = RuntimeError(f"the engine called sys.exit({error})")
+            self._check_engine(failure)
+            raise failure from error
         except Exception as error:
             self._check_engine(error)
             raise
@@ -127,7 +131,7 @@ class RenderThread:
         """After a failure, find its cause: the engine is lost if not even an empty picture can be drawn."""
         try:
             self._engine.render(EMPTY, width=8, height=8)
-        except Exception as second:
+        except (Exception, SystemExit) as second:
             self._lost(f"{error!r}, and then {second!r} on an empty picture")
 
     def _watch(self) -> None:

@@ -184,7 +184,7 @@ class Agent:
     def _send_picture(self, drawn: "Future[Picture]") -> bool:
         """Send the picture, or its refusal, after which nothing may follow; whether it was a picture."""
         try:
-            picture = np.ascontiguousarray(drawn.result())
+            picture = drawn.result()
         except Exception as error:
             self._link.send(encode_status(self._note("render_views", self._reason(error))))
             return False
