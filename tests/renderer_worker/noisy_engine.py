@@ -1,5 +1,8 @@
 """An engine of one's own for tests: each picture is one grey, drawn from the noise."""
 
+import os
+import subprocess
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,3 +19,12 @@ class Noisy:
     def render(self, world: Snapshot, *, width: int, height: int) -> NDArray[np.uint8]:
         grey = self._level + self._spread * np.random.default_rng(noise_seed(world)).random()
         return np.full((height, width, 3), grey, self._kind)
+
+
+class Talkative(Noisy):
+    """Prints in Latin-1, without an end of line, and starts a process that outlives it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        os.write(1, "Grün ".encode("latin-1"))
+        subprocess.Popen(["sleep", "600"])

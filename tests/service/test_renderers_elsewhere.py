@@ -1,12 +1,14 @@
 """``trompe serve`` with renderers elsewhere: it uses and lists them."""
 
+import os
+import signal
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
 
-from tests.served import Served, reserved_port
+from tests.served import Served, command_line, process_table, reserved_port, wait_until
 from tests.service.processes import listening
 from trompe_client import Client, ServerFault
 from trompe_client._core import Request
@@ -43,6 +45,20 @@ def test_one_of_them_is_enough_and_none_need_be_known(tmp_path: Path, nobody: in
     with listening() as port:
         assert supervisor(tmp_path, RendererAddresses((("127.0.0.1", nobody), ("127.0.0.1", port)))).missing() == []
     assert supervisor(tmp_path, RendererAddresses()).missing() == []
+
+
+def test_a_renderer_is_restarted_and_stopped_whatever_its_engine_prints_and_leaves_behind() -> None:
+    service = Supervisor(Settings(engine="tests.renderer_worker.noisy_engine:Talkative"), RendererAddresses())
+    with closing(service):
+        service.start()
+        (worker,) = (pid for pid in children(os.getpid()) if "render" in command_line(Path(f"/proc/{pid}")))
+        assert (helpers := children(worker))
+        os.kill(worker, signal.SIGKILL)
+        wait_until(lambda: not service.missing() and not {worker, *helpers} & process_table().keys())
+
+
+def children(process: int) -> list[int]:
+    return [pid for pid, parent in process_table().items() if parent == process]
 
 
 def test_workers_of_a_service_use_renderers_elsewhere_and_it_is_not_ready_once_all_are_away(

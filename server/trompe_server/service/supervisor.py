@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from typing import Final
+from typing import IO, Final
 
 from trompe_server.errors import ServiceError
 from trompe_server.renderers.discovery import MAX_PROBES, Address, RendererAddresses
@@ -27,6 +28,8 @@ BACKOFF: Final = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 STEADY: Final = 30.0
 """Seconds a child must run for its death not to count as early."""
 STOP_PATIENCE: Final = 10.0
+LAST_WORDS: Final = 1.0
+"""Seconds to read what an ended child has printed."""
 NICE: Final = 10
 """Added niceness of the children, so that the API answers at once while they compute on all cores."""
 GIVE_UP: Final = 3
@@ -35,8 +38,8 @@ PROBE_PATIENCE: Final = 1.0
 """Seconds a probed renderer has to answer."""
 
 
-LISTENING: Final = re.compile(r"^trompe renderer listening on \S+:(\d+)\b")
-"""The line a renderer worker prints once it is ready; its other lines are logged."""
+LISTENING: Final = re.compile(r"trompe renderer listening on \S+:(\d+)\b")
+"""Said by a renderer worker once it is ready, maybe after words of its engine; its other lines are logged."""
 
 
 class _Renderer:
@@ -92,31 +95,37 @@ class _Renderer:
             self._stopping.wait(wait)
 
     def _run_once(self) -> int:
-        """Run the process to its end, read its standard output, and return its exit status.
+        """Run the process to its end and return its exit status.
 
-        It has its own process group: Ctrl-C reaches only us, and we end it in order.
+        It has its own process group: Ctrl-C reaches only us, and we end it in order, with the processes of its engine.
         """
         place = ["--host", "127.0.0.1", "--port", str(self.port)]
         command = [sys.executable, "-m", "trompe_server.system.child", "render", *place, *self._flags]
         pipe = subprocess.PIPE
-        with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, process_group=0) as process:
-            self._process = process
-            os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + NICE)
-            if self._stopping.is_set():
-                process.terminate()
-            assert process.stdout is not None
-            for line in process.stdout:
-                self._read(line.rstrip())
-            status = process.wait()
+        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, errors="replace", process_group=0)
+        self._process = process
+        os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + NICE)
+        if self._stopping.is_set():
+            process.terminate()
+        reader = threading.Thread(target=self._read, args=(process.stdout,), daemon=True)
+        reader.start()
+        status = process.wait()
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        reader.join(LAST_WORDS)  # a process in a group of its own may still hold the output
         self._up.clear()
+        assert process.stdin is not None
+        process.stdin.close()
         return status
 
-    def _read(self, line: str) -> None:
-        if match := LISTENING.search(line):
-            self.port = int(match[1])
-            self._up.set()
-        elif line:
-            logger.info("renderer worker: %s", line)
+    def _read(self, output: IO[str]) -> None:
+        with output:
+            for line in output:
+                if match := LISTENING.search(line):
+                    self.port = int(match[1])
+                    self._up.set()
+                elif words := line.strip():
+                    logger.info("renderer worker: %s", words)
 
 
 class Supervisor:

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import closing, suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -131,12 +132,20 @@ def test_a_local_renderer_renders_and_ends_with_its_block() -> None:
     assert engine_at(*address, timeout=5) is None
 
 
-def test_a_local_renderer_may_say_other_things_before_its_address() -> None:
+def test_a_local_renderer_may_say_other_things_before_its_address_and_after(tmp_path: Path) -> None:
     with answering_once(pretend(frame(BLACK))) as (host, port):
-        says = f"print('an engine that says hello'); print('listening on {host}:{port}', flush=True); input()"
-        with local_renderer([sys.executable, "-c", says]) as target:
+        lines = (
+            "import os, pathlib, sys",
+            "os.write(1, b'Gr\\xfcn, ')",
+            f"print('listening on {host}:{port}', flush=True)",
+            "print('x' * 2**20, flush=True)",
+            "pathlib.Path(sys.argv[1]).touch()",
+            "input()",
+        )
+        with local_renderer([sys.executable, "-c", "\n".join(lines), str(tmp_path / "said")]) as target:
             assert target.address == (host, port)
             assert (target.render(triangle(), [VIEW], size=(8, 8)) == 0).all()
+            wait_until((tmp_path / "said").exists)
 
 
 def test_a_local_renderer_ends_when_its_parent_is_killed() -> None:
