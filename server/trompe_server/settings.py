@@ -74,7 +74,10 @@ class Settings(BaseSettings):
     @property
     def database_url(self) -> str:
         """URL of the database of jobs, events, workers and tokens."""
-        return self.database or f"sqlite:///{self.data.absolute() / 'trompe.sqlite'}"
+        from sqlalchemy import URL  # late: commands read settings at their start
+
+        file = str(self.data.absolute() / "trompe.sqlite")
+        return self.database or URL.create("sqlite", database=file).render_as_string()
 
     @property
     def store_url(self) -> str:

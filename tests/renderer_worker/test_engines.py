@@ -312,7 +312,7 @@ def test_a_missing_package_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPa
 def test_an_engine_may_draw_all_pictures_into_the_same_memory() -> None:
     canvas = np.zeros((2, 3, 3), np.uint8)
 
-    def render(world: Any, **_: int) -> Picture:
+    def render(world: Any, **_: int) -> NDArray[np.uint8]:
         canvas[:] = world
         return canvas
 

@@ -52,7 +52,8 @@ def test_a_renderer_is_restarted_and_stopped_whatever_its_engine_prints_and_leav
     with closing(service):
         service.start()
         (worker,) = (pid for pid in children(os.getpid()) if "render" in command_line(Path(f"/proc/{pid}")))
-        assert (helpers := children(worker))
+        helpers = children(worker)
+        assert helpers
         os.kill(worker, signal.SIGKILL)
         wait_until(lambda: not service.missing() and not {worker, *helpers} & process_table().keys())
 

@@ -21,6 +21,8 @@ from trompe_server.library import Library
 from trompe_server.queue import retention
 from trompe_server.queue.retention import Retention, delete_job
 from trompe_server.queue.store import JobStore
+from trompe_server.service.dispatch import prepare_data
+from trompe_server.settings import Settings
 from trompe_server.storage.database import connect
 from trompe_server.storage.folders import Folder, JobArtifacts, LocalArtifacts, job_artifacts, open_folder
 from trompe_server.system.files import exclusive
@@ -306,3 +308,9 @@ def test_a_database_url_that_cannot_be_used_is_quoted_without_its_password() -> 
     with pytest.raises(ServiceError, match=r"mysql://me:\*\*\*@host/jobs") as caught:
         connect("mysql://me:geheim@host/jobs")
     assert "geheim" not in str(caught.value)
+
+
+def test_the_database_is_in_the_data_folder_whatever_that_is_called(tmp_path: Path) -> None:
+    data = tmp_path / "100%20 Größe? a=b&c #1"
+    prepare_data(Settings(data=data))
+    assert [each.name for each in data.iterdir()] == ["trompe.sqlite"]
