@@ -8,6 +8,10 @@ def host_and_port(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 65535:
         raise ValueError(f"{text!r} is not HOST:PORT, e.g. 127.0.0.1:8085")
+    try:
+        host.encode("idna")
+    except UnicodeError as error:
+        raise ValueError(f"{text!r} is not HOST:PORT: {host!r} cannot be a host's name") from error
     return host.strip("[]"), int(port)
 
 

@@ -42,7 +42,7 @@ def run(command: click.Command, *arguments: str) -> tuple[int, str]:
         ),
         *(
             pytest.param(commands.worker, ["--renderer", wrong], 2, "is not HOST:PORT", id=f"address {wrong!r}")
-            for wrong in ("8085", "host:", ":80x", "")
+            for wrong in ("8085", "host:", ":80x", "", "a..b:80")
         ),
         *(
             pytest.param(commands.migrate, ["--database", url], 1, "is not a supported database URL", id=url)
