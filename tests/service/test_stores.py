@@ -23,7 +23,7 @@ from trompe_server.queue.retention import Retention, delete_job
 from trompe_server.queue.store import JobStore
 from trompe_server.service.dispatch import prepare_data
 from trompe_server.settings import Settings
-from trompe_server.storage.database import connect
+from trompe_server.storage.database import DatabaseDownError, connect
 from trompe_server.storage.folders import Folder, JobArtifacts, LocalArtifacts, job_artifacts, open_folder
 from trompe_server.system.files import exclusive
 from trompe_shared.api import JobState
@@ -314,3 +314,9 @@ def test_the_database_is_in_the_data_folder_whatever_that_is_called(tmp_path: Pa
     data = tmp_path / "100%20 Größe? a=b&c #1"
     prepare_data(Settings(data=data))
     assert [each.name for each in data.iterdir()] == ["trompe.sqlite"]
+
+
+def test_a_damaged_database_is_not_available(tmp_path: Path) -> None:
+    (tmp_path / "trompe.sqlite").write_bytes(bytes(range(256)) * 100)
+    with pytest.raises(DatabaseDownError, match="file is not a database"):
+        JobStore(Settings(data=tmp_path).database_url).counts()

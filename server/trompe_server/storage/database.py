@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import sqlalchemy as sa
 from sqlalchemy.engine.interfaces import ExceptionContext
-from sqlalchemy.exc import ArgumentError, DataError, InterfaceError, OperationalError
+from sqlalchemy.exc import ArgumentError, DatabaseError, DataError, InterfaceError, OperationalError
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 
@@ -97,7 +97,8 @@ def _translate(context: ExceptionContext) -> BaseException | None:
     if context.is_pre_ping:
         return None  # the pool replaces a broken connection
     words = (str(context.original_exception).strip().splitlines() or [type(context.original_exception).__name__])[0]
-    if context.is_disconnect or isinstance(error, (OperationalError, InterfaceError)):
+    damaged = type(error) is DatabaseError  # SQLite's file; its subclasses mean other things
+    if damaged or context.is_disconnect or isinstance(error, (OperationalError, InterfaceError)):
         return DatabaseDownError(f"The database is not available ({words}).")
     if isinstance(error, DataError):
         return SpecError(f"The database cannot hold such a value ({words}); use text without NUL characters.")
