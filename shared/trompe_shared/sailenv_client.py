@@ -121,7 +121,7 @@ class SailenvTarget:
         if size not in self._connections:
             self._connections[size] = _Connection(self._host, self._port, size, self._timeout)
             if self._aborted:
-                raise RendererLostError("it was aborted.")
+                raise RendererLostError("it was given up.")
             self._connections[size].register()
             found = self._connections[size].engine
             self._engine = self._engine or found
@@ -138,6 +138,8 @@ class SailenvTarget:
         """The error to raise instead, with the renderer's address and a remedy."""
         where = f"{self._host}:{self._port}"
         remedy = f"Start one with `trompe render --host {self._host} --port {self._port}`, or give another address."
+        if self._aborted:
+            return RendererLostError(f"The renderer at {where} was given up: it did not answer.")
         if isinstance(error, RendererError):
             return type(error)(f"Renderer at {where}: {error}")
         if isinstance(error, ProtocolError):
