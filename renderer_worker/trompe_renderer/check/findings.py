@@ -30,6 +30,7 @@ REMEDIES: Final[Mapping[str, str]] = {
     "aspect": "Set the camera's aspect to width / height for each picture, and keep the vertical field of view.",
     "sheared": "Read the rows without padding: in OpenGL glPixelStorei(GL_PACK_ALIGNMENT, 1).",
     "shifted": "Centre the picture on the camera's axis; pixel (0, 0) covers [0, 1] x [0, 1].",
+    "overexposed": "Light of intensity 1 makes a white surface that faces it just white: lower lights or exposure.",
     "gamma missing": "Encode the picture: linear light to sRGB.",
     "gamma twice": "Encode the picture once: turn off either the engine's sRGB output or your own encoding.",
     "texture not decoded": "Mark the albedo texture as sRGB, so that the engine decodes it to linear light.",
@@ -48,7 +49,16 @@ REMEDIES: Final[Mapping[str, str]] = {
     "clipped": "Clip nothing between 0.1 and 10 m.",
     "slow": "A job takes about 1,000 pictures: use fewer samples, or several workers.",
 }
-FINAL: Final = {"invisible", "untextured", "stale scene", "stale object", "stale texture", "moved object", "axes"}
+FINAL: Final = {
+    "invisible",
+    "untextured",
+    "stale scene",
+    "stale object",
+    "stale texture",
+    "moved object",
+    "axes",
+    "overexposed",
+}
 """Faults after which other questions have no answer."""
 
 

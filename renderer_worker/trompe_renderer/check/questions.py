@@ -304,8 +304,11 @@ def lens(look: _Look, _: EngineInfo) -> Findings:
     """A disc in pictures of three shapes; in the square one before black and white, whose edges bias oppositely."""
     black = {name: _ellipse(look, FRONT, size) for name, size in LENS.items()}
     white = _ellipse(look, replace(FRONT, background=(255, 255, 255)), LENS["square"])
-    if white is None or None in black.values():
+    if None in black.values():
         yield fault("invisible", "A disc at the origin is missing in some of the pictures.")
+        return
+    if white is None:
+        yield fault("overexposed", "A light grey disc in moderate light is white.")
         return
     shots = {name: shot for name, shot in black.items() if shot}
     square = shots["square"]
