@@ -292,6 +292,7 @@ def test_the_documented_engine_runs(tmp_path: Path) -> None:
         pytest.param("pyrender", {"msaa": "0"}, "--set msaa: 0 is not in the range", id="out of range"),
         pytest.param("pyrender", {"shadows": "perhaps"}, "--set shadows: 'perhaps' is not", id="no boolean"),
         pytest.param(OWN, {"level": "much"}, r"--set level: 'much'.*spread \(float, default 50", id="by keyword"),
+        pytest.param(f"{__name__}:Unknown", {}, "types of Unknown are unknown.*'Later'", id="a type without an import"),
         pytest.param("mitsuba", {"filter": "sinc"}, "--set filter: 'sinc' is not one of 'gaussian'", id="a choice"),
     ],
 )
@@ -335,6 +336,10 @@ class Fixed(NoInfo):
     @property
     def info(self) -> EngineInfo:
         return EngineInfo("fixed", "1")
+
+
+class Unknown(NoInfo):
+    def __init__(self, size: "Later" = 2) -> None: ...  # type: ignore[name-defined]  # noqa: F821
 
 
 @pytest.mark.parametrize(

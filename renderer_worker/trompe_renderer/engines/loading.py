@@ -74,13 +74,13 @@ def _imported(name: str, module: str, attribute: str, remedy: str) -> Callable[.
 def _options_class(kind: Any) -> Any:
     """The dataclass that ``kind`` takes as its only parameter, if it does."""
     (only, *others) = *signature(kind).parameters, None
-    hint = get_type_hints(kind.__init__).get(only or "")
+    hint = _hints(kind).get(only or "")
     return hint if others == [None] and isinstance(hint, type) and is_dataclass(hint) else None
 
 
 def _values(name: str, takes: Any, settings: Mapping[str, str]) -> tuple[dict[str, Any], list[str]]:
     """Values by option, and ``option=value`` of those compared that differ from the defaults."""
-    hints = get_type_hints(takes.__init__, include_extras=True)
+    hints = _hints(takes)
     variadic = Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD
     known = {each.name: each for each in signature(takes).parameters.values() if each.kind not in variadic}
     kinds = {option: _click_type(hints.get(option), each.default) for option, each in known.items()}
@@ -99,6 +99,16 @@ def _values(name: str, takes: Any, settings: Mapping[str, str]) -> tuple[dict[st
     same = {each.name for each in fields(takes) if not each.compare} if is_dataclass(takes) else set()
     changed = [option for option, value in values.items() if value != known[option].default and option not in same]
     return values, [f"{option}={values[option]}" for option in changed]
+
+
+def _hints(kind: Any) -> dict[str, Any]:
+    """Types of the parameters of a class."""
+    try:
+        return get_type_hints(kind.__init__, include_extras=True)
+    except NameError as error:
+        raise RendererError(
+            f"The option types of {kind.__name__} are unknown ({error}): import them not only for type checkers."
+        ) from error
 
 
 def _click_type(hint: Any, default: Any) -> "click.ParamType[Any]":
