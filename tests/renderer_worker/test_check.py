@@ -287,9 +287,9 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "GBR": ("channel order", seen(lambda picture, _: picture[..., [1, 2, 0]])),
     "encoded twice": ("gamma twice", seen(on_object(lambda picture: encoded(picture / 255)))),
     "not encoded": ("gamma missing", seen(on_object(lambda picture: 255 * linear(picture)))),
-    "2.5 times as bright": (
+    "8 times as bright": (
         "overexposed",
-        seen(on_object(lambda picture: encoded(np.clip(2.5 * linear(picture), 0, 1)))),
+        seen(on_object(lambda picture: encoded(np.clip(8 * linear(picture), 0, 1)))),
     ),
     "texture not decoded": ("texture not decoded", painted(lambda texture: np.round(encoded(texture / 255)))),
     "decoded twice": ("texture decoded twice", painted(lambda texture: np.round(255 * linear(texture.astype(float))))),
@@ -433,6 +433,7 @@ def test_our_own_engine_passes_with_all_settings(setting: str) -> None:
         ("noise with a constant seed", "camera light"),
         ("3 levels off", "earlier objects"),
         ("no ambient light", "looks at the origin"),
+        ("white light", "8 times as bright"),
     ],
 )
 def test_two_faults_at_once_are_both_named(one: str, other: str, engine: Engine) -> None:

@@ -451,7 +451,8 @@ def _direction(guesses: Sequence[NDArray[np.float64]]) -> Findings:
 def _colour(look: _Look, white: Picture, inside: NDArray[np.bool_]) -> Findings:
     """A weaker, redder light: red falls by the intensity, green and blue by the colour as well."""
     weak = look.at(BALL, _lit(replace(SUN, intensity=0.15, colour=(255, 40, 40)), SIDES[0]))
-    bright = inside & (white.mean(axis=-1) > np.percentile(white[inside].mean(axis=1), 60))
+    levels = white.mean(axis=-1)
+    bright = inside & (levels > min(np.percentile(levels[inside], 60), levels[inside].max() - 1))  # all may be white
     before, after = median(white, bright) + 1, median(weak, bright) + 1
     if after[0] > 0.9 * before[0]:
         look.dims = False
