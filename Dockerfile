@@ -65,7 +65,7 @@ COPY deploy/image/make_secrets.py /opt/
 COPY --from=project /project /
 RUN install --directory --owner=trompe --group=trompe --mode=0700 /data /models /objects \
  && install --directory --owner=trompe --group=trompe --mode=0750 /secrets/token /secrets/database /secrets/objects /secrets/cluster
-ENV TROMPE_DATA=/data TORCH_HOME=/models ORT_DISABLE_TELEMETRY=1
+ENV TROMPE_DATA=/data TORCH_HOME=/models
 USER trompe
 EXPOSE 8000
 HEALTHCHECK --interval=10s --timeout=10s --start-period=60s CMD ["python", "/opt/health.py"]

@@ -1,12 +1,12 @@
 """Classifiers from ``.onnx`` files, run by onnxruntime: scores only, no gradients."""
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import onnxruntime
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -21,6 +21,9 @@ from trompe_server.classifiers.protocol import (
     refuse_probabilities,
 )
 from trompe_shared.errors import ClassifierError
+
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # else it records its use in the home folder and reports it
+import onnxruntime
 
 _WEIGHTS_APART: Final = re.compile("external data|GetFileLength", re.IGNORECASE)
 """onnxruntime's words, new and old, for a missing file of weights."""

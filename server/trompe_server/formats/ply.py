@@ -157,6 +157,8 @@ def _polygons_of_text(rows: list[bytes], header: bytes) -> list[NDArray[Any]]:
     for element in ELEMENT.finditer(header):
         some = rows[first : first + int(element[2])]
         if re.match(rb"property +list +\w+ +\w+ +vertex_ind(ices|ex)\n", element[3]):
+            if all(row.split(None, 1)[0] == b"3" for row in some):
+                break  # most files, in a fraction of the time
             return [np.array(words[1 : 1 + int(words[0])], np.int64) for words in map(bytes.split, some)]
         first += len(some)
     return []

@@ -4,6 +4,8 @@ import io
 import json
 import os
 import shutil
+import subprocess
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -580,6 +582,16 @@ def test_an_onnx_network_that_breaks_the_contract_is_refused(
 ) -> None:
     with pytest.raises(ClassifierError, match=message):
         load_onnx(write_onnx(tmp_path / "net.onnx", **options))
+
+
+def test_a_network_that_onnxruntime_runs_leaves_nothing_in_the_home_folder(tmp_path: Path) -> None:
+    """onnxruntime records its use there and reports it, unless told not to before its import."""
+    file, home = write_onnx(tmp_path / "net.onnx"), tmp_path / "home"
+    home.mkdir()
+    code = f"from trompe_server.classifiers import load_classifier; load_classifier({str(file)!r})"
+    variables = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    subprocess.run([sys.executable, "-c", code], env={**variables, "HOME": str(home)}, check=True)
+    assert list(home.rglob("*")) == []
 
 
 def test_an_onnx_network_whose_weights_are_elsewhere_is_refused_with_the_remedy(tmp_path: Path) -> None:
