@@ -124,6 +124,19 @@ def painted(change: Callable[[Picture], NDArray[Any]]) -> Fault:
     return aimed(aim)
 
 
+def read(change: Callable[[Levels], Levels]) -> Fault:
+    """Textures are read at other coordinates."""
+
+    def other(each: Instance) -> Instance:
+        parts = tuple(replace(part, uvs=change(part.uvs)) for part in each.model.obj.parts)
+        return replace(
+            each,
+            model=replace(each.model, shape=f"{each.model.shape} read anew", obj=replace(each.model.obj, parts=parts)),
+        )
+
+    return aimed(lambda world, *_: replace(world, instances=tuple(map(other, world.instances))))
+
+
 def turned_world(matrix: list[list[int]]) -> Fault:
     pose = np.eye(4)
     pose[:3, :3] = matrix
@@ -273,6 +286,8 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "v flipped": ("v flipped", painted(lambda texture: texture[::-1])),
     "u flipped": ("u flipped", painted(lambda texture: texture[:, ::-1])),
     "transposed": ("texture turned", painted(lambda texture: texture.swapaxes(0, 1))),
+    "clamped": ("texture not repeated", read(lambda uvs: uvs.clip(0, 1))),
+    "repeated by mirroring": ("texture not repeated", read(lambda uvs: np.abs((uvs + 1) % 2 - 1))),
     "no textures": ("untextured", painted(lambda texture: np.full_like(texture, 180))),
     "61 degrees": ("field of view", wide(61)),
     "62 degrees": ("field of view", wide(62)),

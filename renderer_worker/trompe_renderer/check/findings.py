@@ -25,6 +25,7 @@ REMEDIES: Final[Mapping[str, str]] = {
     "camera": "Take Snapshot.camera (camera to world) whole; the camera need not be upright nor look at the origin.",
     "v flipped": "v = 0 is the bottom row of the texture: use 1 - v, or flip the rows of the texture.",
     "u flipped": "u = 0 is the left column of the texture: use u as it is.",
+    "texture not repeated": "Repeat textures in u and v (GL_REPEAT): coordinates may lie outside [0, 1].",
     "texture turned": "u runs along the rows of the texture, v up its columns; do not transpose it.",
     "field of view": "60 degrees (FIELD_OF_VIEW) is the vertical field of view.",
     "aspect": "Set the camera's aspect to width / height for each picture, and keep the vertical field of view.",

@@ -41,10 +41,11 @@ def cube(half: float) -> Object3D:
     return _object(parts, {f"{name}.png": plain(*colour) for name, (_, _, colour) in FACES.items()})
 
 
-def plate(half: float, texture: Colours) -> Object3D:
-    """A square that faces +z, seen from the front only. ``half`` of an edge, metres."""
+def plate(half: float, texture: Colours, *, corner: tuple[int, int] = (0, 0)) -> Object3D:
+    """A square that faces +z, seen from the front only. ``half`` of an edge, metres. ``corner``: u, v lower left."""
     face = _face((0, 0, 1), (0, 1, 0), half, "paint")
-    return _object([replace(face, vertices=face.vertices * np.array([1, 1, 0], np.float32))], {TEXTURE: texture})
+    flat, uvs = face.vertices * np.array([1, 1, 0], np.float32), face.uvs + np.array(corner, np.float32)
+    return _object([replace(face, vertices=flat, uvs=uvs)], {TEXTURE: texture})
 
 
 def disc(radius: float, texture: Colours, *, corners: int = 90) -> Object3D:

@@ -260,21 +260,17 @@ def _named(seen: Seen) -> str:
 
 QUARTERS: Final = np.array([[(230, 25, 25), (25, 230, 25)], [(25, 25, 230), (230, 230, 25)]], np.uint8)
 """Colours of the texture's quarters, top row first."""
-QUARTERED: Final = plate(0.3, QUARTERS.repeat(16, axis=0).repeat(16, axis=1))
+QUARTERED, REPEATED = (
+    plate(0.3, QUARTERS.repeat(16, axis=0).repeat(16, axis=1), corner=corner) for corner in ((0, 0), (1, -1))
+)
 
 
 def texture(look: _Look, _: EngineInfo) -> Findings:
-    """A square with four colours."""
-    picture = look.at(QUARTERED)
-    if blob(picture) is None:
+    """A square with four colours, and one with the same ones by coordinates beyond the texture."""
+    seen = _quarters(look, QUARTERED)
+    if seen is None:
         yield fault("invisible", "A square at the origin, seen from the front, is missing.")
         return
-    middle, off = SQUARE[0] // 2, round(_pixels(0.15, SQUARE))
-    spots = [
-        [picture[middle + y - 3 : middle + y + 4, middle + x - 3 : middle + x + 4] for x in (-off, off)]
-        for y in (-off, off)
-    ]
-    seen = patterns(np.array([[np.median(spot, axis=(0, 1)) for spot in row] for row in spots]))
     right = patterns(QUARTERS)
     turns = {
         (): right,
@@ -290,8 +286,24 @@ def texture(look: _Look, _: EngineInfo) -> Findings:
     }
     for name in found:
         yield fault(name, said[name])
-    if not found:
-        yield ok("texture", "its lower left corner is u = 0, v = 0.")
+    again = _quarters(look, REPEATED)
+    if again is None or (again != seen).any():
+        yield fault("texture not repeated", "Coordinates from 1 to 2 and -1 to 0 show another part of the texture.")
+    elif not found:
+        yield ok("texture", "its lower left corner is u = 0, v = 0; it repeats.")
+
+
+def _quarters(look: _Look, obj: Object3D) -> NDArray[np.int64] | None:
+    """Patterns of the colours of a square's quarters, top row first; ``None`` if it is missing."""
+    picture = look.at(obj)
+    if blob(picture) is None:
+        return None
+    middle, off = SQUARE[0] // 2, round(_pixels(0.15, SQUARE))
+    spots = [
+        [picture[middle + y - 3 : middle + y + 4, middle + x - 3 : middle + x + 4] for x in (-off, off)]
+        for y in (-off, off)
+    ]
+    return patterns(np.array([[np.median(spot, axis=(0, 1)) for spot in row] for row in spots]))
 
 
 RADIUS: Final = 0.28
