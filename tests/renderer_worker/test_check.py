@@ -27,6 +27,7 @@ from trompe_renderer.world.snapshot import Instance, Snapshot, WorldLight
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import look_rotation
 from trompe_shared.sailenv_client import SailenvTarget
+from trompe_shared.wavefront import Part
 
 Picture = NDArray[np.uint8]
 Levels = NDArray[np.float64]
@@ -127,12 +128,12 @@ def painted(change: Callable[[Picture], NDArray[Any]]) -> Fault:
 def read(change: Callable[[Levels], Levels]) -> Fault:
     """Textures are read at other coordinates."""
 
+    def moved(part: Part) -> Part:
+        return replace(part, uvs=change(part.uvs.astype(float)).astype(np.float32))
+
     def other(each: Instance) -> Instance:
-        parts = tuple(replace(part, uvs=change(part.uvs)) for part in each.model.obj.parts)
-        return replace(
-            each,
-            model=replace(each.model, shape=f"{each.model.shape} read anew", obj=replace(each.model.obj, parts=parts)),
-        )
+        obj = replace(each.model.obj, parts=tuple(map(moved, each.model.obj.parts)))
+        return replace(each, model=replace(each.model, shape=f"{each.model.shape} moved", obj=obj))
 
     return aimed(lambda world, *_: replace(world, instances=tuple(map(other, world.instances))))
 
