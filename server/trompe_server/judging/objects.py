@@ -65,10 +65,16 @@ class _Triangles:
     def __len__(self) -> int:
         return len(self.corners)
 
-    def mapped(self, names: list[str]) -> Float[np.ndarray, "F 3 6"]:
-        """Corners with their texture coordinates, and a small step for the place of their material in ``names``."""
+    def mapped(self, names: list[str]) -> Float[np.ndarray, "F 3 10"]:
+        """Corners with their texture coordinates, and a small step for the place of their material in ``names``.
+
+        Textures repeat: coordinates are places on circles, with their steps to the next corner.
+        """
+        turns = 2 * np.pi * self.uvs
+        circles = np.concatenate([np.cos(turns), np.sin(turns)], axis=2) / (2 * np.pi)
+        along = np.roll(self.uvs, -1, axis=1) - self.uvs
         steps = np.searchsorted(names, self.materials) * (NAMED / len(names))
-        return np.concatenate([self.corners, self.uvs, np.tile(steps[:, None, None], (1, 3, 1))], axis=2)
+        return np.concatenate([self.corners, circles, along, np.tile(steps[:, None, None], (1, 3, 1))], axis=2)
 
 
 @dataclass(frozen=True)

@@ -41,11 +41,17 @@ def shuffled(part: Part) -> Part:
     return replace(part, faces=faces)
 
 
+def a_tile_further(part: Part) -> Part:
+    """The part with coordinates that read the same texels, as textures repeat."""
+    return replace(part, uvs=part.uvs + np.array([1, -1], np.float32))
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_repaint_differs_in_its_albedo_only_in_another_format_too(name: str) -> None:
     obj = shipped(name)
     painted = repainted(obj, by=12)
-    for after in (painted, read_object(write_glb(painted), name="other.glb").obj, with_parts(painted, shuffled)):
+    glb = read_object(write_glb(painted), name="other.glb").obj
+    for after in (painted, glb, with_parts(painted, shuffled), with_parts(painted, a_tile_further)):
         pair = ObjectPair(obj, after)
         assert pair.findings() == []
         before, compared = pair.textures
@@ -84,6 +90,11 @@ CHANGES = {
         with_parts(MUG, lambda part: replace(part, uvs=part.uvs / np.float32(2))),
         "uv",
         "2368 of 2368 triangles",
+    ),
+    "a texture twice": (
+        with_parts(MUG, lambda part: replace(part, uvs=part.uvs * np.float32(2))),
+        "uv",
+        r"2\d\d\d of 2368 triangles",
     ),
     "other normals": (with_parts(MUG, lambda part: replace(part, normals=-part.normals)), "geometry", "shaded"),
     "another normal map": (lighter(MUG, map_of="normal"), "material", "The normal map of the material 'mug_ceramic'"),
