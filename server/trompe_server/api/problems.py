@@ -35,8 +35,7 @@ _EXAMPLE: Final = {
     "type": "urn:trompe:unknown-label",
     "title": "Unprocessable Entity",
     "status": 422,
-    "detail": "'tiny' has no class 'mag'; did you mean 'mug'? Give a class, its index, or another network by "
-    "`classifier`.",
+    "detail": "'tiny' has no class 'mag'; did you mean 'mug'? Give a class, its index, or another network.",
     "instance": "/v1/jobs",
     "request_id": "5f0c1e7a9b3d2846",
 }

@@ -66,6 +66,4 @@ def _unclear(label: str, fits: Sequence[int], classes: Sequence[str], classifier
         return LabelError(f"{label!r} fits several classes of {classifier!r}: {candidates}. Give the index.")
     close = get_close_matches(label.strip().casefold(), [s for name in classes for s in _synonyms(name)], n=3)
     hint = f"did you mean {', '.join(map(repr, close))}?" if close else f"an example of a class is {classes[0]!r}."
-    return LabelError(
-        f"{classifier!r} has no class {label!r}; {hint} Give a class, its index, or another network by `classifier`."
-    )
+    return LabelError(f"{classifier!r} has no class {label!r}; {hint} Give a class, its index, or another network.")
