@@ -17,7 +17,7 @@ from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.storage.database import DatabaseDownError
 from trompe_shared.api import Problem
 from trompe_shared.errors import RendererError, TrompeError
-from trompe_shared.faults import faults_of
+from trompe_shared.faults import Fault, faults_of
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +86,7 @@ def problem_response(
 
 async def _validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    errors = [{"field": _field(fault.place), "message": fault.message} for fault in faults_of(error.errors())]
+    errors = [{"field": _field(fault.place), "message": _message(fault)} for fault in faults_of(error.errors())]
     detail = "; ".join(f"{each['field']}: {each['message']}" for each in errors)
     return problem_response(request, 422, code="validation", detail=detail, errors=errors)
 
@@ -132,6 +132,15 @@ def _is_disk_full(error: BaseException | None) -> bool:
         or getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
         or _is_disk_full(error.__cause__)
     )
+
+
+def _message(fault: Fault) -> str:
+    """The fault in words; FastAPI speaks of its own classes where a body is of another kind."""
+    if fault.place == "body" and fault.kind == "model_attributes_type":
+        return "Send a JSON object with the header Content-Type: application/json."
+    if fault.message.startswith("Expected UploadFile"):
+        return "Send a file with a name, not a text (curl: -F file=@PATH)."
+    return fault.message
 
 
 def _field(place: str) -> str:

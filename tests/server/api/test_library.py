@@ -32,6 +32,11 @@ def test_an_object_is_found_by_its_id_its_beginning_and_its_name(api: Api) -> No
     assert uploaded in api.get("/v1/objects").json()
 
 
+def test_a_text_in_place_of_a_file_is_told(api: Api) -> None:
+    for path in ("/v1/objects", "/v1/classifiers", "/v1/backgrounds"):
+        assert "file=@PATH" in api.problem(api.post(path, data={"file": "mug.zip"}), 422)["detail"]
+
+
 def test_a_broken_archive_is_refused_and_nothing_is_kept(api: Api) -> None:
     refusal = api.problem(api.upload_object(triangle_zip()[:-40]), 422)
     assert refusal["type"] == "urn:trompe:invalid-object"

@@ -68,7 +68,9 @@ def test_the_service_is_ready_when_nothing_is_missing(api: Api, missing: list[st
 def test_a_body_that_is_no_json_is_told_apart_from_one_that_is_wrong(api: Api) -> None:
     broken = api.post("/v1/jobs", content=b"{", headers={"Content-Type": "application/json"})
     assert "JSON" in api.problem(broken, 422)["detail"]
-    api.problem(api.post("/v1/jobs", content=b"object=mug"), 422)
+    for other in (b"object=mug", b'{"object": "mug", "goal": {"label": "mug"}}'):
+        form = api.post("/v1/jobs", content=other, headers={"Content-Type": "application/x-www-form-urlencoded"})
+        assert "Content-Type: application/json" in api.problem(form, 422)["detail"]
 
 
 def test_a_database_that_is_away_is_a_matter_of_seconds_and_no_mistake(
