@@ -14,7 +14,6 @@ from trompe_shared.api import (
     Accuracy,
     BackgroundInfo,
     ClassifierInfo,
-    GoalOptions,
     Job,
     JobSpec,
     JudgementSpec,
@@ -199,11 +198,10 @@ def _with_interval(share: float | None, interval: tuple[float, float] | None) ->
 
 
 def _facts(result: Result, seconds: Mapping[str, float]) -> Iterator[tuple[str, str]]:
-    goal = result.spec.goal
     if result.drawn_by:
         yield "renderer", result.drawn_by
-    if result.goal_reached is not None and (goal.target is not None or goal.top_k > 1):
-        yield "goal reached", f"{_figure(result.goal_reached, PERCENT)} of the target views: {_goal(goal)}"
+    if result.at_goal:
+        yield "goal reached", result.at_goal
     if result.fooled_as:
         yield "fooled views became", result.became
     yield "N% (texels altered)", _figure(result.texels_altered, PERCENT)
@@ -227,12 +225,6 @@ def _facts(result: Result, seconds: Mapping[str, float]) -> Iterator[tuple[str, 
     if result.evaluations is not None:
         queries = "" if result.queries is None else f", {result.queries:,} scores asked"
         yield "images evaluated", f"{result.evaluations:,} by each attacked classifier{queries}"
-
-
-def _goal(goal: GoalOptions) -> str:
-    if goal.target is None:
-        return f"the true class is not among the {goal.top_k} best"
-    return f"taken for {goal.target if isinstance(goal.target, str) else f'class {goal.target}'}"
 
 
 def _figure(value: float | None, form: str = "{:.2f}") -> str:

@@ -182,6 +182,21 @@ def test_a_result_shows_all_its_accuracies() -> None:
     assert {"target (own views)", "judge net (own views)", "judge net (held-out views)"} <= set(names)
 
 
+@pytest.mark.parametrize(
+    ("goal", "told"),
+    [({"target": "ball"}, "33.0% of the target views: taken for ball"), ({"top_k": 3}, "among the 3 best"), ({}, None)],
+)
+def test_a_result_says_how_often_its_goal_was_reached(tmp_path: Path, goal: dict[str, Any], told: str | None) -> None:
+    request = JobRequest.of("mug", label="mug", **goal)
+    result = RESULT | {"spec": request.spec().model_dump(mode="json"), "goal_reached": 0.33}
+    with running(Settings(data=tmp_path)) as client:
+        job = client.services.store.create(request)[0].id
+        client.end(job, result__json=json.dumps(result).encode())
+        page = client.get(f"/jobs/{job}").text
+    assert ("Goal reached on" in page) == (told is not None)
+    assert (told or "") in page
+
+
 def test_names_of_options_are_shown_as_code() -> None:
     assert _code("<b>: leave out `grid`") == "&lt;b&gt;: leave out <code>grid</code>"
 

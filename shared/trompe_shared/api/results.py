@@ -292,6 +292,17 @@ class Result(Visibility):
         few, rest = self.fooled_as[:NAMED], sum(each.own + each.held_out for each in self.fooled_as[NAMED:])
         return ", ".join([*(each.words for each in few), *([f"{rest} in other classes"] if rest else [])])
 
+    @property
+    def at_goal(self) -> str | None:
+        """How often a target class, or the loss of the best k, was reached, in words; ``None`` for the plain goal."""
+        goal = self.spec.goal
+        if self.goal_reached is None or (goal.target is None and goal.top_k == 1):
+            return None
+        wanted = f"the true class is not among the {goal.top_k} best"
+        if goal.target is not None:
+            wanted = f"taken for {goal.target if isinstance(goal.target, str) else f'class {goal.target}'}"
+        return f"{self.goal_reached:.1%} of the target views: {wanted}"
+
 
 def _visible(delta_e: float) -> str:
     return next(words for least, words in VISIBLE if delta_e >= least)
