@@ -18,7 +18,7 @@ export class Refused extends Error {
 export const ask = async (path, options = {}) => answered(await fetch(path, options));
 
 export async function answered(answer) {
-  if (answer.status === 401) location.assign(`/login?next=${encodeURIComponent(location.pathname)}`);
+  if (answer.status === 401) location.assign(`/login?next=${encodeURIComponent(location.pathname + location.search)}`);
   if (!answer.ok) throw new Refused(await answer.json().catch(() => ({ title: `The server answered ${answer.status}` })));
   return answer.status === 204 ? null : answer.json();
 }
@@ -42,12 +42,15 @@ export function follow(path, name, onMessage) {
       if (source.readyState === EventSource.CLOSED) timer = setTimeout(open, 2000);
     };
   };
-  open();
   const stop = () => {
     clearTimeout(timer);
-    source.close();
+    source?.close();
   };
+  // A browser has six connections to a server for all its tabs, so only those that are seen hold one.
+  const heed = () => (document.hidden ? stop() : open());
+  document.addEventListener("visibilitychange", heed);
   addEventListener("pagehide", stop);
+  heed();
   return stop;
 }
 

@@ -63,9 +63,9 @@ if (live) {
       location.reload();
     }
   });
-  // A stream can end without its last event if the server restarts, so poll too.
+  // A stream can end without its last event if the server restarts, and a job can be deleted, so poll too.
   setInterval(async () => {
-    const job = await ask(`/v1/jobs/${live.dataset.job}`).catch(() => null);
-    if (job && !["queued", "running"].includes(job.state)) location.reload();
+    const { state, status } = await ask(`/v1/jobs/${live.dataset.job}`).catch((error) => error.problem ?? {});
+    if (status === 404 || (state && !["queued", "running"].includes(state))) location.reload();
   }, 10000);
 }
