@@ -2,7 +2,8 @@
 import { Refused, answered, ask, words } from "./common.js";
 
 const form = document.getElementById("new");
-const keys = new Map();
+const button = form.querySelector("button.button");
+const keys = new Map(), uploads = new Map();
 
 // The same request has the same key, and makes one job.
 function keyOf(body) {
@@ -18,36 +19,45 @@ export function complain(error, fallback = "") {
     : [[fallback, words(error)]];
   for (const [field, text] of problems) {
     const known = [...form.querySelectorAll("[data-error]")].find(
-      (each) => each.dataset.error && each.dataset.error.split(" ").some((name) => `${field}.`.startsWith(`${name}.`)));
+      (each) => each.dataset.error && each.dataset.error.split(" ").some((name) => `${field}.`.startsWith(`${name}.`) || name.startsWith(`${field}.`)));
     const place = known ?? form.querySelector('[data-error=""]');
     place.textContent = known || !field ? text : `${field}: ${text}`;
     place.hidden = false;
   }
 }
 
+// Upload a file and choose it; nothing can be submitted until then. Returns what is stored, null if it is refused, and
+// undefined if another file was picked meanwhile.
 export async function upload(path, picked, select, place, onShare = () => {}) {
   const body = new FormData();
   body.append("file", picked);
+  uploads.get(select)?.abort();
+  const request = new XMLHttpRequest();
+  uploads.set(select, request);
+  button.disabled = true;
   try {
-    const stored = await answered(await posted(path, body, onShare));
+    const stored = await answered(await posted(request, path, body, onShare));
     const option = [...select.options].find((each) => each.value === stored.id) ?? new Option(stored.name, stored.id);
     option.selected = true;
     select.append(option);
     complain(null);
     return stored;
   } catch (error) {
+    if (uploads.get(select) !== request) return undefined;
     complain(error, place);
     return null;
+  } finally {
+    if (uploads.get(select) === request) uploads.delete(select);
+    button.disabled = uploads.size > 0;
   }
 }
 
 // Post with `onShare` told the share that is sent, which `fetch` does not tell.
-function posted(path, body, onShare) {
+function posted(request, path, body, onShare) {
   return new Promise((done, fail) => {
-    const request = new XMLHttpRequest();
     request.upload.onprogress = ({ loaded, total }) => onShare(loaded / total);
     request.onload = () => done(new Response(request.response, { status: request.status }));
-    request.onerror = () => fail(new TypeError("no connection"));
+    request.onerror = request.onabort = () => fail(new TypeError("no connection"));
     request.open("POST", path);
     onShare(0);
     request.send(body);
@@ -59,7 +69,6 @@ export const send = (path, body, headers = {}) =>
 
 // Submit what `request` gives as JSON, and go to the job. Until then the button is disabled: the form has no address.
 export function submits(path, request) {
-  const button = form.querySelector("button.button");
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     button.disabled = true;

@@ -1,5 +1,5 @@
 // The form of a new job: uploads at once, and shows the API's faults before anything is queued.
-import { ask } from "./common.js";
+import { Refused, ask } from "./common.js";
 import { complain, send, submits, upload } from "./form.js";
 import { Turntable } from "./turntable.js";
 
@@ -16,6 +16,7 @@ async function take(picked) {
   const stored = await upload("/v1/objects", picked, object, "object", (share) => {
     says.textContent = share < 1 ? `${picked.name}: ${Math.round(100 * share)} % uploaded` : `${picked.name}: the server reads it`;
   });
+  if (stored === undefined) return;
   says.textContent = stored
     ? `${stored.name}: ${stored.triangles} triangles, ${Object.keys(stored.textures).length} textures`
     : `${picked.name} was refused`;
@@ -79,7 +80,11 @@ for (const name of ["dragleave", "drop"])
     event.preventDefault();
     drop.classList.remove("over");
   });
-drop.addEventListener("drop", (event) => take(event.dataTransfer.files[0]));
+drop.addEventListener("drop", ({ dataTransfer: { files, items } }) => {
+  const many = files.length > 1 || items[0]?.webkitGetAsEntry()?.isDirectory;
+  if (many) complain(new Refused({ detail: "Drop one file; pack a folder, or a model with its textures, as a zip." }), "object");
+  else take(files[0]);
+});
 document.getElementById("classifier-file").onchange = async (event) => {
   const [picked] = event.target.files;
   if (picked && (await upload("/v1/classifiers", picked, classifier, classifier.name))) await classes();
@@ -95,9 +100,14 @@ document.getElementById("more-labels").onclick = (event) => {
   event.target.before(more);
   more.focus();
 };
-form.addEventListener("input", (event) => {
-  if (event.target.name === "paint.epsilon") form.elements["epsilon-says"].value = event.target.value;
-});
+const sayEpsilon = () => { form.elements["epsilon-says"].value = option("paint.epsilon").value; };
+option("paint.epsilon").oninput = sayEpsilon;
 form.addEventListener("change", check);
 submits("/v1/jobs", request);
-await Promise.all([chosen(), classes(), foresee()]);
+// By now the browser has filled in again what it kept of a form to which one returns.
+addEventListener("pageshow", () => {
+  sayEpsilon();
+  chosen();
+  classes();
+  foresee();
+});

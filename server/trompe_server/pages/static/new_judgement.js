@@ -15,7 +15,7 @@ for (const input of document.querySelectorAll("input[data-for]")) {
 const tables = [...document.querySelectorAll(".turntable")].map((figure) => new Turntable(figure));
 ["before", "after"].forEach((name, index) => {
   elements[name].onchange = () => elements[name].value && tables[index].show(elements[name].value);
-  elements[name].onchange();
+  addEventListener("pageshow", elements[name].onchange);
 });
 for (const { slider } of tables)
   slider.oninput = () => {
