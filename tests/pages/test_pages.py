@@ -18,6 +18,7 @@ from playwright.sync_api import Browser, BrowserContext, Page, Response, expect
 from tests.pages.conftest import LIMIT, REPORTED, Service, drop, held_back, inaccessible, slowed, turntables, width
 from tests.served import wait_until
 from trompe_shared.api import OPTIONS, JobRequest
+from trompe_shared.shipped import shipped_objects
 
 pytestmark = pytest.mark.timeout(1200)
 
@@ -30,8 +31,10 @@ def done(service: Service) -> str:
 
 @pytest.fixture(scope="module")
 def stronger(service: Service) -> str:
-    """Another job, of a larger epsilon."""
-    return service.finished(epsilon=0.2, steps=1)
+    """Another job, of a larger epsilon and an object with a long name."""
+    with service.client() as client:
+        mug = client.upload_object(shipped_objects()["mug"].path, name=f"mug{100 * 'W'}")
+    return service.finished(object=mug.id, epsilon=0.2, steps=1)
 
 
 def test_the_start_page_shows_an_example_before_there_is_any_job(service: Service, page: Page) -> None:
@@ -62,10 +65,58 @@ def test_a_wrong_file_and_a_wrong_class_are_told_in_the_servers_words(
     page.set_input_files("#classifier-file", file)
     expect(page.locator('[data-error^="victim.classifier"]')).to_contain_text("not a supported classifier")
 
-    page.fill("[name='goal.label']", "elephant")
-    page.get_by_role("button", name="Submit").click()
-    expect(page.locator(".error:visible").last).to_contain_text("elephant")
+    for label, told in (("", "Field required"), ("elephant", "elephant")):
+        page.fill("[name='goal.label']", label)
+        page.get_by_role("button", name="Submit").click()
+        expect(page.locator(".error:visible").last).to_contain_text(re.compile(f"^{told}|'{told}'"))
     faults.clear()  # browsers report answers of 422 on the console
+
+
+def test_without_scripts_a_page_says_what_it_lacks(service: Service, browser: Browser) -> None:
+    page = browser.new_page(java_script_enabled=False)
+    page.goto(f"{service.url}/jobs/new")
+    expect(page.locator("noscript p")).to_be_visible()
+    page.close()
+
+
+@pytest.mark.parametrize("dropped", [["candle"], ["mesh.obj", "mesh.mtl"]], ids=["a folder", "two files"])
+def test_only_one_file_can_be_dropped(
+    service: Service, page: Page, context: BrowserContext, tmp_path: Path, dropped: list[str]
+) -> None:
+    (tmp_path / "candle").mkdir()
+    page.goto(f"{service.url}/jobs/new")
+    hold = {"items": [], "files": [str(tmp_path / name) for name in dropped], "dragOperationsMask": 1}
+    box = page.locator("#drop").bounding_box()
+    assert box is not None
+    session = context.new_cdp_session(page)
+    for kind in ("dragEnter", "dragOver", "drop"):
+        place = {"x": box["x"] + 20, "y": box["y"] + 10}
+        session.send("Input.dispatchDragEvent", {"type": kind, "data": hold} | place)
+    expect(page.locator('[data-error="object"]')).to_contain_text("Drop one file")
+
+
+def test_nothing_is_submitted_before_the_file_that_was_picked_last_is_stored(service: Service, page: Page) -> None:
+    page.goto(f"{service.url}/jobs/new")
+    submit = page.get_by_role("button", name="Submit")
+    held = held_back(page, "**/v1/objects")
+    for name in ("teapot", "mug"):
+        with page.expect_request("**/v1/objects"):
+            page.set_input_files("#file", shipped_objects()[name].path)
+        expect(submit).to_be_disabled()
+    held[1].continue_()
+    expect(page.locator("#file-says")).to_contain_text("mug: ")
+    expect(submit).to_be_enabled()
+
+
+def test_a_form_to_which_one_returns_shows_the_object_that_it_submits(service: Service, page: Page) -> None:
+    page.goto(f"{service.url}/jobs/new")
+    page.select_option("[name=object]", "mug")
+    page.fill("[name='paint.epsilon']", "0.2")
+    page.goto(f"{service.url}/docs")
+    page.go_back()
+    expect(page.locator("[name=object]")).to_have_value("mug")
+    expect(page.locator("[name='goal.label']")).to_have_value("mug")
+    expect(page.locator("[name=epsilon-says]")).to_have_text("0.2")
 
 
 def test_every_field_of_the_form_reaches_its_option_and_its_fault_is_shown_beside_it(
@@ -222,6 +273,29 @@ def test_a_running_job_is_cancelled_from_the_list(service: Service, page: Page) 
     expect(row.locator(".state")).to_have_text("cancelled")
 
 
+def test_a_job_that_is_deleted_while_its_page_is_open_is_told(service: Service, page: Page, faults: list[str]) -> None:
+    job = service.store.create(JobRequest.of("mug", label="mug", needs={"gpu": 1000}))[0].id
+    page.goto(f"{service.url}/jobs/{job}")
+    expect(page.locator("[data-field=phase]")).to_be_visible()
+    service.store.request_cancel(job)
+    service.store.delete(job)
+    expect(page.get_by_role("main")).to_contain_text(f"There is no job '{job}'")
+    faults.clear()  # browsers report answers of 404 on the console
+
+
+def test_a_list_that_is_not_seen_holds_no_connection(service: Service, page: Page, done: str) -> None:
+    page.goto(f"{service.url}/jobs")
+    expect(page.locator(f"#job-{done}")).to_be_visible()
+    show = """(hidden) => {
+        Object.defineProperty(document, "hidden", {value: hidden, configurable: true});
+        document.dispatchEvent(new Event("visibilitychange"));
+    }"""
+    with page.expect_event("requestfailed", lambda request: "/stream" in request.url):
+        page.evaluate(show, True)
+    with page.expect_request("**/jobs/stream*"):
+        page.evaluate(show, False)
+
+
 def test_the_list_is_sorted_and_filtered(service: Service, page: Page, done: str, stronger: str) -> None:
     service.submit(epsilon=0.1, steps=1)
     page.goto(f"{service.url}/jobs")
@@ -241,6 +315,14 @@ def test_the_list_is_sorted_and_filtered(service: Service, page: Page, done: str
 def test_two_jobs_are_compared(service: Service, page: Page, done: str, stronger: str) -> None:
     page.goto(f"{service.url}/jobs")
 
+    for job in (done, stronger):
+        page.locator(f"#job-{job}").get_by_role("checkbox").check()
+    copies = "row => { for (let copies = 0; copies < 5; copies += 1) row.after(row.cloneNode(true)); }"
+    page.locator(f"#job-{done}").evaluate(copies)
+    page.locator(f"#job-{stronger}").get_by_role("checkbox").dispatch_event("change")
+    expect(page.locator("#compare")).to_have_text("Compare at most 6")
+    assert page.locator("#compare").get_attribute("href") is None
+    page.reload()
     for job in (done, stronger):
         page.locator(f"#job-{job}").get_by_role("checkbox").check()
     page.get_by_role("link", name="Compare these 2").click()
@@ -371,7 +453,7 @@ def inked(page: Page) -> float:
     ],
 )
 def test_every_page_is_accessible_and_none_is_too_wide_cut_off_half_empty_or_moves_while_it_loads(
-    service: Service, browser: Browser, done: str, wide: int, high: int, scheme: Any
+    service: Service, browser: Browser, done: str, stronger: str, wide: int, high: int, scheme: Any
 ) -> None:
     context = browser.new_context(viewport={"width": wide, "height": high}, color_scheme=scheme)
     context.set_default_timeout(LIMIT)
@@ -383,6 +465,7 @@ def test_every_page_is_accessible_and_none_is_too_wide_cut_off_half_empty_or_mov
         "/jobs/new",
         "/judgements/new",
         f"/jobs/{done}",
+        f"/jobs/{stronger}",
         f"/jobs/compare?job={done}&job={done}",
         "/experiments",
         "/experiments/tries",

@@ -2,6 +2,7 @@
 import { follow } from "./common.js";
 
 const table = document.querySelector("table[data-stream]");
+const MOST_COMPARED = 6; // as the page of the comparison takes
 const compare = document.getElementById("compare"), find = document.getElementById("find");
 
 const idOf = (row) => row.id.slice("job-".length);
@@ -66,7 +67,9 @@ if (table && compare) {
   table.addEventListener("change", () => {
     const picked = [...table.querySelectorAll("input[name=compare]:checked")].map((box) => box.value);
     compare.hidden = picked.length < 2;
-    compare.textContent = `Compare these ${picked.length}`;
-    compare.href = `/jobs/compare?${picked.map((job) => `job=${job}`).join("&")}`;
+    const many = picked.length > MOST_COMPARED;
+    compare.textContent = many ? `Compare at most ${MOST_COMPARED}` : `Compare these ${picked.length}`;
+    if (many) compare.removeAttribute("href");
+    else compare.href = `/jobs/compare?${picked.map((job) => `job=${job}`).join("&")}`;
   });
 }
