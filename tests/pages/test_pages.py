@@ -62,8 +62,14 @@ def test_a_wrong_file_and_a_wrong_class_are_told_in_the_servers_words(
     drop(page, file)
     expect(page.locator('[data-error="object"]')).to_contain_text("zip")
     expect(page.locator("#file-says")).to_contain_text("refused")
-    page.set_input_files("#classifier-file", file)
-    expect(page.locator('[data-error^="victim.classifier"]')).to_contain_text("not a supported classifier")
+    for place, field, told in (
+        ("#file", "object", "zip"),
+        ("#classifier-file", "victim.classifier", "not a supported classifier"),
+    ):
+        page.set_input_files(place, file)
+        expect(page.locator(f'[data-error^="{field}"]')).to_contain_text(told)
+        page.wait_for_timeout(1500)  # the form is checked meanwhile
+        expect(page.locator(f'[data-error^="{field}"]')).to_be_visible()
 
     for label, told in (("", "Field required"), ("elephant", "elephant")):
         page.fill("[name='goal.label']", label)

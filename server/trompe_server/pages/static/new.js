@@ -102,7 +102,7 @@ document.getElementById("more-labels").onclick = (event) => {
 };
 const sayEpsilon = () => { form.elements["epsilon-says"].value = option("paint.epsilon").value; };
 option("paint.epsilon").oninput = sayEpsilon;
-form.addEventListener("change", check);
+form.addEventListener("change", ({ target }) => target.type !== "file" && check()); // uploads tell their own faults
 submits("/v1/jobs", request);
 // By now the browser has filled in again what it kept of a form to which one returns.
 addEventListener("pageshow", () => {
