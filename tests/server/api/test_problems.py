@@ -63,6 +63,7 @@ def test_the_service_is_ready_when_nothing_is_missing(api: Api, missing: list[st
     missing.append("the attack worker is not up")
     assert api.problem(api.get("/readyz"), 503)["detail"] == "the attack worker is not up"
     assert api.get("/healthz").status_code == 200
+    assert [api.request("HEAD", path).status_code for path in ("/healthz", "/readyz")] == [200, 503]
 
 
 def test_a_body_that_is_no_json_is_told_apart_from_one_that_is_wrong(api: Api) -> None:
