@@ -197,8 +197,14 @@ def test_a_result_says_how_often_its_goal_was_reached(tmp_path: Path, goal: dict
     assert (told or "") in page
 
 
-def test_names_of_options_are_shown_as_code() -> None:
+def test_names_of_options_are_shown_as_code(tmp_path: Path) -> None:
     assert _code("<b>: leave out `grid`") == "&lt;b&gt;: leave out <code>grid</code>"
+    with running(Settings(data=tmp_path)) as client:
+        job = client.services.store.create(JobRequest.of("mug", label="mug"))[0].id
+        client.tell(job, "ended", state="failed", artifacts=[], error="None answers to `renderers: a`. There is b.")
+        for path in ("/jobs", f"/jobs/{job}"):
+            assert "to <code>renderers: a</code>" in (page := client.get(path).text)
+            assert "`" not in page
 
 
 def test_names_from_users_are_shown_as_text(client: Api) -> None:
