@@ -383,9 +383,10 @@ def _materials(files: Mapping[str, bytes], used: Collection[str]) -> dict[str, M
 
 
 def _normal(maps: Mapping[str, str], files: Mapping[str, bytes]) -> str | None:
-    """The normal map of an MTL's material: ``norm``, or a bump map in colours; a grey one holds heights."""
+    """The normal map of an MTL's material: ``norm``, or a bump map in colours; a grey one, or the albedo, holds
+    heights."""
     bump = maps.get("bump")
-    if bump is None or "normal" in maps:
+    if bump is None or "normal" in maps or bump == maps["albedo"]:
         return maps.get("normal")
     rgb = decode_rgb(_member(files, bump), bump)
     return None if (rgb == rgb[..., :1]).all() else bump

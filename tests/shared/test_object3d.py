@@ -149,6 +149,11 @@ def test_a_grey_bump_map_has_heights_and_is_no_normal_map(
     assert obj.files["n.png"] == picture
 
 
+def test_a_bump_map_that_is_the_albedo_is_no_normal_map() -> None:
+    files = with_files(thing_mat_def__json=None, thing__mtl=LIBRARY + b"map_bump paint.png")
+    assert object_from_files(files).materials["paint"].normal is None
+
+
 @pytest.mark.parametrize(
     ("words", "name"),
     [
