@@ -60,7 +60,7 @@ def painted_grey(obj: Object3D, grey: int) -> Object3D:
     return obj.with_textures(
         {
             name: np.full(
-                (4, 4, 3) if opacity_of(obj.files[name], blended=name in obj.blended) is None else image.shape,
+                (4, 4, 3) if opacity_of(obj.files[name], blended=True) is None else image.shape,  # scaled alpha rings
                 grey,
                 dtype=np.uint8,
             )

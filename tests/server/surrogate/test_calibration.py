@@ -37,8 +37,7 @@ from trompe_server.surrogate.tone import ToneMap, measure_tone_map
 from trompe_shared.api import SurrogateModel
 from trompe_shared.errors import SpecError
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import Object3D
-from trompe_shared.opacity import opacity_of
+from trompe_shared.object3d import Object3D, decode_alpha
 from trompe_shared.shipped import shipped_objects
 
 SIZE = (64, 64)
@@ -492,14 +491,21 @@ def test_painting_grey_or_noise_keeps_the_object(mug: Object3D) -> None:
         assert np.abs(change).max() == 26
 
 
-def test_painting_grey_or_noise_keeps_what_is_cut_out() -> None:
-    opacity = (np.indices((24, 40)).sum(axis=0) % 5 * 60).astype(np.uint8)
+@pytest.mark.parametrize(
+    "opacity",
+    [
+        pytest.param(np.indices((24, 40)).sum(axis=0) % 5 * 60, id="with holes"),
+        pytest.param(np.where(np.arange(40) < 20, 128, 255) + np.zeros((24, 1)), id="hardly without"),
+    ],
+)
+def test_painting_grey_or_noise_keeps_what_is_cut_out(opacity: NDArray[Any]) -> None:
+    alpha = opacity.astype(np.uint8)
     obj = object_of(quad(np.full((24, 40, 3), 100, np.uint8)))
-    obj = with_alpha(obj, "m0.png", opacity)
+    obj = with_alpha(obj, "m0.png", alpha)
     for painted in (painted_grey(obj, 77), painted_noise(obj, np.random.default_rng(3))):
-        kept = opacity_of(painted.files["m0.png"])
+        kept = decode_alpha(painted.files["m0.png"], "m0.png")
         assert kept is not None
-        assert np.array_equal(kept, opacity)
+        assert np.array_equal(kept, alpha)
 
 
 def test_a_photograph_behind_the_object_is_behind_every_surrogate(mug: Object3D) -> None:
