@@ -1,32 +1,22 @@
 """The surrogates of a job: each attacked renderer has its calibration; equal sampling models share their geometry."""
 
-import hashlib
 import logging
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import Final, TypeVar
 
 import numpy as np
 
 from trompe_server.job.files import JobFiles
 from trompe_server.job.setup import PROBE_STREAM, JobSetup
-from trompe_server.storage.arrays import pack_arrays, unpack_arrays
 from trompe_server.storage.folders import Folder
 from trompe_server.surrogate import Geometry, Image8, SamplingModel, Surrogate, prepare_geometry
 from trompe_server.surrogate.calibration import Calibration, build_surrogate, calibrate
 from trompe_server.surrogate.calibration_file import calibration_key, pack_calibration, unpack_calibration
-from trompe_server.surrogate.tone import Ask, ToneMap, measure_tone_map
+from trompe_server.surrogate.tone import Ask
 from trompe_shared.api import SearchOptions
-from trompe_shared.engine import EngineInfo
 
 logger = logging.getLogger(__name__)
-
-TONE_VERSION: Final = 1
-"""To be raised whenever the same images can give another tone curve."""
-
-T = TypeVar("T")
 
 
 class JobCalibrations:
@@ -43,7 +33,7 @@ class JobCalibrations:
         setup, search, renderer = self._setup, self._search, self._setup.attacked[number]
         shown, engine = renderer.shown(setup.views), renderer.engine
         key = calibration_key(setup.obj, shown, clean, engine=engine, wanted=search.surrogate, seed=search.seed)
-        known = self._stored(name := f"{key}.npz", unpack_calibration)
+        known = self._stored(name := f"{key}.npz")
         if known is None:
             found = self._probe(number, clean, ask)
         else:
@@ -71,12 +61,12 @@ class JobCalibrations:
             device=setup.device,
         )
 
-    def _stored(self, name: str, unpack: Callable[[bytes], T]) -> T | None:
-        """A shared file, marked as used; ``None`` if there is none or it is damaged."""
+    def _stored(self, name: str) -> Calibration | None:
+        """A shared calibration, marked as used; ``None`` if there is none or it is damaged."""
         if not self._shared.exists(name):
             return None
         try:
-            found = unpack(self._shared.read(name))
+            found = unpack_calibration(self._shared.read(name))
         except (ValueError, OSError):
             logger.warning("the stored calibration %s is damaged; probing the target again", name)
             return None
@@ -95,19 +85,8 @@ class JobCalibrations:
             backdrops=setup.backdrops,
             on_sampling=self._prepare_geometry,
             deterministic=setup.attacked[number].engine.deterministic,
-            tone_map=partial(self._tone_map, setup.attacked[number].engine),
             device=setup.device,
         )
-
-    def _tone_map(self, engine: EngineInfo, ask: Ask, size: tuple[int, int]) -> ToneMap:
-        """The engine's tone curve, measured once for all jobs."""
-        key = hashlib.sha256(repr((TONE_VERSION, engine, size)).encode()).hexdigest()
-        name = f"tone-{key}.npz"
-        found = self._stored(name, lambda data: ToneMap.of(unpack_arrays(data)))
-        if found is None:
-            found = measure_tone_map(ask, size)
-            self._shared.write(name, pack_arrays(found.arrays()))
-        return found
 
     def _prepare_geometry(self, sampling: SamplingModel) -> None:
         """Rasterise all views once, in a thread: while the renderer is busy with the probes."""

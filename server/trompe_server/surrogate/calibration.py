@@ -52,8 +52,6 @@ KEPT_BYTES: Final = 2**29
 KEPT_RASTERS: Final = 2
 """The best hypothesis and the one that is tried."""
 
-MeasureToneMap = Callable[[Ask, tuple[int, int]], ToneMap]
-
 
 def painted_grey(obj: Object3D, grey: int) -> Object3D:
     """``obj`` with every albedo texture replaced by one grey (encoded, 0..255); alpha stays."""
@@ -312,7 +310,6 @@ def calibrate(
     backdrops: Mapping[str, Image8] = NO_BACKDROPS,
     on_sampling: Callable[[SamplingModel], None] = lambda _: None,
     deterministic: bool = True,
-    tone_map: MeasureToneMap = measure_tone_map,
     device: torch.device | str = "cpu",
 ) -> Calibration:
     """Probe the target as far as the ``wanted`` colour model needs; ``auto`` takes the cheapest within tolerance.
@@ -322,8 +319,8 @@ def calibrate(
     clean: the target's images of ``obj``, (views, H, W, 3) uint8. on_sampling: receives the sampling model as soon as
     it is known, before most of the probes. deterministic: equal views give equal images whatever the number of their
     noise; otherwise the noise is measured. All images of a view share it, so that they differ by the paint alone.
-    tone_map: gives the target's tone curve, if it is needed. A few trial views decide; the other views are probed
-    afterwards. Raises ``RendererError`` for images of another shape or type.
+    A few trial views decide; the other views are probed afterwards. Raises ``RendererError`` for images of another
+    shape or type.
     """
     clean = _checked(clean, views, size=clean.shape[1:3])
 
@@ -333,7 +330,6 @@ def calibrate(
     trial = _Trial(
         *(obj, views, clean, asked, generator, backdrops),
         deterministic=deterministic,
-        tone_map=tone_map,
         device=torch.device(device),
     )
     if wanted in {"auto", "diffuse"}:
@@ -381,10 +377,9 @@ class _Trial:
         backdrops: Mapping[str, Image8],
         *,
         deterministic: bool,
-        tone_map: MeasureToneMap,
         device: torch.device,
     ) -> None:
-        self.obj, self.ask, self.backdrops, self.tone_map, self.device = obj, ask, backdrops, tone_map, device
+        self.obj, self.ask, self.backdrops, self.device = obj, ask, backdrops, device
         self.index = _from_all_sides([view.camera for view in views])
         self.views, self.clean = tuple(views[k] for k in self.index), clean[self.index]
         repainted = painted_noise(obj, generator)
@@ -409,7 +404,7 @@ class _Trial:
             self.charts.append(len(views))
             return self.ask(chart, views)
 
-        return self.tone_map(ask, (self.clean.shape[1], self.clean.shape[2]))
+        return measure_tone_map(ask, (self.clean.shape[1], self.clean.shape[2]))
 
     @cached_property
     def noise(self) -> float:

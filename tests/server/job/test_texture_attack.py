@@ -303,7 +303,7 @@ def test_a_calibration_serves_only_its_renderer_and_is_made_anew_if_damaged(
     spec = spec_of(surrogate="calibrated")
     whole = run_job(spec, library, until="calibrate")
     count = len(library.calibrations.names())
-    for stored in library.calibrations.names():  # the tone curve's too
+    for stored in library.calibrations.names():
         library.calibrations.write(stored, library.calibrations.read(stored)[:-100])
     again = run_job(spec, library, known=True, until="calibrate")
     assert again.artifacts.lasting() == whole.artifacts.lasting()
@@ -316,6 +316,15 @@ def test_a_calibration_serves_only_its_renderer_and_is_made_anew_if_damaged(
     run_job(spec, library, known=True, until="calibrate")
     with pytest.raises(RuntimeError, match="probes the target"):
         run_job(spec, library, target=DarkTarget(), known=True, until="calibrate")
+
+
+@pytest.mark.usefixtures("measured_tone")
+def test_a_tone_curve_is_that_of_the_renderer_and_not_of_another_one_of_its_name(library: Library) -> None:
+    spec = spec_of(surrogate="calibrated")
+    alone = run_job(spec, library, target=DarkTarget(), until="calibrate")
+    run_job(spec, library, until="calibrate")
+    after_another = run_job(spec, library, target=DarkTarget(), known=True, until="calibrate")
+    assert after_another.artifacts.lasting() == alone.artifacts.lasting()
 
 
 def test_a_pool_of_random_views_takes_the_place_of_the_grid(library: Library) -> None:

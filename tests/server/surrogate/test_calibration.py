@@ -351,7 +351,7 @@ GRID = SamplingModel(samples="grid", kernel=("gaussian", 4.0), filtered="linear"
     ],
 )
 def test_what_path_tracers_and_films_do_is_recovered(
-    mug: Object3D, target: KnownTarget, members: dict[str, object]
+    mug: Object3D, target: KnownTarget, members: dict[str, object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     measured: list[ToneMap] = []
 
@@ -359,8 +359,9 @@ def test_what_path_tracers_and_films_do_is_recovered(
         measured.append(measure_tone_map(ask, size))
         return measured[-1]
 
+    monkeypatch.setattr("trompe_server.surrogate.calibration.measure_tone_map", tone_map)
     asked = Asked(target)
-    calibration = found(mug, asked, "auto", tone_map=tone_map)
+    calibration = found(mug, asked, "auto")
     assert calibration.model == "calibrated"
     assert len(measured) <= 1
     assert calibration.renders == asked.images - len(VIEWS)
