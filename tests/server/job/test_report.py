@@ -191,6 +191,9 @@ def test_an_attack_of_little_effect_says_so_with_a_remedy(library: Library) -> N
         pytest.param({}, "gradient is zero on every view", "Export it without its softmax", id="saturated"),
         pytest.param({"tau": 0.05}, "through the pixels", "Try a smaller `tau` or `keep` in its place", id="tau"),
         pytest.param({"tau": 0.05, "keep": 0.5}, "through the pixels", "Try a smaller `tau`.", id="tau and keep"),
+        pytest.param(
+            {"alpha": 0.0009}, "less than half an 8-bit level", "Try a larger `alpha` or more `steps`", id="alpha"
+        ),
     ],
 )
 def test_an_attack_that_altered_nothing_says_why_and_advises_what_was_not_done(

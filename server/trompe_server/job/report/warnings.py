@@ -24,6 +24,9 @@ LOUD: Final = 2.0
 MORE_VIEWS: Final = 240
 """A pool size that reaches unseen views for most objects."""
 
+HALF_LEVEL: Final = 0.5 / 255
+"""Smallest change of a texel that its texture, saved in 8 bits, shows."""
+
 NAMED: Final = 5
 """Neighbours named in a warning."""
 
@@ -138,6 +141,11 @@ def _transfer(data: ReportData) -> Iterator[str]:
 
 
 def _why_unaltered(spec: JobSpec) -> str:
+    if spec.alpha * spec.search.steps < HALF_LEVEL:
+        return (
+            f"`alpha` times `steps`, {spec.alpha * spec.search.steps:.2g}, is less than half an 8-bit level (1/255), "
+            "to which textures are rounded. Try a larger `alpha` or more `steps`."
+        )
     if spec.paint.tau is not None:
         advice = ["a smaller `tau`"] * (spec.paint.tau > 0) + ["`keep` in its place"] * (spec.paint.keep is None)
         return (
