@@ -17,6 +17,7 @@ from trompe_client._port import finish
 from trompe_client._retry import Retries
 from trompe_client._settings import Connection
 from trompe_shared.addresses import is_loopback
+from trompe_shared.errors import SpecError
 
 CONNECT_SECONDS: Final = 10.0
 """Timeout of connecting."""
@@ -33,7 +34,8 @@ class BlockingPort:
     def __init__(self, connection: Connection, retries: Retries) -> None:
         self.retries = retries
         self._url, self._timeout = connection.url, connection.timeout
-        self._http = httpx.Client(**_options(connection))
+        with _usable_environment():
+            self._http = httpx.Client(**_options(connection))
 
     @asynccontextmanager
     async def open(self, request: Request[Any], *, silence: float | None = None) -> AsyncIterator["_Answer"]:
@@ -70,7 +72,8 @@ class AsyncPort:
     def __init__(self, connection: Connection, retries: Retries) -> None:
         self.retries = retries
         self._url, self._timeout = connection.url, connection.timeout
-        self._http = httpx.AsyncClient(**_options(connection))
+        with _usable_environment():
+            self._http = httpx.AsyncClient(**_options(connection))
 
     @asynccontextmanager
     async def open(self, request: Request[Any], *, silence: float | None = None) -> AsyncIterator["_AsyncAnswer"]:
@@ -146,7 +149,20 @@ def _options(connection: Connection) -> dict[str, Any]:
         "transport": connection.transport,
         # A proxy cannot reach a server on this machine.
         "trust_env": not is_loopback(httpx.URL(connection.url).host),
+        "verify": httpx.create_ssl_context(),  # with SSL_CERT_FILE, for that machine too
     }
+
+
+@contextmanager
+def _usable_environment() -> Iterator[None]:
+    """Translate the errors of httpx about the variables of the environment that it reads."""
+    try:
+        yield
+    except (httpx.InvalidURL, ImportError, OSError, ValueError) as error:
+        raise SpecError(
+            f"The network settings of the environment cannot be used ({error}). "
+            "Correct HTTP_PROXY, HTTPS_PROXY, ALL_PROXY, NO_PROXY or SSL_CERT_FILE."
+        ) from error
 
 
 @contextmanager
@@ -177,9 +193,11 @@ def _translated(url: str) -> Iterator[None]:
     try:
         yield
     except (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout) as error:
+        remedy = "Start one with `trompe serve`, or correct the address, for example in TROMPE_SERVER."
+        if "CERTIFICATE_VERIFY_FAILED" in str(error):
+            remedy = "Give the file of its authority's certificate in SSL_CERT_FILE, or the name in its certificate."
         raise ServerUnreachable(
-            f"No Trompe server answers at {url} ({error or type(error).__name__}). "
-            "Start one with `trompe serve`, or correct the address, for example in TROMPE_SERVER."
+            f"No Trompe server answers at {url} ({error or type(error).__name__}). {remedy}"
         ) from error
     except (httpx.RequestError, httpx.InvalidURL) as error:
         raise ServerUnreachable(

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from tests.client.conftest import SPEC, FakeServer
 from trompe_client import (
     APIError,
+    AsyncClient,
     BadRequest,
     Client,
     ContractError,
@@ -180,6 +182,32 @@ def test_an_answer_of_some_other_server_is_quoted() -> None:
     with answering(302, b"", Location="/login") as client, pytest.raises(BadRequest, match="HTTP 302"):
         client.objects()
     with answering(200, b'[{"id": 3}]') as client, pytest.raises(ContractError, match="same version"):
+        client.objects()
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "host"),
+    [
+        ("ALL_PROXY", "socks5://127.0.0.1:9", "trompe.example"),
+        ("ALL_PROXY", "socks://proxy", "trompe.example"),
+        ("NO_PROXY", "::1/128", "trompe.example"),
+        ("SSL_CERT_FILE", "/no", "trompe.example"),
+        ("SSL_CERT_FILE", "/no", "localhost"),
+    ],
+)
+def test_network_settings_that_cannot_be_used_are_told(
+    monkeypatch: pytest.MonkeyPatch, variable: str, value: str, host: str
+) -> None:
+    monkeypatch.setenv(variable, value)
+    for client in (Client, AsyncClient):
+        with pytest.raises(SpecError, match=rf"environment cannot be used \(.+\)\. Correct .*{variable}"):
+            client(f"https://{host}")
+
+
+def test_an_unknown_certificate_is_told_with_its_remedy() -> None:
+    refusal = httpx.ConnectError("[SSL: CERTIFICATE_VERIFY_FAILED] certificate verify failed")
+    client = Client(transport=httpx.MockTransport(Mock(side_effect=refusal)), retries=Retries(limit=0))
+    with client, pytest.raises(ServerUnreachable, match=r"FAILED.*SSL_CERT_FILE"):
         client.objects()
 
 
