@@ -3,8 +3,10 @@
 The jobs are fake.
 """
 
+import json
 import shutil
 import signal
+import socket
 import subprocess
 import threading
 import time
@@ -35,7 +37,7 @@ class Serve(Served):
     """A running ``trompe serve`` with tokens: ``http`` may write, ``reader`` may read."""
 
     def __init__(self, data: Path) -> None:
-        super().__init__(data, environment=FAKE | {"TROMPE_RATE_LIMIT": "0"})
+        super().__init__(data, environment=FAKE | {"TROMPE_RATE_LIMIT": "0", "TROMPE_LOG": "json"})
         prepare_data(self.settings)
         self.tokens = Tokens(self.store.engine)
         self.secret = self.tokens.create("writer", Right.write)
@@ -55,6 +57,15 @@ class Serve(Served):
 def serve(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serve]:
     with Serve(tmp_path_factory.mktemp("api") / "data") as running:
         yield running
+
+
+def test_a_log_in_json_has_the_http_servers_lines_too(serve: Serve) -> None:
+    with socket.create_connection(("127.0.0.1", serve.port)) as connection:
+        connection.sendall(b"nonsense\r\n\r\n")
+        assert connection.recv(100).startswith(b"HTTP/1.1 400")
+    wait_until(lambda: "Invalid HTTP request" in serve.words())
+    (line,) = (line for line in serve.words().splitlines() if "Invalid HTTP request" in line)
+    assert json.loads(line)["logger"] == "uvicorn.error"
 
 
 def all_ended(serve: Serve) -> bool:

@@ -151,8 +151,11 @@ def _check_origin(request: Request) -> None:
     origin = request.headers.get("origin")
     if origin is None or request.method in READING:
         return
-    if _split(origin).netloc != request.headers.get("host"):
-        raise _RefusedError(403, "other-origin", f"Pages of {origin} may not write here.")
+    host = request.headers.get("host")
+    if _split(origin).netloc != host:
+        raise _RefusedError(
+            403, "other-origin", f"Pages of {origin} may not write at {host}. A proxy must pass on the header Host."
+        )
 
 
 def _check_host(request: Request) -> None:

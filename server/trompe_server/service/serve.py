@@ -87,6 +87,7 @@ def _serve_http(
     _allow_many_connections()
     config = uvicorn.Config(
         app,
+        log_config=None,
         log_level="warning",
         timeout_keep_alive=KEEP_ALIVE,
         timeout_graceful_shutdown=5,

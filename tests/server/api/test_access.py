@@ -187,6 +187,7 @@ def test_a_page_of_another_site_can_neither_write_nor_read(api: Api) -> None:
     for origin in ("https://evil.example", "null", "http://trompe:8000"):
         refusal = api.problem(api.post("/v1/jobs", json={}, headers={"Origin": origin}), 403)
         assert refusal["type"] == "urn:trompe:other-origin"
+        assert refusal["detail"].startswith(f"Pages of {origin} may not write at trompe. A proxy must pass on")
     api.problem(api.post("/v1/jobs", json={}, headers={"Origin": "http://trompe"}), 422)
     evil = {"Origin": "https://evil.example"}
     assert not [name for name in api.get("/v1/jobs", headers=evil).headers if name.startswith("access-control")]

@@ -75,18 +75,20 @@ def test_a_background_is_an_image(api: Api, tmp_path: Path) -> None:
     )
 
 
-def test_an_upload_over_the_limit_is_refused_however_it_comes(api: Api) -> None:
-    announced = api.upload_object(b"0" * 200_000)
-    assert "0.0953674 MiB" in api.problem(announced, 413)["detail"]
-
+@pytest.mark.parametrize(
+    ("path", "limit"),
+    [("/v1/objects", "0.0953674 MiB"), ("/v1/jobs", "1 MiB"), ("/v1/judgements", "1 MiB"), ("/login", "1 MiB")],
+)
+def test_a_body_over_the_limit_is_refused_however_it_comes(api: Api, path: str, limit: str) -> None:
     async def parts() -> AsyncIterator[bytes]:
         yield b'--b\r\nContent-Disposition: form-data; name="file"; filename="x.zip"\r\n\r\n'
         for _ in range(20):
-            yield b"0" * 10_000
+            yield b"0" * 100_000
         yield b"\r\n--b--\r\n"
 
-    chunked = api.post("/v1/objects", content=parts(), headers={"content-type": "multipart/form-data; boundary=b"})
-    assert "larger than" in api.problem(chunked, 413)["detail"]
+    for content in (b"0" * 2_000_000, parts()):
+        answer = api.post(path, content=content, headers={"content-type": "multipart/form-data; boundary=b"})
+        assert f"larger than {limit}" in api.problem(answer, 413)["detail"]
 
 
 def test_the_client_uploads_the_files_that_classifiers_are_read_from() -> None:

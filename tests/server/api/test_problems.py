@@ -135,3 +135,11 @@ def test_writes_are_logged_with_request_token_and_job(stocked: Api, caplog: pyte
     assert record.getMessage().startswith(f"POST /v1/jobs/{job}/cancel 200 in ")
     told = {name: vars(record)[name] for name in ("request", "token", "job")}
     assert told == {"request": answer.headers["x-request-id"], "token": "ci", "job": job}
+
+
+def test_failed_reads_are_logged_in_one_line(api: Api, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", logger="trompe_server.api.middleware")
+    answer = api.get("/v1/jobs/none%0AINFO")
+    record = caplog.records[-1]
+    assert record.getMessage().startswith("GET /v1/jobs/none%0AINFO 404 in ")
+    assert vars(record)["request"] == answer.headers["x-request-id"]
