@@ -32,7 +32,7 @@ class Settings(BaseSettings):
     """URL of the database, SQLite or PostgreSQL; empty: a file in the data folder."""
     store: str = ""
     """Store of artifacts and uploads: a local folder, or any URL fsspec supports; empty: the data folder."""
-    max_upload: int = 512 * 2**20
+    max_upload: Annotated[int, Field(gt=0)] = 512 * 2**20
     """Largest upload, bytes."""
     rate_limit: Annotated[float, Field(ge=0)] = 100.0
     """Requests per second allowed to each token, or to each address without a token; 0: no limit."""
@@ -58,7 +58,7 @@ class Settings(BaseSettings):
     networks: Texts = ()
     """Networks by name that jobs may use, as patterns (``timm:*``, ``hf:google/vit-base-patch16-224``); in the
     environment a JSON list."""
-    renderer_patience: float = 10.0
+    renderer_patience: Annotated[float, Field(ge=0)] = 10.0
     """Seconds a job waits for a renderer."""
     pipeline: str = "trompe_server.job.texture_attack:open_job"
     """``module:function`` that opens a job, with the signature of the default; replaced by tests."""

@@ -96,4 +96,9 @@ def _serve_metrics(settings: Settings) -> None:
     registry = CollectorRegistry()
     settings.metrics_folder.mkdir(parents=True, exist_ok=True)
     MultiProcessCollector(registry, path=str(settings.metrics_folder))  # type: ignore[no-untyped-call]
-    prometheus_client.start_http_server(settings.metrics_port, registry=registry)
+    try:
+        prometheus_client.start_http_server(settings.metrics_port, registry=registry)
+    except OSError as error:
+        raise ServiceError(
+            f"Cannot serve metrics on port {settings.metrics_port} ({error}). Choose another TROMPE_METRICS_PORT."
+        ) from error

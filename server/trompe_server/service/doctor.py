@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from trompe_server.settings import Settings
+from trompe_shared.addresses import without_password
 from trompe_shared.errors import TrompeError
 
 PATIENCE: Final = 60.0
@@ -121,9 +122,9 @@ def _check_folder(folder: Path, *, min_free: int = MIN_FREE) -> str:
 def _check_store(settings: Settings) -> str:
     from trompe_server.storage.folders import open_folder
 
-    name, data = f"doctor-{secrets.token_hex(8)}", b"content"
+    name, data, shown = f"doctor-{secrets.token_hex(8)}", b"content", without_password(settings.store_url)
     remedy = "Check the URL and the access rights (--store, TROMPE_STORE, credentials of the storage's own tools)."
-    with _or(remedy, Exception, words=f"{settings.store_url} does not store a file"):  # fsspec raises any kind
+    with _or(remedy, Exception, words=f"{shown} does not store a file"):  # fsspec raises any kind
         folder = open_folder(settings.store_url)
         folder.write(name, data)
         try:
@@ -131,7 +132,7 @@ def _check_store(settings: Settings) -> str:
                 raise OSError("reads back other bytes than written")
         finally:
             folder.delete(name)
-    return f"{settings.store_url} stores a file"
+    return f"{shown} stores a file"
 
 
 def _check_database(settings: Settings) -> str:

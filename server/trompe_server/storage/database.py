@@ -5,7 +5,6 @@ it locks rows, and a process frozen within a transaction loses its locks. Every 
 database cannot be reached, and ``SpecError`` for a value that it cannot hold.
 """
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final
@@ -17,6 +16,7 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 
 from trompe_server.errors import ServiceError
+from trompe_shared.addresses import without_password
 from trompe_shared.errors import SpecError
 
 BUSY_TIMEOUT: Final = 30_000
@@ -70,6 +70,9 @@ def connect(url: str) -> sa.Engine:
         sa.event.listen(engine, "connect", _prepare_sqlite)
     elif kind in {"postgresql", "postgres"}:
         parsed = parsed.set(drivername="postgresql+psycopg")
+        password = parsed.query.get("password")
+        if isinstance(password, str):  # messages show the query
+            parsed = parsed.difference_update_query(["password"]).set(password=password)
         engine = sa.create_engine(parsed, pool_pre_ping=True, pool_size=10, max_overflow=40, connect_args=POSTGRES)
     else:
         raise ServiceError(_invalid_url(url))
@@ -106,8 +109,7 @@ def _translate(context: ExceptionContext) -> BaseException | None:
 
 
 def _invalid_url(url: str) -> str:
-    shown = re.sub(r"(://[^:/@]*:).*@", r"\1***@", url)
     return (
-        f"{shown!r} is not a supported database URL: give sqlite:////absolute/path.sqlite or "
+        f"{without_password(url)!r} is not a supported database URL: give sqlite:////absolute/path.sqlite or "
         "postgresql://user:password@host:5432/name (--database or TROMPE_DATABASE)."
     )

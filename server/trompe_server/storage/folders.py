@@ -11,6 +11,7 @@ from typing import Any, BinaryIO, Final, cast
 
 from trompe_server.errors import MissingFileError, ServiceError
 from trompe_server.system.files import no_space, write_whole
+from trompe_shared.addresses import without_password
 from trompe_shared.errors import SpecError, TrompeError
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]{0,199}")
@@ -31,8 +32,8 @@ def open_folder(url: str | Path) -> "Folder":
         system, root = fsspec.core.url_to_fs(text, use_listings_cache=False)
     except (ImportError, ValueError) as error:
         raise ServiceError(
-            f"The store {text!r} cannot be opened ({error}). Give a folder or a URL supported by fsspec; "
-            "s3:// needs: pip install 'trompe[s3]'."
+            f"The store {without_password(text)!r} cannot be opened ({error}). Give a folder or a URL supported "
+            "by fsspec; s3:// needs: pip install 'trompe[s3]'."
         ) from error
     return RemoteArtifacts(system, root.rstrip("/"))
 

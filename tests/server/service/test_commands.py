@@ -3,6 +3,7 @@
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -42,7 +43,11 @@ def run(command: click.Command, *arguments: str) -> tuple[int, str]:
         ),
         *(
             pytest.param(commands.worker, ["--renderer", wrong], 2, "is not HOST:PORT", id=f"address {wrong!r}")
+<<<<<<< HEAD
             for wrong in ("8085", "host:", ":80x", "", "a..b:80")
+=======
+            for wrong in ("8085", "host:", ":80x", "", "http://host:8085", "::1")
+>>>>>>> 01f9603 (Operation: passwords in URLs of store and database stay out of messages; wrong settings and addresses are told)
         ),
         *(
             pytest.param(commands.migrate, ["--database", url], 1, "is not a supported database URL", id=url)
@@ -76,6 +81,8 @@ def test_serve_says_what_is_wrong_with_the_data_folder(tmp_path: Path) -> None:
     [
         ("TROMPE_WORKERS", "many", "workers: Input should be a valid integer, unable to parse"),
         ("TROMPE_NETWORKS", "tiny", "networks: 'tiny' is not a JSON list"),
+        ("TROMPE_MAX_UPLOAD", "-1", "max_upload: Input should be greater than 0"),
+        ("TROMPE_RENDERER_PATIENCE", "nan", "renderer_patience: Input should be greater than or equal to 0"),
     ],
 )
 def test_wrong_settings_are_named_with_their_variable(
@@ -85,6 +92,14 @@ def test_wrong_settings_are_named_with_their_variable(
     status, words = run(commands.migrate, "--data", str(tmp_path))
     assert status == 2
     assert re.search(rf"{fault}[^()]* \({variable}\)", words)
+
+
+def test_metrics_on_a_port_in_use_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("", 0)) as taken:
+        port = taken.getsockname()[1]
+        monkeypatch.setenv("TROMPE_METRICS_PORT", str(port))
+        status, words = run(commands.worker, "--data", str(tmp_path), "--renderer", "127.0.0.1:1")
+    assert (status, f"Cannot serve metrics on port {port}" in words) == (1, True), words
 
 
 def test_an_option_goes_before_a_wrong_variable(monkeypatch: pytest.MonkeyPatch) -> None:

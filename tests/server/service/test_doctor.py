@@ -5,6 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner
 
 from tests.served import answering_once, reserved_port, saying
@@ -43,10 +44,11 @@ def test_a_full_disk_is_found(tmp_path: Path) -> None:
     assert "trompe jobs delete" in str(failed(doctor._check_folder, tmp_path, min_free=2**80).remedy)
 
 
-def test_a_database_that_is_away_is_found_and_its_password_kept(tmp_path: Path) -> None:
-    url = "postgresql://me:hunter2@127.0.0.1:9/trompe"
-    finding = failed(doctor._check_database, Settings(data=tmp_path, database=url))
-    assert "hunter2" not in str(finding)
+@pytest.mark.parametrize("database", ["me:hunter2@127.0.0.1:9/trompe", "me@127.0.0.1:9/trompe?password=hunter2"])
+def test_a_database_that_is_away_is_found_and_its_password_kept(tmp_path: Path, database: str) -> None:
+    settings = Settings(data=tmp_path, database=f"postgresql://{database}")
+    finding = failed(doctor._check_database, settings)
+    assert "hunter2" not in f"{finding} {JobStore(settings.database_url).engine.url!r}"
     assert "TROMPE_DATABASE" in str(finding.remedy)
 
 
@@ -61,8 +63,11 @@ def test_a_database_without_tables_is_found(tmp_path: Path) -> None:
     assert "jobs: none; attack workers alive: 0" in doctor._check_database(settings)
 
 
-def test_a_store_that_nobody_knows_is_found(tmp_path: Path) -> None:
-    assert "--store" in str(failed(doctor._check_store, Settings(data=tmp_path, store="nosuch://bucket")).remedy)
+@pytest.mark.parametrize("store", ["nosuch://me:hunter2@bucket", "ftp://me:hunter2@127.0.0.1:9/trompe"])
+def test_a_store_that_does_not_work_is_found_and_its_password_kept(tmp_path: Path, store: str) -> None:
+    finding = failed(doctor._check_store, Settings(data=tmp_path, store=store))
+    assert "--store" in str(finding.remedy)
+    assert "hunter2" not in str(finding)
 
 
 def test_a_machine_without_gl_is_told_what_to_install() -> None:
