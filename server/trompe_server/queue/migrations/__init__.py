@@ -59,4 +59,7 @@ def _migrate(connection: sa.Connection) -> None:
     try:
         command.upgrade(config, "head")
     except CommandError as error:
-        raise ServiceError(f"The tables in {connection.engine.url!r} cannot be upgraded: {error}.") from error
+        raise ServiceError(
+            f"The tables in {connection.engine.url!r} were made by a newer Trompe ({error}); use that version, or "
+            "another --data or --database."
+        ) from error
