@@ -43,11 +43,7 @@ def run(command: click.Command, *arguments: str) -> tuple[int, str]:
         ),
         *(
             pytest.param(commands.worker, ["--renderer", wrong], 2, "is not HOST:PORT", id=f"address {wrong!r}")
-<<<<<<< HEAD
-            for wrong in ("8085", "host:", ":80x", "", "a..b:80")
-=======
-            for wrong in ("8085", "host:", ":80x", "", "http://host:8085", "::1")
->>>>>>> 01f9603 (Operation: passwords in URLs of store and database stay out of messages; wrong settings and addresses are told)
+            for wrong in ("8085", "host:", ":80x", "", "a..b:80", "http://host:8085", "::1")
         ),
         *(
             pytest.param(commands.migrate, ["--database", url], 1, "is not a supported database URL", id=url)
