@@ -120,6 +120,11 @@ def test_a_name_that_could_leave_the_folder_is_refused(folder: Folder, tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_url_with_one_slash_is_no_folder() -> None:
+    with pytest.raises(ServiceError, match=r"'s3:/bucket' is no URL: write 's3://bucket'"):
+        open_folder("s3:/bucket")
+
+
 def test_a_store_that_nobody_knows_is_refused_with_a_remedy() -> None:
     with pytest.raises(ServiceError, match="cannot be opened"):
         open_folder("nonsense://bucket")

@@ -23,6 +23,8 @@ def open_folder(url: str | Path) -> "Folder":
     text = str(url)
     scheme, _, rest = text.partition("://")
     if not rest:
+        if re.match(r"[a-z0-9]{2,}:/", text):
+            raise ServiceError(f"The store {text!r} is no URL: write {text.replace(':/', '://', 1)!r}.")
         return LocalArtifacts(Path(text))
     if scheme in {"file", "local"}:
         return LocalArtifacts(Path(urllib.parse.unquote(rest)))
