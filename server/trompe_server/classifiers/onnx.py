@@ -71,7 +71,7 @@ def load_onnx(path: Path, device: str = "cpu") -> OnnxClassifier:
     if not _alike(_run(session, images[1:], fixed_batch), logits):
         raise broken(path.name, "its logits of an image depend on chance")
     refuse_probabilities(logits, path.name)
-    if fixed_batch is None and not _takes_batches(session, images):
+    if fixed_batch is None and not _takes_batches(session, images, logits):
         fixed_batch = 1
     return OnnxClassifier(path.stem, session, size, logits.shape[1], fixed_batch)
 
@@ -123,12 +123,12 @@ def _input(session: Any, file: str) -> tuple[int | None, tuple[int, int]]:
     return batch if isinstance(batch, int) else None, (height, width)
 
 
-def _takes_batches(session: Any, images: Logits) -> bool:
-    """Whether images get the same logits together as alone.
+def _takes_batches(session: Any, images: Logits, last: Logits) -> bool:
+    """Whether two images get the same logits together as alone; ``last``: those of the second one.
 
     Not from a graph with a reshape for one image, nor if 8-bit activations are scaled by the range of the batch.
     """
-    alone = np.concatenate([_run(session, image[None], None) for image in images])
+    alone = np.concatenate([_run(session, images[:1], None), last])
     try:
         together = _run(session, images, None)
     except Exception:  # of onnxruntime, which has no common class of errors

@@ -125,11 +125,12 @@ def _by_name(reference: str, name: str | None, classes: Sequence[str] | None, de
 
 
 def _from_file(path: Path, name: str | None, classes: Sequence[str] | None, device: str) -> Classifier:
-    if path.suffix.lower() not in LOADERS:
+    load = LOADERS.get(path.suffix.lower())
+    if load is None:
         raise ClassifierError(f"{str(path)!r} is not a supported classifier; give {KNOWN}.")
     if not path.is_file():
         raise ClassifierError(f"There is no classifier file {str(path)!r}; check the path, or give 'tiny'.")
-    loaded = LOADERS[path.suffix.lower()](path, device)
+    loaded = load(path, device)
     names = check_classes(classes, loaded.n_classes, path.name)
     return replace(loaded, name=name or path.stem, classes=names)
 
