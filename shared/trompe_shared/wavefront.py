@@ -182,7 +182,7 @@ def parse_surfaces(text: str, file: str) -> tuple[Surface, ...]:
     reader = _Reader(file)
     reader.read(text)
     if not reader.corners:
-        raise ObjectError(f"{file!r} has no faces.")
+        raise ObjectError(f"{file!r} has no faces ('f' lines); export the mesh with its faces, not only its points.")
     numbers = dict(reader.numbers)
     if len(reader.colours) == len(numbers["v"]):
         numbers["colour"] = reader.colours

@@ -10,7 +10,7 @@ from trompe_server.formats.assembly import DEFAULT_COLOUR, free_name, painted_fl
 from trompe_server.formats.pictures import decode, shrink
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
-from trompe_shared.local_files import PICTURE_SUFFIXES, encoding_of, libraries, named, text_of
+from trompe_shared.local_files import PICTURE_SUFFIXES, encoding_of, libraries, library_names, named, text_of
 from trompe_shared.object3d import (
     Object3D,
     decode_alpha,
@@ -134,7 +134,7 @@ class _Completion:
     def files_of(self) -> dict[str, bytes]:
         """The completed files."""
         if not self._libraries:
-            self._refuse_unnamed_pictures()
+            self._refuse_lost_pictures()
             self._surfaces = tuple(
                 replace(surface, material=safe_name(surface.material, default="default")) for surface in self._surfaces
             )
@@ -162,13 +162,19 @@ class _Completion:
             self._libraries[first] = f"{text}\nnewmtl {NO_MATERIAL}\n"
             self._rewritten = True
 
-    def _refuse_unnamed_pictures(self) -> None:
+    def _refuse_lost_pictures(self) -> None:
         """Raise ``ObjectError`` if the mesh is ready for a picture that no material names."""
-        pictures = [name for name in self._files if name.lower().endswith(tuple(PICTURE_SUFFIXES))]
-        if pictures and any(surface.uvs is not None and surface.colours is None for surface in self._surfaces):
+        if not any(surface.uvs is not None and surface.colours is None for surface in self._surfaces):
+            return
+        if pictures := [name for name in self._files if name.lower().endswith(tuple(PICTURE_SUFFIXES))]:
             raise ObjectError(
                 f"There is no .mtl beside {self._mesh!r}, so nothing says what {sorted(pictures)[:4]} is for. Add the "
                 ".mtl, with map_Kd for the albedo, or leave the pictures away for a plain object."
+            )
+        if names := library_names(self._text):
+            raise ObjectError(
+                f"{self._mesh!r} names the materials file {names[0]!r}, which did not come with it. Add it and its "
+                "pictures (a zip or folder holds all), or delete the line 'mtllib' for a plain grey object."
             )
 
     def _add(self, surface: Surface) -> None:

@@ -233,6 +233,7 @@ def test_a_bare_obj_is_grey_and_comes_back_with_its_texture() -> None:
     obj, out = comes_back(OBJ.replace("mtllib t.mtl\n", "").encode(), "t.obj")
     assert set(np.unique(next(iter(obj.textures.values())))) == {204}
     assert sorted(unpack(out)) == ["red_albedo.png", "t.mtl", "t.obj"]
+    assert "names the materials file 't.mtl', which did not come with it" in refusal(OBJ.encode(), "t.obj")
 
 
 @pytest.mark.parametrize("scale", [1, 255])
