@@ -134,6 +134,12 @@ def test_a_background_is_a_colour_or_a_picture_file(tmp_path: Path) -> None:
         pytest.param({"elevations": 2}, "random views are attacked: add `grid`", id="rows of no grid"),
         pytest.param({"ranges": {"colour": (0, 1)}}, "`ranges` colour: Extra inputs", id="no such range"),
         pytest.param({"ranges": {"roll": 3}}, "`ranges` roll: Input should be", id="no range"),
+        pytest.param(
+            {"label": True}, "`label` 0: should be a class by name or index; got true", id="label of no class"
+        ),
+        pytest.param(
+            {"target": False}, "`target`: should be a class by name or index; got false", id="target of no class"
+        ),
         pytest.param({"background": []}, "`background`: Value should have at least 1 item", id="no background"),
     ],
 )
@@ -143,7 +149,7 @@ def test_a_wrong_option_is_named_before_any_server_is_asked(option: dict[str, An
 
 
 def test_a_label_or_several_are_names_or_indices_of_any_library() -> None:
-    for label in (5, np.int64(5), [np.int64(5)], "5"):
+    for label in (5, 5.0, np.int64(5), [np.int64(5)], "5"):
         assert [int(each) for each in plan_attack("mug", label=label).request({}).goal.label] == [5]
 
 

@@ -118,11 +118,18 @@ CONDITIONS: Final[dict[Conditions, ViewRanges]] = {
 
 
 def _as_list(given: Any) -> Any:
-    return [given] if isinstance(given, str | SupportsIndex) else given
+    return [given] if isinstance(given, str | float | SupportsIndex) else given
 
 
+def _not_bool(given: Any) -> Any:
+    if isinstance(given, bool):
+        raise ValueError(f"should be a class by name or index; got {str(given).lower()}")
+    return given
+
+
+ClassName = Annotated[str | int, BeforeValidator(_not_bool)]
 ClassNames = Annotated[
-    list[str | int],
+    list[ClassName],
     BeforeValidator(_as_list, json_schema_input_type=str | int | list[str | int]),
     Field(min_length=1, max_length=64),
 ]
@@ -244,7 +251,7 @@ class GoalOptions(_Part):
         metavar="NAME_OR_INDEX",
         in_form=True,
     )
-    target: str | int | None = option(None, "class to be taken for; default: any other class", metavar="NAME_OR_INDEX")
+    target: ClassName | None = option(None, "class to be taken for; default: any other class", metavar="NAME_OR_INDEX")
     top_k: Annotated[int, Field(ge=1)] = option(1, "the true class must leave the k best classes")
     loss: Loss = option("margin", "loss to maximise")
 
