@@ -47,9 +47,8 @@ def send_file(request: Request, artifacts: JobArtifacts, name: str, *, digest: s
     headers |= {"Content-Length": str(len(part)), "Content-Disposition": f'inline; filename="{name}"'}
     if asked is not None:
         headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
-    body: Iterable[bytes] = () if request.method == "HEAD" else _parts(artifacts.open(name), part)
     media_type = guess_type(name)[0] or "application/octet-stream"
-    return StreamingResponse(body, 200 if asked is None else 206, headers, media_type)
+    return StreamingResponse(_parts(artifacts, name, part), 200 if asked is None else 206, headers, media_type)
 
 
 def zip_stream(artifacts: JobArtifacts, names: Iterable[str], *, time: datetime) -> Iterator[bytes]:
@@ -61,7 +60,7 @@ def zip_stream(artifacts: JobArtifacts, names: Iterable[str], *, time: datetime)
             info.compress_type = zipfile.ZIP_STORED if name[name.rfind(".") :] in _PACKED else zipfile.ZIP_DEFLATED
             info.file_size = artifacts.size(name)
             with archive.open(info, "w") as member:
-                for part in _parts(artifacts.open(name), range(info.file_size)):
+                for part in _parts(artifacts, name, range(info.file_size)):
                     member.write(part)
                     yield sink.take()
     yield sink.take()
@@ -86,8 +85,8 @@ class _Sink:
         return taken
 
 
-def _parts(file: BinaryIO, wanted: range) -> Iterator[bytes]:
-    with file:
+def _parts(artifacts: JobArtifacts, name: str, wanted: range) -> Iterator[bytes]:
+    with artifacts.open(name) as file:
         file.seek(wanted.start)
         left = len(wanted)
         while left and (part := file.read(min(PART, left))):

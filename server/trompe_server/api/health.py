@@ -31,14 +31,12 @@ def list_renderers(services: ServicesDep) -> list[RendererInfo]:
     return services.renderers()
 
 
-@router.head("/healthz", include_in_schema=False)
 @router.get("/healthz", tags=["health"], responses=examples.found({"status": "ok"}))
 def health() -> dict[str, str]:
     """The process answers."""
     return {"status": "ok"}
 
 
-@router.head("/readyz", include_in_schema=False)
 @router.get("/readyz", tags=["health"], responses=examples.found({"status": "ready"}))
 def readiness(services: ServicesDep, request: Request) -> Response:
     """Database, worker and renderer are up; 503 names the missing ones."""

@@ -155,7 +155,6 @@ def read_result(services: ServicesDep, request: Request, job: str) -> Response:
     return send(services, request, with_result(services, job, RESULT), RESULT)
 
 
-@router.head("/{job}/artifacts/{name}", include_in_schema=False)
 @router.get("/{job}/artifacts/{name}", response_class=Response, responses=examples.FILE_ANSWERS)
 def read_artifact(services: ServicesDep, request: Request, job: str, name: str) -> Response:
     """One of the job's ``artifacts``, or a range of its bytes. The ETag is the file's SHA-256."""

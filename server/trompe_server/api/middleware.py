@@ -1,5 +1,6 @@
 """Middleware, from the outside in: request ids, log, security headers, errors as problem details; body limit."""
 
+import asyncio
 import logging
 import secrets
 import time
@@ -125,6 +126,33 @@ class Envelope(HttpMiddleware):
         )
 
 
+class Head(HttpMiddleware):
+    """Answers HEAD as GET, without the body: after the headers the application takes the client for gone."""
+
+    async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+        answered = asyncio.Event()
+
+        async def send_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                scope["method"] = "HEAD"  # or the server awaits the body
+                await send(message)
+                await send({"type": "http.response.body"})
+                answered.set()
+
+        async def leave() -> Message:
+            await answered.wait()
+            return {"type": "http.disconnect"}
+
+        scope["method"] = "GET"
+        try:
+            await self._app(scope, leave, send_headers)
+        finally:
+            scope["method"] = "HEAD"
+
+
 class BodyLimit(HttpMiddleware):
     """Refuses bodies of more than ``limit`` bytes (uploads) or ``MAX_REQUEST`` with 413, announced and actual ones."""
 
@@ -134,10 +162,10 @@ class BodyLimit(HttpMiddleware):
 
     async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["path"] in FILE_PATHS:
-            limit, whose = self._limit, "the limit of this server (TROMPE_MAX_UPLOAD)"
+            limit, what, whose = self._limit, "upload", "the limit of this server (TROMPE_MAX_UPLOAD)"
         else:
-            limit, whose = MAX_REQUEST, "the limit of requests that bring no file"
-        refusal = f"The upload is larger than {limit / 2**20:g} MiB, {whose}."
+            limit, what, whose = MAX_REQUEST, "request", "the limit of requests without a file"
+        refusal = f"The {what} is larger than {limit / 2**20:g} MiB, {whose}."
         announced = dict(scope["headers"]).get(b"content-length", b"0")
         if announced.isdigit() and int(announced) > limit:
             await problem_response(Request(scope), 413, code="too-large", detail=refusal)(scope, receive, send)

@@ -12,6 +12,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 
 from trompe_server.errors import ConflictError, NotFoundError, ServiceError
 from trompe_server.storage.database import DatabaseDownError
@@ -95,7 +96,20 @@ async def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     if _is_disk_full(error):
         return _disk_full(request, error)
-    return problem_response(request, error.status_code, detail=error.detail, headers=error.headers)
+    allowed = _methods(request) if error.status_code == 405 else ""
+    headers = {"Allow": allowed} if allowed else error.headers
+    return problem_response(request, error.status_code, detail=error.detail, headers=headers)
+
+
+def _methods(request: Request) -> str:
+    """Methods of all routes of the path; Starlette names those of the first. Empty for static files."""
+
+    def has(method: str) -> bool:
+        scope = {**request.scope, "method": method}
+        return any(route.matches(scope)[0] is Match.FULL for route in request.app.routes)
+
+    methods = list(filter(has, ("GET", "POST", "DELETE")))
+    return ", ".join(methods + ["HEAD"] * ("GET" in methods))
 
 
 def failure_response(request: Request, error: Exception) -> JSONResponse:

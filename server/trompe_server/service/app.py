@@ -3,12 +3,13 @@
 from importlib.metadata import version
 from typing import Final
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 
 from trompe_server.api import classify, health, jobs, judgements, library
 from trompe_server.api.contract import contract
 from trompe_server.api.guard import Guard
-from trompe_server.api.middleware import BodyLimit, Envelope
+from trompe_server.api.middleware import BodyLimit, Envelope, Head
+from trompe_server.api.parameters import refuse_unknown
 from trompe_server.api.problems import answer_with_problems
 from trompe_server.api.services import Services
 from trompe_server.pages import add_pages
@@ -23,12 +24,14 @@ def create_app(services: Services) -> FastAPI:
     app = FastAPI(title="Trompe", version=version("trompe"), description=DESCRIPTION, docs_url=None, redoc_url=None)
     app.state.services = services
     # the last middleware is the outermost
+    app.add_middleware(Head)
     app.add_middleware(BodyLimit, limit=services.settings.max_upload)
     app.add_middleware(Guard, tokens=services.tokens, rate=services.settings.rate_limit)
     app.add_middleware(Envelope, metrics=services.metrics)
     answer_with_problems(app)
-    for router in (library.router, classify.router, jobs.router, judgements.router, jobs.experiments, health.router):
-        app.include_router(router)
+    for router in (library.router, classify.router, jobs.router, judgements.router, jobs.experiments):
+        app.include_router(router, dependencies=[Depends(refuse_unknown)])
+    app.include_router(health.router)
     add_pages(app)
     app.openapi = lambda: contract(app)  # type: ignore[method-assign]
     return app

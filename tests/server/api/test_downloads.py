@@ -139,10 +139,25 @@ def test_a_download_goes_on_only_if_the_file_is_the_same(done: Ended) -> None:
     assert done.get(headers=part | {"If-Range": '"other"'}).content == TEN
 
 
-def test_head_tells_size_and_hash_alone_and_an_empty_file_is_served(done: Ended) -> None:
-    head = done.api.request("HEAD", f"/v1/jobs/{done.job}/artifacts/digits.txt")
-    assert (head.status_code, head.content, head.headers["content-length"]) == (200, b"", "10")
-    assert head.headers["etag"] == done.get().headers["etag"]
+READ = ("artifacts/digits.txt", "artifacts/nope", "archive", "result", "events", "")
+
+
+@pytest.mark.parametrize("path", READ)
+def test_head_has_status_and_headers_of_get_alone(done: Ended, path: str) -> None:
+    head, get = (done.api.request(method, f"/v1/jobs/{done.job}/{path}".rstrip("/")) for method in ("HEAD", "GET"))
+    assert (head.status_code, head.content) == (get.status_code, b"")
+    own = {"x-request-id", "content-length"} if get.status_code == 404 else {"x-request-id"}
+    assert [(name, value) for name, value in head.headers.items() if name not in own] == [
+        (name, value) for name, value in get.headers.items() if name not in own
+    ]
+
+
+@pytest.mark.timeout(20)
+def test_head_does_not_wait_for_the_events_of_a_job_that_goes_on(stocked: Api) -> None:
+    assert stocked.request("HEAD", f"/v1/jobs/{stocked.job()}/events").status_code == 200
+
+
+def test_an_empty_file_is_served(done: Ended) -> None:
     assert done.get("empty.txt").content == b""
     assert done.get("empty.txt", {"Range": "bytes=0-"}).status_code == 416
 

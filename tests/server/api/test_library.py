@@ -76,10 +76,15 @@ def test_a_background_is_an_image(api: Api, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "limit"),
-    [("/v1/objects", "0.0953674 MiB"), ("/v1/jobs", "1 MiB"), ("/v1/judgements", "1 MiB"), ("/login", "1 MiB")],
+    ("path", "told"),
+    [
+        ("/v1/objects", "The upload is larger than 0.0953674 MiB"),
+        ("/v1/jobs", "The request is larger than 1 MiB"),
+        ("/v1/judgements", "The request is larger than 1 MiB"),
+        ("/login", "The request is larger than 1 MiB"),
+    ],
 )
-def test_a_body_over_the_limit_is_refused_however_it_comes(api: Api, path: str, limit: str) -> None:
+def test_a_body_over_the_limit_is_refused_however_it_comes(api: Api, path: str, told: str) -> None:
     async def parts() -> AsyncIterator[bytes]:
         yield b'--b\r\nContent-Disposition: form-data; name="file"; filename="x.zip"\r\n\r\n'
         for _ in range(20):
@@ -88,7 +93,7 @@ def test_a_body_over_the_limit_is_refused_however_it_comes(api: Api, path: str, 
 
     for content in (b"0" * 2_000_000, parts()):
         answer = api.post(path, content=content, headers={"content-type": "multipart/form-data; boundary=b"})
-        assert f"larger than {limit}" in api.problem(answer, 413)["detail"]
+        assert told in api.problem(answer, 413)["detail"]
 
 
 def test_the_client_uploads_the_files_that_classifiers_are_read_from() -> None:

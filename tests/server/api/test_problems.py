@@ -25,6 +25,8 @@ ERRORS = [
     ("GET", "/v1/jobs/unknown/artifacts/x", 404),
     ("GET", "/v1/jobs?limit=0", 422),
     ("GET", "/v1/jobs?state=asleep", 422),
+    ("GET", "/v1/jobs?stat=running", 422),
+    ("GET", "/v1/objects?limit=1", 422),
     ("GET", "/v1/jobs?cursor=x", 422),
     ("GET", "/v1/objects/unknown", 404),
     ("POST", "/v1/objects", 422),
@@ -45,6 +47,28 @@ def test_every_error_is_problem_details(api: Api) -> None:
     for method, path, status in ERRORS:
         told = api.problem(api.request(method, path), status, (method, path))
         assert told["instance"] == path.partition("?")[0]
+
+
+def test_an_unknown_query_parameter_is_named_with_the_known_ones(api: Api) -> None:
+    assert "'stat'; did you mean 'state'?" in api.get("/v1/jobs?limit=1&stat=running").json()["detail"]
+    assert "'q'; /v1/jobs takes state, label, object" in api.get("/v1/jobs?q=x").json()["detail"]
+    assert "/v1/objects takes none" in api.get("/v1/objects?limit=1").json()["detail"]
+
+
+ALLOWED = [
+    ("/v1/jobs", "GET, POST, HEAD"),
+    ("/v1/jobs/x", "GET, DELETE, HEAD"),
+    ("/v1/jobs/x/cancel", "POST"),
+    ("/login", "GET, POST, HEAD"),
+    ("/static/trompe.css", "GET, HEAD"),
+]
+
+
+@pytest.mark.parametrize(("path", "methods"), ALLOWED)
+def test_a_refused_method_tells_those_of_all_routes_of_the_path(api: Api, path: str, methods: str) -> None:
+    answer = api.request("PUT", path)
+    api.problem(answer, 405)
+    assert answer.headers["allow"] == methods
 
 
 def test_a_mistake_of_the_server_is_told_without_its_secrets_and_logged_with_the_id_that_the_client_was_told(
