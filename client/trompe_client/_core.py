@@ -160,8 +160,10 @@ def error_from(status: int, headers: Mapping[str, str], body: bytes, *, job_id: 
     try:
         problem = Problem.model_validate_json(body)
     except ValidationError:
-        said = body[:200].decode("utf-8", "replace").strip() or "(empty)"
-        problem = Problem(title=f"HTTP {status}, not from Trompe's API. The answer was {said!r}", status=status)
+        said = f"answer was {body[:200].decode('utf-8', 'replace').strip() or '(empty)'!r}"
+        if "Location" in headers:
+            said = f"address redirects to {headers['Location']}; give the server's own address"
+        problem = Problem(title=f"HTTP {status}, not from Trompe's API. The {said}", status=status)
     kind = BY_STATUS.get(status, ServerFault if status >= 500 else BadRequest)
     pause = _retry_after(headers.get("Retry-After"))
     return kind(problem, request_id=headers.get("X-Request-ID"), job_id=job_id, retry_after=pause)

@@ -22,6 +22,7 @@
 A job that ends as n.a. (nothing was recognised before the attack) is a result, not an error.
 """
 
+import copyreg
 import re
 from typing import Any, ClassVar, Final
 
@@ -41,6 +42,10 @@ class ClientError(TrompeError):
         super().__init__(message)
         self.request_id = request_id
         self.job_id = job_id
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For pickle, which brings errors from worker processes: ``__init__`` takes other arguments than ``args``."""
+        return copyreg.__newobj__, (type(self), *self.args), vars(self)  # type: ignore[attr-defined]
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

@@ -1,6 +1,7 @@
 """The blocking and the asynchronous port over httpx, which no other module imports."""
 
 import asyncio
+import os
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -35,10 +36,16 @@ class BlockingPort:
         self.retries = retries
         self._url, self._timeout = connection.url, connection.timeout
         with _usable_environment():
-            self._http = httpx.Client(**_options(connection))
+            self._options = _options(connection)
+            self._connect()
+
+    def _connect(self) -> None:
+        self._process, self._http = os.getpid(), httpx.Client(**self._options)
 
     @asynccontextmanager
     async def open(self, request: Request[Any], *, silence: float | None = None) -> AsyncIterator["_Answer"]:
+        if self._process != os.getpid():  # forked: on the same connections each would read the other's answers
+            self._connect()
         with (
             _translated(self._url),
             _arguments(request, silence, self._timeout) as arguments,
@@ -147,6 +154,7 @@ def _options(connection: Connection) -> dict[str, Any]:
         "headers": {"User-Agent": f"trompe/{version('trompe')}", **token},
         "timeout": httpx.Timeout(connection.timeout, connect=min(CONNECT_SECONDS, connection.timeout)),
         "transport": connection.transport,
+        "limits": httpx.Limits(max_connections=None),  # each wait for a job holds one
         # A proxy cannot reach a server on this machine.
         "trust_env": not is_loopback(httpx.URL(connection.url).host),
         "verify": httpx.create_ssl_context(),  # with SSL_CERT_FILE, for that machine too

@@ -1,6 +1,8 @@
 """What the SDK promises, against a server that drops connections and refuses things."""
 
 import json
+import os
+import pickle
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -25,7 +27,9 @@ from trompe_client import (
     TooMany,
     Unauthorized,
     WaitTimeout,
+    _core,
 )
+from trompe_client._port import finish
 from trompe_shared.api import JobRequest, JobState, ViewRanges
 from trompe_shared.errors import ObjectError, SpecError
 
@@ -179,10 +183,41 @@ def test_a_token_may_end_with_its_line_and_a_wrong_one_is_told_without_being_sho
 def test_an_answer_of_some_other_server_is_quoted() -> None:
     with answering(404, b"<html>nginx") as client, pytest.raises(NotFound, match="<html>nginx"):
         client.objects()
-    with answering(302, b"", Location="/login") as client, pytest.raises(BadRequest, match="HTTP 302"):
+    moved = "HTTP 302, .* redirects to /login; give the server's own address"
+    with answering(302, b"", Location="/login") as client, pytest.raises(BadRequest, match=moved):
         client.objects()
     with answering(200, b'[{"id": 3}]') as client, pytest.raises(ContractError, match="same version"):
         client.objects()
+
+
+def test_errors_come_back_from_other_processes(client: Client, server: FakeServer) -> None:
+    job = client.submit(SPEC)
+    with pytest.raises(NotFound) as missing:
+        client.job("nope")
+    for error in (missing.value, JobFailed("why", job=job.status), ServerUnreachable("gone", job_id="j")):
+        again = pickle.loads(pickle.dumps(error))
+        assert (type(again), str(again), vars(again)) == (type(error), str(error), vars(error))
+
+
+def test_a_forked_process_opens_connections_of_its_own(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    client.objects()
+    inherited = vars(client.port)["_http"]
+    client.objects()
+    assert vars(client.port)["_http"] is inherited
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    assert client.objects()
+    assert vars(client.port)["_http"] is not inherited
+
+
+def test_any_number_of_jobs_can_be_waited_for_at_the_same_time(server: FakeServer) -> None:
+    with Client(server.url, timeout=2, retries=Retries(limit=0)) as client:
+        job = client.submit(SPEC)
+        streams = [client.port.open(_core.events(job.id, after=None)) for _ in range(101)]
+        for each in streams:
+            finish(each.__aenter__())
+        assert client.objects()
+        for each in streams:
+            finish(each.__aexit__(None, None, None))
 
 
 @pytest.mark.parametrize(
