@@ -207,6 +207,7 @@ def test_a_forked_process_opens_connections_of_its_own(client: Client, monkeypat
     monkeypatch.setattr(os, "getpid", lambda: 1)
     assert client.objects()
     assert vars(client.port)["_http"] is not inherited
+    inherited.close()
 
 
 def test_any_number_of_jobs_can_be_waited_for_at_the_same_time(server: FakeServer) -> None:
