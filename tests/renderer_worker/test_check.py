@@ -329,6 +329,10 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "constant light": ("light intensity", lit(lambda light, _: replace(light, intensity=0.6))),
     "white light": ("light colour", lit(lambda light, _: replace(light, color=(255, 255, 255)))),
     "a sky of its own": ("extra light", aimed(lambda world, *_: replace(world, ambient=(world.ambient[0] + 0.2,) * 3))),
+    "textures as they are without lights": (
+        "not shaded",
+        aimed(lambda world, *_: world if world.lights else replace(world, ambient=(1.0, 1.0, 1.0))),
+    ),
     "no ambient light": ("ambient missing", aimed(lambda world, *_: replace(world, ambient=(0.0, 0.0, 0.0)))),
     "3 levels off": ("background", seen(on_object(lambda asked: asked + 3 * np.sign(127 - asked), background=True))),
     "background not encoded": ("background", seen(on_object(lambda asked: 255 * linear(asked), background=True))),

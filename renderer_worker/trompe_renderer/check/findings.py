@@ -45,6 +45,7 @@ REMEDIES: Final[Mapping[str, str]] = {
     "light colour": "Multiply the light by WorldLight.color / 255, linear.",
     "ambient missing": "Add Snapshot.ambient, light from all sides, to the directional lights.",
     "extra light": "Take all light from Snapshot.lights and .ambient: turn off the engine's own sky and lamps.",
+    "not shaded": "Keep shading on where Snapshot.lights is empty: add a black light if the engine needs one.",
     "frozen texture": "Read obj.textures (obj.files keeps the old paint); find cached textures by HashedModel.albedos.",
     "late texture": "Finish the upload of a texture before the picture is drawn.",
     "clipped": "Clip nothing between 0.1 and 10 m.",

@@ -403,9 +403,16 @@ TOLERANCE: Final = 30.0
 """Degrees by which the brightest direction may differ from the light's."""
 
 
+FAINT_LIGHT: Final = 0.001
+"""Intensity of a light that shows nothing, but is there."""
+
+
 def light(look: _Look, _: EngineInfo) -> Findings:
     """A white ball in ambient light alone, in none, and in directional light alone from two sides."""
-    soft, unlit = (look.at(BALL, _lit(Light(intensity=0.0, ambient=ambient), SIDES[0])) for ambient in (0.6, 0.0))
+    soft, faint, unlit = (
+        look.at(BALL, _lit(Light(intensity=intensity, ambient=ambient), SIDES[0]))
+        for intensity, ambient in ((FAINT_LIGHT, 0.6), (FAINT_LIGHT, 0.0), (0.0, 0.0))
+    )
     rows, columns = np.indices(SQUARE) + 0.5 - SQUARE[0] / 2
     x, y = (places / _pixels(BALL_RADIUS, SQUARE, 2.0) for places in (columns, -rows))
     inside = np.hypot(x, y) < 0.95
@@ -413,8 +420,9 @@ def light(look: _Look, _: EngineInfo) -> Findings:
     if level(soft, inside) < 20:
         yield fault("ambient missing", "A white ball in ambient light alone is dark.")
     if (seen := level(unlit, inside)) > 20:
-        look.dims = False
-        yield fault("extra light", f"A white ball without light has a brightness of {seen:.0f} of 255.")
+        look.dims = level(faint, inside) <= 20
+        name, also = ("not shaded", ", in faint light hardly any") if look.dims else ("extra light", "")
+        yield fault(name, f"A white ball without light has a brightness of {seen:.0f} of 255{also}.")
     hard = [look.at(BALL, _lit(SUN, side)) for side in SIDES]
     if max(float(np.percentile(picture[inside], 95)) for picture in hard) < 20:
         yield fault("light missing", "A white ball in directional light alone is dark.")
