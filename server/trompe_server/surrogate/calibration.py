@@ -123,6 +123,8 @@ def find_physics(best: SamplingModel, score: Score, groups: Sequence["Group"]) -
 def _climbed(best: SamplingModel, score: Score) -> SamplingModel:
     """The best hypothesis reachable from ``best`` by changing one group of members at a time."""
     groups = FILTERED if best.samples == "grid" else ALTERNATIVES if best.anisotropy == 1 else ELONGATED
+    if best.minified != "mipmaps":
+        groups = tuple(group for group in groups if "bias" not in group[0])
     for _ in range(MAX_ROUNDS):
         before = best
         for group in groups:
@@ -213,6 +215,13 @@ TONES: Final[Group] = ({"encoding": "measured"},)
 
 BEYOND: Final[tuple[Group, ...]] = (SLOPES, EDGES, KERNELS)
 """What path tracers do; it costs no image."""
+
+FINEST: Final[Group] = tuple(
+    {"minified": minified, **UNIFORM, **seen}
+    for minified in ("linear", "nearest")
+    for seen in ({}, {"samples": "centre", "slope": "greys", "edges": "encoded"})
+)
+"""Textures without mip levels: ray casters, VTK by default; from the hypothesis before, and as a plain rasteriser."""
 
 MAX_RARE: Final = 2
 """Most rare practices of one renderer."""
@@ -502,6 +511,8 @@ def _chosen(trial: _Trial, wanted: SurrogateModel) -> tuple[str, str, SamplingMo
     sampling = find_physics(plain, score, BEYOND) if traced or score(plain) < SATISFYING else plain
     if _wrong_colours(two(sampling)):
         sampling = find_physics(sampling, score, (TONES, *BEYOND))
+    if not two(sampling).good_enough and (finest := find_physics(sampling, score, (FINEST,))) != sampling:
+        sampling = find_physics(finest, score, (TONES, *BEYOND))
     fidelity = two(sampling)
     told = _summary(fidelity) + _practices(sampling)
     if wanted == "calibrated":
@@ -537,6 +548,7 @@ def _practices(sampling: SamplingModel) -> str:
         "the chord to the unpainted object": sampling.slope == "chord",
         "edges averaged in light": sampling.edges == "linear",
         f"a {kernel} filter of {width:g} pixels": sampling.samples == "grid",
+        "textures without mip levels": sampling.minified != "mipmaps",
     }
     used = [name for name, does in practices.items() if does]
     return f", with {' and '.join(used)}" if used else ""

@@ -12,7 +12,7 @@ from typing import Final, Literal
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import embedding_bag
+from torch.nn.functional import embedding_bag, one_hot
 
 from trompe_server.surrogate.pixel_filter import KernelName, PixelFilter
 from trompe_server.surrogate.pyramid import Levels, MipLayout
@@ -55,6 +55,8 @@ class SamplingModel:
         at the level of one probe's length (graphics cards), or a Gaussian over an ellipse of texels (Heckbert, 1989;
         Mesa's software renderers).
     shift: offset of samples and centre within a pixel: x right and y down, in pixels, within [-1, 1].
+    minified: texels that a fragment reads: of mip levels, or of the texture itself the four around it (``linear``) or
+        the nearest one.
     """
 
     samples: Literal["msaa4", "msaa4-mirrored", "centre", "grid"] = "msaa4"
@@ -71,6 +73,7 @@ class SamplingModel:
     anisotropy: int = 1
     elongated: Literal["probes", "ellipse"] = "probes"
     shift: tuple[float, float] = (0.0, 0.0)
+    minified: Literal["mipmaps", "linear", "nearest"] = "mipmaps"
 
     @property
     def positions(self) -> Samples:
@@ -278,6 +281,8 @@ Reads = Iterator[tuple[Int[Tensor, " m"], Int[Tensor, "m k"], Float[Tensor, "m k
 
 def reads_of(uv: Float[Tensor, "n 2"], duv: Float[Tensor, "n 2 2"], levels: Levels, model: SamplingModel) -> Reads:
     """The reads of fragments from a texture."""
+    if model.minified != "mipmaps":
+        return _finest(uv, levels, nearest=model.minified == "nearest")
     texels = duv * levels[0, [1, 0], None]
     if model.anisotropy == 1:
         return _trilinear(uv, level_of_detail(texels, model), levels)
@@ -369,6 +374,15 @@ def _trilinear(uv: Float[Tensor, "n 2"], level: Float[Tensor, " n"], levels: Lev
         blend = (level - lower) if step else 1 - (level - lower)
         used = (blend > 0).nonzero()[:, 0]
         yield used, *_bilinear(uv[used], lower[used].long() + step, levels), blend[used]
+
+
+def _finest(uv: Float[Tensor, "n 2"], levels: Levels, *, nearest: bool) -> Reads:
+    """Reads from the texture itself."""
+    every = torch.arange(len(uv), device=uv.device)
+    index, weight = _bilinear(uv, torch.zeros_like(every), levels)
+    if nearest:
+        weight = one_hot(weight.argmax(1), 4).to(weight)
+    yield every, index, weight, torch.ones_like(weight[:, 0])
 
 
 def level_of_detail(texels: Float[Tensor, "n 2 2"], model: SamplingModel) -> Float[Tensor, " n"]:

@@ -77,6 +77,8 @@ class Geometry:
 
     reads: for each mip level in the layout's order, the texels read by any view, in the order of the first read, so
     that neighbours in an image are neighbours in memory. Concatenated they are the operators' ``texels``.
+    areas: the same views with mip levels, whose reads say what part of the texture a pixel shows, if ``sampling`` reads
+    single texels instead; otherwise ``None``.
     """
 
     textures: tuple[str, ...]
@@ -85,6 +87,7 @@ class Geometry:
     sampling: SamplingModel
     size: tuple[int, int]
     batches: tuple[ViewBatch, ...]
+    areas: "Geometry | None" = None
 
     def texels(self, textures: Sequence[Float[Tensor, "H W 3"]], *, rounded: bool = False) -> Float[Tensor, "texels 3"]:
         """The texels read by any view from the mip levels of ``textures``. Differentiable."""
@@ -96,6 +99,14 @@ class Geometry:
         if self.sampling.filtered == "linear":
             return self.texels([decode(texture) for texture in ordered])
         return self.texels(ordered, rounded=self.sampling.mips == "rounded")
+
+    def read_weights(self, masks: Bool[Tensor, "views H W"] | None = None) -> Float[Tensor, "texels 1"]:
+        """Total weight of each read in the pixels of all views, or in those of ``masks``."""
+        total = torch.zeros(sum(map(len, self.reads)), 1, device=self.device)
+        for batch in self.batches:
+            seen = torch.ones(len(batch.pixel), 1, device=self.device)
+            total += batch.gather.transpose(seen if masks is None else seen * batch.of(masks)[:, None])
+        return total
 
     @cached_property
     def chains(self) -> list[MipChain]:
@@ -180,7 +191,12 @@ def prepare_geometry(
     batches = tuple(
         _joined(some, prepared[some.start : some.stop], place, len(texels), size, sampling) for some in numbers
     )
-    return Geometry(mesh.textures, layout, reads, sampling, size, batches)
+    areas = None
+    if sampling.minified != "mipmaps":
+        areas = prepare_geometry(
+            obj, views, size=size, sampling=sampling.but(minified="mipmaps"), device=device, known=known
+        )
+    return Geometry(mesh.textures, layout, reads, sampling, size, batches, areas)
 
 
 NEVER: Final = torch.iinfo(torch.int64).max
@@ -436,19 +452,14 @@ class Surrogate:
 
     def influence(self, masks: Bool[Tensor, "views H W"] | None = None) -> dict[str, Float[Tensor, "H W"]]:
         """Total weight of each texel in the pixels of all views, or in those of ``masks``."""
-        geometry, device = self.geometry, self.base.device
+        geometry, device = self._areas, self.base.device
         ones = [torch.ones(*sizes[0], 1, device=device, requires_grad=True) for sizes in geometry.layout.sizes]
-        weights = torch.autograd.grad(geometry.texels(ones), ones, self._read_weights(masks))
+        weights = torch.autograd.grad(geometry.texels(ones), ones, geometry.read_weights(masks))
         return {name: weight[..., 0] for name, weight in zip(geometry.textures, weights, strict=True)}
 
-    def _read_weights(self, masks: Bool[Tensor, "views H W"] | None = None) -> Float[Tensor, "texels 1"]:
-        """Total weight of each read in the pixels of all views, or in those of ``masks``."""
-        geometry = self.geometry
-        total = torch.zeros(self.n_texels, 1, device=geometry.device)
-        for batch in geometry.batches:
-            seen = torch.ones(len(batch.pixel), 1, device=geometry.device)
-            total += batch.gather.transpose(seen if masks is None else seen * batch.of(masks)[:, None])
-        return total
+    @property
+    def _areas(self) -> Geometry:
+        return self.geometry.areas or self.geometry
 
     @cached_property
     def footprint(self) -> Mapping[str, float]:
@@ -478,8 +489,8 @@ class Surrogate:
     @cached_property
     def level_weights(self) -> Mapping[str, Float[Tensor, " levels"]]:
         """Total weight of the reads of each texture's mip levels in the pixels of all views, on the CPU."""
-        geometry = self.geometry
-        by_level = iter(torch.split(self._read_weights()[:, 0].cpu(), [len(level) for level in geometry.reads]))
+        geometry = self._areas
+        by_level = iter(torch.split(geometry.read_weights()[:, 0].cpu(), [len(level) for level in geometry.reads]))
         weights = [torch.stack([next(by_level).sum() for _ in sizes]) for sizes in geometry.layout.sizes]
         return dict(zip(geometry.textures, weights, strict=True))
 

@@ -207,7 +207,7 @@ def test_the_mip_levels_that_views_hardly_read_are_spare(fine: Object3D) -> None
     weights = [0.0] * 9
     for level, reads in enumerate(surrogate.geometry.reads[:9]):
         first = sum(map(len, surrogate.geometry.reads[:level]))
-        weights[level] = float(surrogate._read_weights()[first : first + len(reads)].sum())
+        weights[level] = float(surrogate.geometry.read_weights()[first : first + len(reads)].sum())
     shares = np.cumsum(weights) / sum(weights)
     spare = surrogate.spare_levels[names[0]]
     assert spare >= 2
