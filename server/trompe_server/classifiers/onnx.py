@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -102,18 +103,18 @@ def _session(path: Path, device: str) -> Any:
         if _WEIGHTS_APART.search(str(error)):
             raise ClassifierError(
                 f"{path.name!r} keeps its weights in another file, which is not here. Write one file: "
-                "torch.onnx.export(..., external_data=False)."
+                "torch.onnx.export(..., external_data=False), or onnx.save(onnx.load(FILE), NEW) beside the weights."
             ) from error
         raise broken(path.name, f"onnxruntime cannot read it ({str(error)[:300]})") from error
 
 
 def _input(session: Any, file: str) -> tuple[int | None, tuple[int, int]]:
     """The batch size, if fixed, and (H, W) of the only input. Raises ``ClassifierError``."""
-    inputs = session.get_inputs()
-    if len(inputs) != 1 or len(session.get_outputs()) != 1:
-        raise broken(file, f"it has {len(inputs)} inputs and {len(session.get_outputs())} outputs")
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    if len(inputs) != 1 or len(outputs) != 1:
+        raise broken(file, f"it has {_listed('input', inputs)} and {_listed('output', outputs)}, expected one of each")
     shape, kind = inputs[0].shape, inputs[0].type
-    if len(shape) != 4 or shape[1] != 3 or kind != "tensor(float)":
+    if len(shape) != 4 or (isinstance(shape[1], int) and shape[1] != 3) or kind != "tensor(float)":
         raise broken(file, f"its input is {kind} {shape}")
     batch, _, height, width = shape
     if not (isinstance(height, int) and isinstance(width, int)):
@@ -121,6 +122,11 @@ def _input(session: Any, file: str) -> tuple[int | None, tuple[int, int]]:
             file, f"its input {shape} has no height and width: fix them with onnxruntime.tools.make_dynamic_shape_fixed"
         )
     return batch if isinstance(batch, int) else None, (height, width)
+
+
+def _listed(kind: str, values: Sequence[Any]) -> str:
+    """Number and names of inputs or outputs, for messages."""
+    return f"{len(values)} {kind}s ({', '.join(value.name for value in values[:5])})"
 
 
 def _takes_batches(session: Any, images: Logits, last: Logits) -> bool:
