@@ -176,21 +176,27 @@ def object_upload(path: Path, *, name: str | None = None) -> Upload:
 
 
 def classifier_source(source: Source) -> Upload | str:
-    """A .pt2 or .onnx file as an upload; any other word is a name. Raises ``ClassifierError``."""
-    is_file = Path(source).suffix.lower() in CLASSIFIER_SUFFIXES and not str(source).startswith(LOOKED_UP)
-    return classifier_upload(source) if is_file else str(source)
+    """A .pt2 or .onnx file as an upload; any other word is a name. Raises ``ClassifierError``, also for other files."""
+    path = Path(source)
+    is_file = path.suffix.lower() in CLASSIFIER_SUFFIXES or (path.suffix and path.is_file())
+    return classifier_upload(source) if is_file and not str(source).startswith(LOOKED_UP) else str(source)
 
 
 def classifier_upload(source: Source, *, classes: list[str] | None = None, name: str | None = None) -> Upload:
     """A classifier's file with its class names: ``classes``, or the JSON list in a file beside it.
 
-    Raises ``ClassifierError`` for a missing file, or for class names in another format.
+    Raises ``ClassifierError`` for a missing file or one of another kind, or for class names in another format.
     """
     path = Path(source)
     if not path.is_file():
         raise ClassifierError(
             f"There is no classifier file {str(path)!r}. Give a file that ends in {' or '.join(CLASSIFIER_SUFFIXES)}, "
             "or the name of a stored classifier."
+        )
+    if path.suffix.lower() not in CLASSIFIER_SUFFIXES:
+        raise ClassifierError(
+            f"{path.name!r} is not a supported classifier file: export the network to .pt2 (torch.export) or .onnx; "
+            "docs/library.md shows how, for torch and Keras."
         )
     names = classes if classes is not None else classes_beside(path)
     form = {"classes": json.dumps(names)} if names is not None else {}

@@ -113,7 +113,14 @@ def test_a_classifier_is_a_file_by_its_ending(tmp_path: Path, ending: str) -> No
     assert classifier_source(str(file)) == Upload(file.name, file, kind=ClassifierInfo)
 
 
-@pytest.mark.parametrize("name", ["mobilenet_v2", "torchvision:vgg16", "torchvision:odd.pt2"])
+@pytest.mark.parametrize("name", ["net.keras", "net.tflite", "model.safetensors"])
+def test_a_file_of_another_kind_is_refused_with_the_remedy(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"net")
+    with pytest.raises(ClassifierError, match=f"'{name}' is not a supported classifier file: export the network to"):
+        classifier_source(str(tmp_path / name))
+
+
+@pytest.mark.parametrize("name", ["mobilenet_v2", "net.v2", "torchvision:vgg16", "torchvision:odd.pt2"])
 def test_a_classifier_is_a_name_otherwise(name: str) -> None:
     assert classifier_source(name) == name
 

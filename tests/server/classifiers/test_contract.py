@@ -576,7 +576,9 @@ def test_cut_and_foreign_files_are_refused(pt2: Path, tmp_path: Path) -> None:
         pytest.param({"size": ("h", "w")}, "no height and width: fix them with", id="symbolic size"),
         pytest.param({"channels": "c", "size": ("h", "w")}, "no height and width: fix them with", id="symbolic image"),
         pytest.param({"channels": 1}, r"its input is tensor\(float\) \['n', 1,", id="grey input"),
-        pytest.param({"outputs": ("logits", "raw")}, r"it has 1 inputs \(image\) and 2 outputs \(logits, raw\)", id="two"),
+        pytest.param(
+            {"outputs": ("logits", "raw")}, r"it has 1 inputs \(image\) and 2 outputs \(logits, raw\)", id="two"
+        ),
         pytest.param({"kind": TensorProto.UINT8}, r"its input is tensor\(uint8\)", id="uint8 input"),
         pytest.param({"last": "Softmax"}, "ends in a softmax", id="probabilities"),
         pytest.param({"last": "Shape"}, "onnxruntime cannot read it|its output for one image", id="no logits"),
