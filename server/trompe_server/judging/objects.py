@@ -65,6 +65,12 @@ class _Triangles:
     def __len__(self) -> int:
         return len(self.corners)
 
+    def fronts(self) -> "_Triangles":
+        """Without backs: the later ones of two with the same corners in opposite order."""
+        back, _ = _matched(self.corners, self.corners[:, ::-1])
+        first = (back < 0) | (back >= np.arange(len(self)))
+        return _Triangles(self.corners[first], self.uvs[first], self.normals[first], self.materials[first])
+
     def mapped(self, names: list[str]) -> Float[np.ndarray, "F 3 10"]:
         """Corners with their texture coordinates, and a small step for the place of their material in ``names``.
 
@@ -86,11 +92,12 @@ class ObjectPair:
 
     def findings(self) -> list[Finding]:
         """Differences other than of the albedo's colours, each in one sentence."""
-        return self._shape or [*self._layout(), *self._shading(), *self._maps(), *self._sizes()]
+        return self._shape or [*self._sides(), *self._layout(), *self._shading(), *self._maps(), *self._sizes()]
 
     @property
     def is_one(self) -> bool:
-        """Whether the two have as many triangles. If not, no difference between their images has a meaning."""
+        """Whether the two have as many triangles, backs aside. If not, no difference between their images has a
+        meaning."""
         return len(self._old) == len(self._new)
 
     @cached_property
@@ -108,12 +115,23 @@ class ObjectPair:
         return {name: old for name, (old, _) in same.items()}, {name: new for name, (_, new) in same.items()}
 
     @cached_property
-    def _old(self) -> _Triangles:
-        return _Triangles.of(self.before, self.before.sphere[1])
+    def _all(self) -> tuple[_Triangles, _Triangles]:
+        old, new = (_Triangles.of(each, self.before.sphere[1]) for each in (self.before, self.after))
+        return old, new
 
     @cached_property
+    def _compared(self) -> tuple[_Triangles, _Triangles]:
+        """All triangles before and after; without backs if they are as many only then, as programs add these."""
+        old, new = (each.fronts() for each in self._all) if len(self._all[0]) != len(self._all[1]) else self._all
+        return (old, new) if len(old) == len(new) else self._all
+
+    @property
+    def _old(self) -> _Triangles:
+        return self._compared[0]
+
+    @property
     def _new(self) -> _Triangles:
-        return _Triangles.of(self.after, self.before.sphere[1])
+        return self._compared[1]
 
     @cached_property
     def _shape(self) -> list[Finding]:
@@ -130,12 +148,24 @@ class ObjectPair:
         moved = max(int((places < 0).sum()), int((back < 0).sum()))
         if not moved:
             return []
-        distance = 1000 * self.before.sphere[1] * _farthest(old.corners, new.corners)
-        text = (
-            f"The geometry moved: {moved} of {len(new)} triangles are not where the first object has them, "
-            f"by up to {distance:.3g} mm. A repaint keeps the mesh; textures are not compared."
+        distance = _farthest(old.corners, new.corners)
+        how = (
+            f"moved: {moved} of {len(new)} triangles are not where the first object has them, "
+            f"by up to {1000 * self.before.sphere[1] * distance:.3g} mm"
+            if distance > TOLERANCE / 3  # below it, equal triangles match
+            else f"changed: {moved} of {len(new)} triangles join the same corners in another way, or face the other way"
         )
+        text = f"The geometry {how}. A repaint keeps the mesh; textures are not compared."
         return [Finding(kind="geometry", text=text)]
+
+    def _sides(self) -> Iterator[Finding]:
+        more = len(self._all[1]) - len(self._all[0])
+        if more:
+            yield Finding(
+                kind="geometry",
+                text=f"The {'second' if more > 0 else 'first'} object shows both sides of {abs(more)} triangles of "
+                "which the other shows one: views of their backs differ.",
+            )
 
     @cached_property
     def _places(self) -> tuple[Int[np.ndarray, " F"], Int[np.ndarray, " F"]]:

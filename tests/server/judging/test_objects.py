@@ -41,6 +41,11 @@ def shuffled(part: Part) -> Part:
     return replace(part, faces=faces)
 
 
+def backs(part: Part) -> Part:
+    """The part from behind."""
+    return replace(part, faces=part.faces[:, ::-1], normals=-part.normals)
+
+
 def a_tile_further(part: Part) -> Part:
     """The part with coordinates that read the same texels, as textures repeat."""
     return replace(part, uvs=part.uvs + np.array([1, -1], np.float32))
@@ -86,6 +91,7 @@ MUG = shipped("mug")
 CHANGES = {
     "another object": (shipped("ball"), "object", "2368 triangles, the second 1728"),
     "moved": (with_parts(MUG, moved), "geometry", r"839 of 2368 triangles .* by up to 3\.46 mm"),
+    "from behind": (with_parts(MUG, backs), "geometry", "changed: 2368 of 2368 .* face the other way"),
     "another layout": (
         with_parts(MUG, lambda part: replace(part, uvs=part.uvs / np.float32(2))),
         "uv",
@@ -145,6 +151,16 @@ def test_triangles_that_show_nothing_may_come_and_go() -> None:
     for pair in (ObjectPair(MUG, collapsed), ObjectPair(collapsed, MUG)):
         assert pair.is_one
         assert pair.findings() == []
+
+
+def test_a_program_that_adds_or_drops_backs_leaves_one_object() -> None:
+    painted = repainted(MUG, by=12)
+    double = replace(painted, parts=(*painted.parts, *map(backs, painted.parts)))
+    for pair, which in ((ObjectPair(MUG, double), "second"), (ObjectPair(double, MUG), "first")):
+        (found,) = pair.findings()
+        assert found.text.startswith(f"The {which} object shows both sides of 2368 triangles")
+        (change,) = texture_changes(*pair.textures, epsilon=0.05)
+        assert (change.max_levels, change.texels_beyond_epsilon) == (12, 0)
 
 
 def test_triangles_in_one_place_are_told_apart_by_their_materials() -> None:
