@@ -17,7 +17,10 @@ from trompe_experiments.figures import FIGURES, read_data
 from trompe_experiments.table import RESULTS
 from trompe_shared.errors import SpecError
 
-BLOCK = re.compile(r"(<!-- trompe: (\w+) of (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+BEGIN = "<!-- trompe:"
+BLOCK = re.compile(
+    rf"^({BEGIN} (\w+) of ([^\n]+) -->\n)((?:(?!^{BEGIN}).)*?)(^<!-- end -->)", re.DOTALL | re.MULTILINE
+)
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,9 @@ class _Block:
         if not (self.folder / RESULTS).exists():
             return f"*Not measured yet: {self.link}/{RESULTS} is missing.*\n"
         data, kind = read_data(self.folder), FIGURES[self.figure]
-        rows = f"Rows: [{RESULTS}]({self.link}/{RESULTS})\n" if kind.table else ""
-        return f"\n![{kind.title}]({self.link}/figures/{self.figure}.svg)\n\n{rows}\n<!-- {data.stamp} -->\n"
+        link = self.link.replace(" ", "%20")
+        rows = f"Rows: [{RESULTS}]({link}/{RESULTS})\n" if kind.table else ""
+        return f"\n![{kind.title}]({link}/figures/{self.figure}.svg)\n\n{rows}\n<!-- {data.stamp} -->\n"
 
     def outdated(self) -> Iterator[str]:
         """Messages about text or a figure made from other data."""
@@ -50,7 +54,7 @@ class _Block:
 def fill(document: Path) -> list[str]:
     """Draw all figures of ``document`` and rewrite its blocks; returns messages about the blocks that changed.
 
-    Raises ``SpecError`` for an unknown figure or an unreadable table.
+    Raises ``SpecError`` for an unknown figure, a block without its end, or an unreadable table.
     """
     text = document.read_text("utf-8")
     blocks = list(_blocks(document, text))
@@ -69,6 +73,12 @@ def outdated(document: Path) -> list[str]:
 
 
 def _blocks(document: Path, text: str) -> Iterator[_Block]:
+    rest = BLOCK.sub("", text)
+    if found := re.search(rf"^{BEGIN}.*", rest, re.MULTILINE):
+        raise SpecError(
+            f"{document.name}: {found[0]!r} begins no block; expected lines `{BEGIN} FIGURE of FOLDER -->` and, "
+            "before the next one, `<!-- end -->`."
+        )
     for match in BLOCK.finditer(text):
         if match[2] not in FIGURES:
             raise SpecError(f"{document.name}: unknown figure {match[2]!r}; figures: {', '.join(FIGURES)}.")

@@ -499,6 +499,32 @@ def test_a_document_says_what_is_not_measured_yet_and_refuses_figures_that_do_no
         fill(document)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param(DOCUMENT.replace("<!-- end -->", "Words.") + DOCUMENT, id="no end before the next block"),
+        pytest.param(DOCUMENT.replace("<!-- end -->", ""), id="no end"),
+        pytest.param(DOCUMENT.replace(" of ", " "), id="no folder"),
+    ],
+)
+def test_a_block_that_is_none_is_told_and_the_words_after_it_stay(text: str, tmp_path: Path) -> None:
+    document = tmp_path / "results.md"
+    document.write_text(text)
+    for work in (outdated, fill):
+        with pytest.raises(SpecError, match="'<!-- trompe: table_one .* begins no block"):
+            work(document)
+    assert document.read_text() == text
+
+
+def test_the_folder_of_a_figure_may_have_spaces(tmp_path: Path) -> None:
+    written(tmp_path / "my results", [row(tau=None)])
+    document = tmp_path / "results.md"
+    document.write_text(DOCUMENT.replace("experiments/some", "my results"))
+    assert fill(document)
+    assert "Rows: [results.csv](my%20results/results.csv)\n" in document.read_text()
+    assert outdated(document) == []
+
+
 def test_the_projects_own_results_are_in_step_with_their_data() -> None:
     assert outdated(Path(__file__).parents[2] / "docs" / "experiments.md") == []
 
