@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from trompe_shared.api import JobSpec
 
@@ -30,7 +30,7 @@ def write_about(folder: Path, command: str, *, seconds: float, source: Path | No
     ``seconds`` of runs in the same folder are added up.
     """
     path = folder / ABOUT
-    total = seconds + (json.loads(path.read_text("utf-8")).get("seconds", 0.0) if path.exists() else 0.0)
+    total = seconds + read_about(folder).get("seconds", 0.0)
     note = {
         "command": command,
         "finished": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
@@ -42,6 +42,15 @@ def write_about(folder: Path, command: str, *, seconds: float, source: Path | No
     path.write_text(json.dumps(note, indent=1) + "\n", "utf-8")
     if source is not None and source.resolve() != (folder / SOURCE).resolve():
         shutil.copyfile(source, folder / SOURCE)
+
+
+def read_about(folder: Path) -> dict[str, Any]:
+    """What ``write_about`` noted; nothing if the file is missing or damaged: results do not depend on it."""
+    try:
+        note = json.loads((folder / ABOUT).read_text("utf-8"))
+    except (FileNotFoundError, ValueError):
+        return {}
+    return note if isinstance(note, dict) else {}
 
 
 def in_words(seconds: float) -> str:

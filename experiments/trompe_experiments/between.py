@@ -8,6 +8,7 @@ from typing import Final
 from trompe_experiments.markdown import figure_words, markdown_table
 from trompe_experiments.style import Drawing, drawing, look
 from trompe_experiments.table import ResultRow
+from trompe_shared.api import OPTIONS
 from trompe_shared.comparison import average, grouped
 
 NOTHING: Final = "nothing"
@@ -17,6 +18,7 @@ NOTHING: Final = "nothing"
 def between_chart(rows: Sequence[ResultRow]) -> Drawing:
     """A line for each change of the images: a small dot for each job, a large one for the mean of each attack's own
     image pipeline."""
+    rows = with_all_pipelines(rows)
     places, attacks = _changes(rows), grouped(rows, lambda row: row.image_pipeline)
     with drawing(size=(7.0, 1.2 + 0.36 * len(places))) as made:
         (axes,) = made.panels
@@ -40,12 +42,26 @@ def between_chart(rows: Sequence[ResultRow]) -> Drawing:
 def between_markdown(rows: Sequence[ResultRow]) -> str:
     """A line for each change of the images: mean drop, and the mean share of the undisturbed drop that is kept, at
     most 1, where there is one."""
+    rows = with_all_pipelines(rows)
     attacks = grouped(rows, lambda row: row.image_pipeline)
     head = ["in between", *(f"{attack}: {what}" for attack in attacks for what in ("A_drop", "kept"))]
     lines = [
         [change, *(words for own in attacks.values() for words in _line(own, change))] for change in _changes(rows)
     ]
     return markdown_table(head, lines, align="l" + "r" * (len(head) - 1)) + "\n"
+
+
+def with_all_pipelines(rows: Sequence[ResultRow]) -> list[ResultRow]:
+    """A row for each job that ran through every image pipeline of the rows: others would compare other options too."""
+    jobs = {job: some[0] for job, some in grouped(rows, lambda row: (row.image_pipeline, *_others(row))).items()}
+    pipelines = {row.image_pipeline for row in rows}
+    alike = grouped(jobs.values(), _others).values()
+    return [row for some in alike if len(some) == len(pipelines) for row in some]
+
+
+def _others(row: ResultRow) -> tuple[object, ...]:
+    """What compared jobs share."""
+    return row.object, *(getattr(row, name) for name in OPTIONS if name != "image_pipeline")
 
 
 def _line(rows: Sequence[ResultRow], change: str) -> list[str]:

@@ -18,9 +18,7 @@ from trompe_experiments.table import RESULTS
 from trompe_shared.errors import SpecError
 
 BEGIN = "<!-- trompe:"
-BLOCK = re.compile(
-    rf"^({BEGIN} (\w+) of ([^\n]+) -->\n)((?:(?!^{BEGIN}).)*?)(^<!-- end -->)", re.DOTALL | re.MULTILINE
-)
+BLOCK = re.compile(rf"^({BEGIN} (\w+) of ([^\n]+) -->\n)((?:(?!^{BEGIN}).)*?)(^<!-- end -->)", re.DOTALL | re.MULTILINE)
 
 
 @dataclass(frozen=True)

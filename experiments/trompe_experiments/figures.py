@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from trompe_experiments.baselines import baselines_chart, baselines_markdown
-from trompe_experiments.between import between_chart, between_markdown
+from trompe_experiments.between import between_chart, between_markdown, with_all_pipelines
 from trompe_experiments.engines import engines_chart, engines_markdown
 from trompe_experiments.histograms import prediction_histograms
 from trompe_experiments.judged import JUDGEMENTS, JudgedRow
@@ -118,7 +118,11 @@ FIGURES: dict[str, Kind] = {
     ),
     "between": Kind(
         "What is kept when images are changed on their way to the network",
-        lambda data: _values(data, "image_pipeline") > 1 and all(row.drops_through for row in data.results),
+        lambda data: (
+            _values(data, "image_pipeline") > 1
+            and bool(with_all_pipelines(data.results))
+            and all(row.drops_through for row in data.results)
+        ),
         lambda data: between_chart(data.results),
         lambda data: between_markdown(data.results),
     ),

@@ -3,7 +3,6 @@
 import base64
 import html
 import io
-import json
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 from PIL.Image import Resampling
 
-from trompe_experiments.about import ABOUT, SOURCE
+from trompe_experiments.about import SOURCE, read_about
 from trompe_experiments.figures import Data, figures_of, histogram_rows, plain_rows, read_data
 from trompe_experiments.markdown import cells_of, figure_words
 from trompe_experiments.table import RESULTS, SEPARATOR, ResultRow
@@ -33,7 +32,7 @@ COLUMNS: Final = (
 
 def write_report(folder: Path) -> Path:
     """Write ``report.html`` and its figures from the tables in ``folder``; returns its path. Raises ``SpecError``."""
-    data, about, source = read_data(folder), folder / ABOUT, folder / SOURCE
+    data, source = read_data(folder), folder / SOURCE
     environment = Environment(
         loader=PackageLoader("trompe_experiments", "files"), keep_trailing_newline=True, undefined=StrictUndefined
     )
@@ -41,7 +40,7 @@ def write_report(folder: Path) -> Path:
     text = environment.get_template("report.html").render(
         experiment=data.rows[0].experiment,
         facts=_facts(data.rows),
-        about=json.loads(about.read_text("utf-8")) if about.exists() else {},
+        about=read_about(folder),
         figures=[
             (kind.title, _base64(data.draw(name)[0].read_bytes()), kind.table and kind.table(data))
             for name, kind in figures_of(data).items()

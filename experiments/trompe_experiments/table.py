@@ -16,12 +16,16 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from trompe_experiments.markdown import NOT_APPLICABLE, figure_words
 from trompe_shared.api import OPTIONS, Accuracy, JobSpec, JobState, Option, Result
 from trompe_shared.errors import SpecError
+from trompe_shared.faults import faults_of
 
 RESULTS, PREDICTIONS = "results.csv", "predictions.csv"
 """File names in the folder of an experiment."""
 REFUSED: Final = "refused"
 """State of a row whose job the server refused."""
 TO_RETRY: Final = {JobState.failed.value, JobState.cancelled.value, REFUSED}
+
+MOST_FAULTS: Final = 3
+"""Faults of a row that are told."""
 
 SEPARATOR = " | "
 """Between several warnings, networks or backgrounds in one cell."""
@@ -273,16 +277,22 @@ def _cell(value: object) -> object:
 
 def read_table(path: Path, kind: type[R], *, optional: bool = False) -> list[R]:
     """The rows of a CSV file; none for a missing ``optional`` one. Raises ``SpecError``."""
+    rows: list[R] = []
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets write a byte order mark
-            return [kind.model_validate(_filled(row, kind)) for row in csv.DictReader(file)]
+            rows.extend(kind.model_validate(_filled(row, kind)) for row in csv.DictReader(file))
     except FileNotFoundError as error:
         if optional:
             return []
         raise SpecError(f"No table {str(path)!r}; `trompe experiment run` writes it.") from error
     except (ValidationError, csv.Error, UnicodeDecodeError) as error:
-        told = " ".join(str(error).splitlines()[:3])
-        raise SpecError(f"{str(path)!r} is not a {kind.__name__} table of this version ({told}).") from error
+        faults = [*map(str, faults_of(error))] if isinstance(error, ValidationError) else [str(error)]
+        more = f"; and {len(faults) - MOST_FAULTS} more" if len(faults) > MOST_FAULTS else ""
+        raise SpecError(
+            f"{str(path)!r}, row {len(rows) + 1}, does not fit this version: {'; '.join(faults[:MOST_FAULTS])}{more}. "
+            "Expected UTF-8 with commas, columns as `trompe experiment run` writes them: mend the file, or move it."
+        ) from error
+    return rows
 
 
 def read_results(folder: str | Path) -> list[ResultRow]:

@@ -73,7 +73,9 @@ def test_drops_through_changes_of_the_images_are_compared_with_the_undisturbed_o
         row(image_pipeline="robust", object="pot", held_out_a_drop=0.4, pipeline_drops="half size 0.100 | grain n.a."),
         row(image_pipeline="none", held_out_a_drop=1.0, pipeline_drops="half size 0.200 | grain 0.500"),
         row(image_pipeline="none", object="pot", held_out_a_drop=-0.02, pipeline_drops="half size 0.200 | grain 0.500"),
+        row(image_pipeline="none", steps=5, held_out_a_drop=0.1, pipeline_drops="half size 0.000 | grain 0.000"),
     ]
+    rows.append(rows[0].model_copy(update={"series": "a second one with the same job"}))
     lines = [[*map(str.strip, line.split("|")[1:-1])] for line in between_markdown(rows).splitlines()]
     assert lines[0] == ["in between", "robust: A_drop", "robust: kept", "none: A_drop", "none: kept"]
     assert lines[2:] == [
@@ -511,7 +513,7 @@ def test_a_block_that_is_none_is_told_and_the_words_after_it_stay(text: str, tmp
     document = tmp_path / "results.md"
     document.write_text(text)
     for work in (outdated, fill):
-        with pytest.raises(SpecError, match="'<!-- trompe: table_one .* begins no block"):
+        with pytest.raises(SpecError, match=r"'<!-- trompe: table_one .* begins no block"):
             work(document)
     assert document.read_text() == text
 

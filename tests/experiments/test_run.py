@@ -396,9 +396,13 @@ def test_the_shipped_files_are_listed() -> None:
 
 
 def test_a_table_of_another_kind_is_refused(tmp_path: Path) -> None:
-    (tmp_path / RESULTS).write_text("a,b\n1,2\n")
-    with pytest.raises(SpecError, match="is not a ResultRow table of this version"):
-        read_results(tmp_path)
+    for text, words in (
+        ("a,b\n1,2\n", "row 1, does not fit this version: experiment: Field required; .* and 3 more"),
+        ("experiment,key,state,object,steps\nq,k,succeeded,mug,30\nq,k,succeeded,mug,3O\n", "row 2, .*: steps: .*int"),
+    ):
+        (tmp_path / RESULTS).write_text(text)
+        with pytest.raises(SpecError, match=words):
+            read_results(tmp_path)
     with pytest.raises(SpecError, match="No table"):
         read_results(tmp_path / "nowhere.csv")
 
@@ -525,6 +529,7 @@ def test_jobs_that_the_server_did_long_ago_promise_nothing_on_the_time_that_is_l
 def test_how_an_experiment_was_made_is_noted_and_its_runs_add_up(tmp_path: Path) -> None:
     source = tmp_path / "mine.yaml"
     source.write_text("name: mine\n")
+    (tmp_path / ABOUT).write_text('{"seconds": 9')
     for _ in range(2):
         write_about(tmp_path, "trompe experiment run mine.yaml", seconds=30.0, source=source)
     note = json.loads((tmp_path / ABOUT).read_text())
