@@ -126,6 +126,7 @@ class ResultRow(_Options):  # type: ignore[misc]
     judge_s: float | None = None
     seconds: float | None = None
     judge_drops: str = ""
+    renderer_drops: str = ""
     pipeline_drops: str = ""
     warnings: str = ""
     error: str = ""
@@ -170,6 +171,9 @@ class ResultRow(_Options):  # type: ignore[misc]
             **{f"fidelity_{name}": value for name, value in result.fidelity.items()},
             **_seconds(result),
             "judge_drops": SEPARATOR.join(_drop_words(it.classifier, it.held_out or it.target) for it in result.judges),
+            "renderer_drops": SEPARATOR.join(
+                _drop_words(it.renderer.name, it.held_out or it.target) for it in result.renderers
+            ),
             "pipeline_drops": SEPARATOR.join(_drop_words(it.pipeline, it.held_out) for it in result.image_pipelines),
             "warnings": SEPARATOR.join(result.warnings),
         }

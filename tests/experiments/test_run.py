@@ -34,7 +34,18 @@ from trompe_experiments.table import PREDICTIONS, RESULTS, PredictionRow, Result
 from trompe_experiments.terminal import change, compared, differences, failures
 from trompe_server import renderers
 from trompe_server.api.examples import RESULT as EXAMPLE
-from trompe_shared.api import Job, JobRequest, JobSpec, JobState, JudgementSpec, Problem, Progress, Result
+from trompe_shared.api import (
+    Job,
+    JobRequest,
+    JobSpec,
+    JobState,
+    JudgementSpec,
+    Problem,
+    Progress,
+    RendererResult,
+    Result,
+)
+from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import SpecError
 
 
@@ -344,6 +355,21 @@ def row_of(**columns: Any) -> ResultRow:
 def test_rows_hold_the_class_to_be_taken_for(target: int | str | None, cell: str) -> None:
     spec = JobRequest.of("mug", label="mug", target=target).spec()
     assert ResultRow.of_spec(RowId(experiment="x", key="k"), spec, state="succeeded").target == cell
+
+
+def test_rows_hold_the_drop_in_each_of_several_renderers() -> None:
+    result = result_of(JobRequest.of("mug", label="mug", epsilon=0.05))
+    seen = RendererResult(
+        **{name: getattr(result, name) for name in ("surrogate", "target", "held_out", "transfer_gap")},
+        renderer=EngineInfo("three", "0.180"),
+        attacked=False,
+        views=[],
+        held_out_views=[],
+    )
+    other = seen.model_copy(update={"renderer": EngineInfo("pyrender", "0.1"), "held_out": None})
+    result = result.model_copy(update={"renderers": [seen, other]})
+    row = ResultRow.of_result(RowId(experiment="x", key="k"), result, state="succeeded")
+    assert row.renderer_drops == "three 0.500 | pyrender 0.500"
 
 
 def test_two_experiments_are_compared_on_what_they_share() -> None:
