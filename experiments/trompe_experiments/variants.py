@@ -83,8 +83,8 @@ def export_variants(
 
     ``objects/NAME-SEED.zip`` are SAILenv archives; ``train/LABEL/`` and ``test/LABEL/`` hold pictures of the variants
     and of the unpainted objects, rendered by ``target`` from different random cameras and lights; ``labels.csv`` lists
-    the pictures, and those that it listed before are deleted. An object that the network does not recognise has no
-    variants. Raises ``SpecError``.
+    the pictures; those that it listed before, and their archives, are deleted. An object that the network does not
+    recognise has no variants. Raises ``SpecError``.
     """
     unknown = sorted(set(names) - set(shipped_objects()))
     if unknown:
@@ -99,7 +99,7 @@ def export_variants(
     )
     rows = run_experiment(plan_experiment(experiment), service, out, show=show)
     (out / "objects").mkdir(exist_ok=True)
-    _delete_pictures(out)
+    _delete_listed(out)
     with (out / LABELS).open("w", newline="", encoding="utf-8") as file:
         labels = csv.writer(file, lineterminator="\n")
         labels.writerow(COLUMNS)
@@ -109,15 +109,16 @@ def export_variants(
     return rows
 
 
-def _delete_pictures(out: Path) -> None:
-    """Delete the pictures of an earlier export into ``out``, whose splits may differ."""
+def _delete_listed(out: Path) -> None:
+    """Delete the pictures and archives of an earlier export into ``out``, whose splits and budget may differ."""
     if not (out / LABELS).exists():
         return
     with (out / LABELS).open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
-            picture = (out / row.get("file", "")).resolve()
-            if picture.is_file() and picture.is_relative_to(out.resolve()):
-                picture.unlink()
+            for name in (row.get("file", ""), f"objects/{row.get('variant')}.zip"):
+                listed = (out / name).resolve()
+                if listed.is_file() and listed.is_relative_to(out.resolve()):
+                    listed.unlink()
 
 
 def _variants(name: str, out: Path, rows: Sequence[ResultRow]) -> Iterator[Variant]:

@@ -233,16 +233,19 @@ def test_variants_are_zips_and_labelled_pictures_from_views_that_train_and_test_
         assert row["file"].startswith(f"{row['split']}/ball/")
         with Image.open(out / row["file"]) as picture:
             assert picture.size == SIZE
-    (tmp_path / "kept.png").write_bytes(b"")
-    with (out / "labels.csv").open("a") as table:
-        table.write("../kept.png\n")
-    export_variants(out, service, FakeTarget(), show=Silent(), **asked | {"views": 3})  # type: ignore[arg-type]
-    listed = [row["file"] for row in csv.DictReader((out / "labels.csv").read_text().splitlines())]
-    assert sorted(listed) == sorted(path.relative_to(out).as_posix() for path in out.glob("t*/*/*.png"))
-    assert (tmp_path / "kept.png").exists()
     for file in made:
         painted = load_object(service.artifact(attacked[0].key, "") or b"")
         assert load_object(file.read_bytes()).textures.keys() == painted.textures.keys()
+    (tmp_path / "kept.png").write_bytes(b"")
+    with (out / "labels.csv").open("a") as table:
+        table.write("../kept.png,train,ball,ball,ball-9\n")
+    (out / "objects" / "ball-9.zip").write_bytes(b"")
+    export_variants(out, service, FakeTarget(), show=Silent(), **asked | {"views": 3})  # type: ignore[arg-type]
+    rows = list(csv.DictReader((out / "labels.csv").read_text().splitlines()))
+    listed = [row["file"] for row in rows]
+    assert sorted(listed) == sorted(path.relative_to(out).as_posix() for path in out.glob("t*/*/*.png"))
+    assert {path.stem for path in out.glob("objects/*.zip")} == {row["variant"] for row in rows} - {"clean"}
+    assert (tmp_path / "kept.png").exists()
 
 
 def test_unknown_objects_have_no_variants(tmp_path: Path) -> None:
