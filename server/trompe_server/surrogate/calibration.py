@@ -217,7 +217,7 @@ BEYOND: Final[tuple[Group, ...]] = (SLOPES, EDGES, KERNELS)
 """What path tracers do; it costs no image."""
 
 FINEST: Final[Group] = tuple(
-    {"minified": minified, **UNIFORM, **seen}
+    {"minified": minified, **UNIFORM, "bias": 0.0, **seen}
     for minified in ("linear", "nearest")
     for seen in ({}, {"samples": "centre", "slope": "greys", "edges": "encoded"})
 )

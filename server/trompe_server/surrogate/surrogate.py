@@ -475,8 +475,12 @@ class Surrogate:
 
     @cached_property
     def spare_levels(self) -> Mapping[str, int]:
-        """Finest mip levels of each texture that views hardly read: less than ``HARDLY`` of their reads, by weight."""
-        return {name: int((share.cumsum(0) < HARDLY).sum()) for name, share in self._level_shares.items()}
+        """Finest mip levels of each texture that views hardly read: less than ``HARDLY`` of their reads, by weight.
+
+        Without mip levels, those below the median of what pixels show: other views read other texels of it.
+        """
+        least = HARDLY if self.geometry.areas is None else 0.5
+        return {name: int((share.cumsum(0) < least).sum()) for name, share in self._level_shares.items()}
 
     @cached_property
     def _level_shares(self) -> Mapping[str, Float[Tensor, " levels"]]:

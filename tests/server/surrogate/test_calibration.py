@@ -348,6 +348,11 @@ GRID = SamplingModel(samples="grid", kernel=("gaussian", 4.0), filtered="linear"
             {"samples": "grid", "kernel": ("blackman-harris", 1.5), "slope": "chord"},
             id="Blackman-Harris, interreflection",
         ),
+        pytest.param(
+            KnownTarget(SamplingModel(samples="centre", minified="nearest")),
+            {"samples": "centre", "minified": "nearest"},
+            id="ray caster",
+        ),
     ],
 )
 def test_what_path_tracers_and_films_do_is_recovered(

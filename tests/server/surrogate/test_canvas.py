@@ -215,6 +215,17 @@ def test_the_mip_levels_that_views_hardly_read_are_spare(fine: Object3D) -> None
     assert joined([surrogate, of_blocks(fine, bias=-2.0)]).spare_levels[names[0]] == spare - 2
 
 
+@pytest.mark.parametrize("minified", ["linear", "nearest"])
+def test_texels_without_mip_levels_move_with_what_a_pixel_shows(fine: Object3D, minified: str) -> None:
+    usual, surrogate, names = of_blocks(fine), of_blocks(fine, minified=minified), sorted(fine.textures)
+    assert not any(map(len, surrogate.geometry.reads[1:9]))
+    assert all(torch.equal(surrogate.influence()[name], weight) for name, weight in usual.influence().items())
+    shares = usual.level_weights[names[0]].cumsum(0) / usual.level_weights[names[0]].sum()
+    spare = surrogate.spare_levels[names[0]]
+    assert spare >= usual.spare_levels[names[0]] > 0
+    assert shares[spare - 1] < 0.5 <= shares[spare]
+
+
 @pytest.mark.parametrize(
     ("sampling", "error"),
     [({}, 1e-6), ({"mips": "rounded"}, 1.01 / 255), ({"filtered": "linear"}, 0.5 / 255)],

@@ -25,6 +25,8 @@ MODELS = [
     SamplingModel(shade_at="centroid", filtered="linear", cull=False, bias=-1.0),
     SamplingModel(anisotropy=4, shift=(0.3, -0.4)),
     SamplingModel(anisotropy=16, elongated="ellipse", samples="centre"),
+    SamplingModel(minified="linear"),
+    SamplingModel(minified="nearest", samples="centre"),
 ]
 VIEWS = [View(Camera(0.157, 30, 25)), View(Camera(0.2, 200, -20))]
 SIZE = (64, 64)
@@ -64,6 +66,14 @@ def front_view(
     image = torch.full((SIZE[0] * SIZE[1], 3), torch.nan)
     image[geometry.batches[0].pixel] = read_values(obj, model, views)[0]
     return image.view(*SIZE, 3)
+
+
+@pytest.mark.parametrize("minified", ["linear", "nearest"])
+def test_without_mip_levels_a_pixel_reads_the_texel_at_its_centre(minified: str) -> None:
+    texture = noise(48, 48)
+    seen = front_view(texture, pixels=16, model=SamplingModel(samples="centre", minified=minified))  # type: ignore[arg-type]
+    middle = seen[24:40, 24:40] * 255
+    np.testing.assert_allclose(middle, texture[1::3, 1::3], atol=1 if minified == "linear" else 1e-3)
 
 
 def averaged(level: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
