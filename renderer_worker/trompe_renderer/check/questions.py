@@ -30,9 +30,10 @@ RATIO: Final = 0.02
 """Share by which a pixel may be wider than high."""
 SHIFT: Final = 0.25
 """Pixels by which the picture may be off its middle."""
-EXPONENTS: Final = (0.62, 1.5)
+EXPONENTS: Final = (0.62, 1.8)
 """Slopes of encoded brightness over encoded albedo, both logarithmic, that pass as a tone curve. Encoding twice gives
-0.45, not encoding 2.2; the curves of ACES, AgX, Khronos and Reinhard lie between 0.7 and 1.35."""
+0.45, not encoding 2.2; the curves of ACES, AgX, Khronos and Reinhard lie between 0.7 and 1.35, Filament's film in dim
+light at 1.54."""
 DIMMED: Final = 0.6
 """sRGB level of the texture that looks in the first light of the question of gamma as white does in the second,
 whatever the tone curve. Without decoding it is 0.32, with two decodings 0.80."""
