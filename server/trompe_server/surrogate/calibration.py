@@ -497,10 +497,10 @@ def _chosen(trial: _Trial, wanted: SurrogateModel) -> tuple[str, str, SamplingMo
     Without one within tolerance it is the best.
     """
 
+    @cache
     def two(sampling: SamplingModel) -> Fidelity:
         return trial.fidelity("calibrated", sampling, CALIBRATED_GREYS)
 
-    @cache
     def score(sampling: SamplingModel) -> float:
         return two(sampling).score
 

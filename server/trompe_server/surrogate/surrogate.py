@@ -121,7 +121,8 @@ class Geometry:
     @property
     def nbytes(self) -> int:
         """Memory of the operators in bytes."""
-        return sum(batch.gather.nbytes + batch.pixel.nbytes for batch in self.batches)
+        own = sum(batch.gather.nbytes + batch.pixel.nbytes for batch in self.batches)
+        return own + (self.areas.nbytes if self.areas else 0)
 
 
 KEPT_LEVELS: Final = 2**29
