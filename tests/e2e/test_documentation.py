@@ -36,7 +36,7 @@ def test_the_page_runs_from_its_beginning_to_its_end(
     assert texels is not None, said
     assert 0 < int(texels[1]) <= 0.05 * sum(texture[..., 0].size for texture in clean.textures.values()) + 1
     assert "calibrated good enough with two probes a view" in said
-    assert said.endswith("2 steps\n")
+    assert said.endswith("2 steps\n5 classes\n")
 
 
 def test_the_notebook_runs_from_top_to_bottom() -> None:
