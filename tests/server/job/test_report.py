@@ -242,7 +242,8 @@ def test_more_views_are_advised_by_options_that_fit_the_job(options: dict[str, A
     [
         pytest.param({}, "Try a larger `epsilon` or more `steps`.", id="defaults"),
         pytest.param({"steps_taken": 30}, "Try a larger `epsilon`.", id="early end"),
-        pytest.param({"epsilon": 1, "tau": 0}, "Try more `steps`.", id="at their limits"),
+        pytest.param({"epsilon": 1, "alpha": 0.1, "tau": 0}, "Try more `steps`.", id="at their limits"),
+        pytest.param({"alpha": 0.0005}, "Try a larger `alpha` or more `steps`.", id="steps too small"),
         pytest.param({"tau": 0.2}, "Try a larger `epsilon`, more `steps` or a smaller `tau`.", id="tau"),
         pytest.param(
             {"loss": "cross_entropy", "keep": 0.1, "materials": ["clay"], "steps_taken": 3},

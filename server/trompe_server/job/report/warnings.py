@@ -71,8 +71,10 @@ def _noise(data: ReportData) -> Iterator[str]:
 def _stronger(data: ReportData) -> str:
     """Advice for a larger effect: the options that limited this attack."""
     paint = data.spec.paint
+    reached = data.spec.search.steps * data.spec.alpha >= paint.epsilon
     limits = {
-        "a larger `epsilon`": paint.epsilon < 1,
+        "a larger `alpha`": not reached,
+        "a larger `epsilon`": reached and paint.epsilon < 1,
         "`loss: margin`": data.spec.goal.loss != "margin",
         "more `steps`": _took_all_steps(data),
         "a larger `epsilon_view`": paint.epsilon_view is not None,
