@@ -9,7 +9,7 @@ from trompe_renderer.engines.engine import Engine, draw
 from trompe_renderer.world.model import HashedModel, model_of, repainted
 from trompe_renderer.world.snapshot import Instance, Snapshot, WorldLight
 from trompe_renderer.world.validation import unit_color
-from trompe_shared.geometry import View, light_travel_direction
+from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
 
@@ -32,12 +32,10 @@ class EngineRender:
 
 def _world(model: HashedModel, view: View) -> Snapshot:
     """``model`` alone at the origin."""
-    x, y, z = light_travel_direction(view.light).tolist()
-    lights = (WorldLight((x, y, z), view.light.intensity, view.light.colour),)
     return Snapshot(
         instances=(Instance(model, np.eye(4), 1, 1),),
         camera=np.asarray(np.linalg.inv(view.camera.world_to_camera()), np.float64),
-        lights=lights if view.light.intensity > 0 else (),
+        lights=(WorldLight.of(view.light),) if view.light.intensity > 0 else (),
         ambient=(view.light.ambient,) * 3,
         background=unit_color(view.background),
         noise=view.noise,

@@ -17,7 +17,7 @@ from trompe_renderer.world.movement import frustum_walls
 from trompe_renderer.world.objects import ObjectRequest
 from trompe_renderer.world.scenario import read_scenario
 from trompe_renderer.world.scenes import OBJECT_VIEW, SceneSetup, scene_named
-from trompe_renderer.world.snapshot import Background, Matrix, Sky, Snapshot, WorldLight
+from trompe_renderer.world.snapshot import Matrix, Sky, Snapshot, WorldLight
 from trompe_renderer.world.validation import Ints, Vector, checked_color, checked_number, checked_vector, unit_color
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, TrompeError
@@ -65,8 +65,7 @@ class Session(ObjectCommands):
         self._sequence += 1
         self._lights, self._ambient = dict(scene.lights), scene.ambient
         self._reset_objects(scene.static_objects, scene.walls)
-        background = scene.background
-        self._background: Background = background if isinstance(background, Sky) else unit_color(background)
+        self._background = scene.background
 
     def snapshot(self) -> Snapshot:
         """The world as the agent's camera sees it now."""

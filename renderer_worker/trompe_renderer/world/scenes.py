@@ -6,7 +6,7 @@ objects. It may name objects shipped with Trompe, too.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -14,8 +14,8 @@ from typing import Any, Final
 from trompe_renderer.world.model import HashedModel, model_of
 from trompe_renderer.world.movement import NO_WALLS, Pose, Walls, room_walls
 from trompe_renderer.world.objects import WorldObject
-from trompe_renderer.world.snapshot import Sky, WorldLight
-from trompe_renderer.world.validation import WHITE, Ints, Vector
+from trompe_renderer.world.snapshot import Background, Sky, WorldLight
+from trompe_renderer.world.validation import Ints, Vector
 from trompe_shared.errors import RendererError
 from trompe_shared.geometry import Light
 from trompe_shared.object3d import load_object
@@ -41,13 +41,13 @@ class SceneSetup:
     ``position`` and ``rotation`` (Euler angles, degrees) are the camera's.
     """
 
-    static_objects: tuple[WorldObject, ...]
     lights: Mapping[str, WorldLight]
     ambient: Ints
-    background: Ints | Sky
-    position: Vector
-    rotation: Vector
+    background: Background
     walls: Walls
+    static_objects: tuple[WorldObject, ...] = ()
+    position: Vector = (0.0, 0.0, 0.0)
+    rotation: Vector = (0.0, 0.0, 0.0)
 
 
 @cache
@@ -74,15 +74,11 @@ def shipped_model(name: str) -> HashedModel:
 
 def _object_view() -> SceneSetup:
     """The paper's scene for one object: two lights in front of white."""
-    light = Light()
-    rim = replace(light, azimuth=180.0, elevation=30.0, intensity=0.0)
+    rim = Light(azimuth=180.0, elevation=30.0, intensity=0.0)
     return SceneSetup(
-        static_objects=(),
-        lights={MAIN_LIGHT: WorldLight.of(light), RIM_LIGHT: WorldLight.of(rim)},
+        lights={MAIN_LIGHT: WorldLight.of(Light()), RIM_LIGHT: WorldLight.of(rim)},
         ambient=(128, 128, 128),
-        background=WHITE,
-        position=(0.0, 0.0, 0.0),
-        rotation=(0.0, 0.0, 0.0),
+        background=(1.0, 1.0, 1.0),
         walls=NO_WALLS,
     )
 

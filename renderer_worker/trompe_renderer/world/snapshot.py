@@ -45,8 +45,9 @@ class WorldLight:
 
     @classmethod
     def of(cls, light: Light) -> "WorldLight":
-        """White directional light like ``light``."""
-        return cls(checked_vector(light_travel_direction(light).tolist(), "direction"), light.intensity)
+        """A directional light like ``light``."""
+        direction = checked_vector(light_travel_direction(light).tolist(), "direction")
+        return cls(direction, light.intensity, light.colour)
 
 
 @dataclass(frozen=True)
