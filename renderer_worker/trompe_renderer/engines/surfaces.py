@@ -2,7 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Generic, Literal, TypeVar
 
 import numpy as np
@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from trompe_renderer.world.model import HashedModel
 from trompe_renderer.world.snapshot import Matrix, Sky, Snapshot
+from trompe_renderer.world.validation import unit_color
 from trompe_shared.geometry import FIELD_OF_VIEW
 from trompe_shared.object3d import Material, decode_rgb, open_image
+from trompe_shared.opacity import CUTOFF
 from trompe_shared.wavefront import Part
 
 NEAR: Final = 0.005
@@ -135,6 +137,45 @@ class ContentCache(Generic[T]):
             _, (value, count) = self._entries.popitem(last=False)
             size -= count
             self._drop(value)
+
+
+def scene_table(
+    world: Snapshot,
+    surfaces: Iterable[Surface],
+    kept: ContentCache[str],
+    *,
+    add_mesh: Callable[[Surface], tuple[str, int]],
+    add_image: Callable[[TextureImage], tuple[str, int]],
+) -> dict[str, Any]:
+    """A snapshot as JSON for an engine in another process, which finds meshes and images by key.
+
+    Matrices are lists of rows. ``kept``: the keys that the engine has; ``add_mesh`` and ``add_image`` send what it
+    lacks and return its key and its size in bytes there.
+    """
+
+    def image_key(image: TextureImage | None) -> str | None:
+        return kept.get(image.key, lambda: add_image(image)) if image else None
+
+    def item(surface: Surface) -> dict[str, Any]:
+        return {
+            "mesh": kept.get(surface.key, lambda: add_mesh(surface)),
+            "pose": surface.pose.tolist(),
+            "albedo": image_key(surface.albedo),
+            "normal": image_key(surface.normal),
+            "metallic": image_key(surface.metallic),
+            "alpha": surface.opacity is not None or surface.albedo.transparent,
+            "opacity": surface.opacity,
+            "cutoff": CUTOFF if surface.opacity is None else 0,
+            "roughness": PLAIN_ROUGHNESS,
+        }
+
+    return {
+        "fov": FIELD_OF_VIEW,
+        "camera": world.camera.tolist(),
+        "ambient": world.ambient,
+        "lights": [asdict(light) | {"color": unit_color(light.color)} for light in world.lights],
+        "items": [item(surface) for surface in surfaces],
+    }
 
 
 def clipping_planes(camera: Matrix, balls: Iterable[Ball]) -> tuple[float, float]:

@@ -16,22 +16,19 @@ from PIL import Image
 
 from trompe_renderer.engines.engine import noise_seed
 from trompe_renderer.engines.surfaces import (
-    PLAIN_ROUGHNESS,
     ContentCache,
     Surface,
     TextureImage,
     composited,
     ray_range,
     rgba_of,
+    scene_table,
     surfaces_of,
     without_backs,
 )
-from trompe_renderer.world.snapshot import Snapshot, WorldLight
-from trompe_renderer.world.validation import unit_color
+from trompe_renderer.world.snapshot import Snapshot
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError
-from trompe_shared.geometry import FIELD_OF_VIEW
-from trompe_shared.opacity import CUTOFF
 
 SCRIPT: Final = Path(__file__).parent / "blender.py"
 REMEDY: Final = (
@@ -65,43 +62,22 @@ class CyclesEngine:
 
     def render(self, world: Snapshot, *, width: int, height: int) -> NDArray[np.uint8]:
         surfaces = list(surfaces_of(world))
-        values = {
-            "fov": FIELD_OF_VIEW,
+        table = scene_table(world, surfaces, self._kept, add_mesh=self._add_mesh, add_image=self._add_image) | {
             "clip": ray_range(world.camera, [surface.ball for surface in surfaces]),
             "size": [width, height],
             "seed": noise_seed(world),
-            "camera": world.camera.tolist(),
-            "ambient": world.ambient,
-            "lights": [_light(light) for light in world.lights],
-            "items": [self._item(surface) for surface in surfaces],
         }
-        data = self._call("draw", {"world": values})
+        data = self._call("draw", {"world": table})
         self._kept.trim()
         with Image.open(BytesIO(data)) as picture:
             rgba = np.asarray(picture.convert("RGBA")) / 255.0
         return composited(rgba[..., :3], rgba[..., 3:], world)
-
-    def _item(self, surface: Surface) -> dict[str, Any]:
-        return {
-            "mesh": self._kept.get(surface.key, lambda: self._add_mesh(surface)),
-            "pose": surface.pose.tolist(),
-            "albedo": self._image(surface.albedo),
-            "normal": surface.normal and self._image(surface.normal),
-            "metallic": surface.metallic and self._image(surface.metallic),
-            "alpha": surface.opacity is not None or surface.albedo.transparent,
-            "opacity": surface.opacity,
-            "cutoff": CUTOFF,
-            "roughness": PLAIN_ROUGHNESS,
-        }
 
     def _add_mesh(self, surface: Surface) -> tuple[str, int]:
         part = without_backs(surface.part)
         arrays = {"vertices": part.vertices, "normals": part.normals, "uvs": part.uvs, "faces": part.faces}
         self._call("mesh", {"key": surface.key}, arrays)
         return surface.key, sum(array.nbytes for array in arrays.values())
-
-    def _image(self, image: TextureImage) -> str:
-        return self._kept.get(image.key, lambda: self._add_image(image))
 
     def _add_image(self, image: TextureImage) -> tuple[str, int]:
         pixels = rgba_of(image.pixels())
@@ -139,13 +115,3 @@ class CyclesEngine:
 
 class _BlenderError(Exception):
     """Blender failed or has ended."""
-
-
-def _light(light: WorldLight) -> dict[str, Any]:
-    return {
-        "kind": light.kind,
-        "color": unit_color(light.color),
-        "intensity": light.intensity,
-        "direction": light.direction,
-        "position": light.position,
-    }

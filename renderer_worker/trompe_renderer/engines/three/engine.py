@@ -2,7 +2,6 @@
 
 import shutil
 from base64 import b64decode, b64encode
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -13,22 +12,19 @@ from numpy.typing import NDArray
 from playwright.sync_api import Error, Page, Route, sync_playwright
 
 from trompe_renderer.engines.surfaces import (
-    PLAIN_ROUGHNESS,
     ContentCache,
     Surface,
     TextureImage,
     background_pixels,
     clipping_planes,
     rgba_of,
+    scene_table,
     sphere_around,
     surfaces_of,
 )
-from trompe_renderer.world.snapshot import Sky, Snapshot, WorldLight
-from trompe_renderer.world.validation import unit_color
+from trompe_renderer.world.snapshot import Sky, Snapshot
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError
-from trompe_shared.geometry import FIELD_OF_VIEW
-from trompe_shared.opacity import CUTOFF
 from trompe_shared.three import FOLDER, LIGHTS, THREE
 
 SCRIPTS: Final = {"page.js": Path(__file__).parent, THREE: FOLDER, LIGHTS: FOLDER}
@@ -81,41 +77,18 @@ class ThreeEngine:
     def _call(self, function: str, *arguments: Any) -> Any:
         return self._page.evaluate(f"given => trompe.{function}(...given)", list(arguments))
 
-    def _world(self, world: Snapshot, surfaces: list[Surface], width: int, height: int) -> Mapping[str, Any]:
+    def _world(self, world: Snapshot, surfaces: list[Surface], width: int, height: int) -> dict[str, Any]:
         near, far = clipping_planes(world.camera, [surface.ball for surface in surfaces])
         centre, radius = sphere_around(surfaces)
         background: Any = world.background
         if isinstance(background, Sky):
             background = _text(rgba_of(background_pixels(world, width=width, height=height)))
-        return {
-            "fov": FIELD_OF_VIEW,
+        return scene_table(world, surfaces, self._kept, add_mesh=self._add_mesh, add_image=self._add_texture) | {
             "near": near,
             "far": far,
-            "camera": world.camera.T.ravel().tolist(),
             "centre": centre.tolist(),
             "radius": radius,
-            "items": [self._item(surface) for surface in surfaces],
-            "ambient": world.ambient,
-            "suns": [
-                _light(each) | {"towards": [-x for x in each.direction]}
-                for each in world.lights
-                if each.kind == "Directional"
-            ],
-            "lamps": [_light(each) | {"position": each.position} for each in world.lights if each.kind == "Point"],
             "background": background,
-        }
-
-    def _item(self, surface: Surface) -> Mapping[str, Any]:
-        blended = surface.opacity is not None
-        return {
-            "mesh": self._kept.get(surface.key, lambda: self._add_mesh(surface)),
-            "pose": surface.pose.T.ravel().tolist(),
-            "albedo": self._texture(surface.albedo),
-            "normal": self._texture(surface.normal),
-            "metallic": self._texture(surface.metallic),
-            "opacity": surface.opacity,
-            "cutoff": 0 if blended else CUTOFF,
-            "roughness": PLAIN_ROUGHNESS,
         }
 
     def _add_mesh(self, surface: Surface) -> tuple[str, int]:
@@ -123,9 +96,6 @@ class ThreeEngine:
         arrays = {"position": part.vertices, "normal": part.normals, "uv": part.uvs, "index": part.faces}
         self._call("addMesh", surface.key, {name: _text(array) for name, array in arrays.items()})
         return surface.key, sum(array.nbytes for array in arrays.values())
-
-    def _texture(self, image: TextureImage | None) -> str | None:
-        return None if image is None else self._kept.get(image.key, lambda: self._add_texture(image))
 
     def _add_texture(self, image: TextureImage) -> tuple[str, int]:
         pixels = image.pixels()
@@ -160,10 +130,6 @@ def _answer(route: Route) -> None:
         route.fulfill(path=SCRIPTS[path] / path, content_type="text/javascript")
     else:
         route.abort()
-
-
-def _light(light: WorldLight) -> dict[str, Any]:
-    return {"color": unit_color(light.color), "intensity": light.intensity}
 
 
 def _text(array: NDArray[Any]) -> str:

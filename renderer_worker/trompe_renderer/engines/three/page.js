@@ -1,4 +1,4 @@
-// One picture at a time for engine.py: meshes and textures by key, then `draw`. Matrices are column-major.
+// One picture at a time for engine.py: meshes and textures by key, then `draw`. Matrices are lists of rows.
 import { aimSun, setAmbient, setLight } from "./lights.js";
 import * as THREE from "./three.module.min.js";
 
@@ -76,7 +76,7 @@ function place(number, item) {
   }
   const mesh = slots[number], material = mesh.material;
   mesh.geometry = meshes.get(item.mesh);
-  mesh.matrix.fromArray(item.pose);
+  mesh.matrix.set(...item.pose.flat());
   mesh.matrixWorldNeedsUpdate = mesh.visible = true;
   material.map = textures.get(item.albedo);
   material.normalMap = textures.get(item.normal) ?? null;
@@ -98,25 +98,22 @@ function light(lights, number, make, item) {
     scene.add(lights[number]);
     if (lights[number].target) scene.add(lights[number].target);
   }
-  const each = lights[number];
-  each.visible = !!item;
-  if (!item) return each;
-  setLight(each, item);
-  return each;
+  lights[number].visible = true;
+  setLight(lights[number], item);
+  return lights[number];
 }
 
 function shine(world) {
   setAmbient(ambient, world.ambient);
-  for (let number = 0; number < Math.max(suns.length, world.suns.length); number++) {
-    const item = world.suns[number], sun = light(suns, number, () => new THREE.DirectionalLight(), item);
-    if (!item) continue;
-    aimSun(sun, item.towards, ball);
+  for (const each of [...suns, ...lamps]) each.visible = false;
+  world.lights.filter(item => item.kind === "Directional").forEach((item, number) => {
+    const sun = light(suns, number, () => new THREE.DirectionalLight(), item);
+    aimSun(sun, item.direction.map(x => -x), ball);
     sun.castShadow = options.shadows;
-  }
-  for (let number = 0; number < Math.max(lamps.length, world.lamps.length); number++) {
-    const item = world.lamps[number], lamp = light(lamps, number, () => new THREE.PointLight(), item);
-    if (item) lamp.position.fromArray(item.position);
-  }
+  });
+  world.lights.filter(item => item.kind === "Point").forEach((item, number) => {
+    light(lamps, number, () => new THREE.PointLight(), item).position.fromArray(item.position);
+  });
 }
 
 async function show(background, width, height) {
@@ -138,7 +135,7 @@ async function draw(world, width, height) {
   }
   Object.assign(camera, {fov: world.fov, aspect: width / height, near: world.near, far: world.far});
   camera.updateProjectionMatrix();
-  camera.matrix.fromArray(world.camera);
+  camera.matrix.set(...world.camera.flat());
   camera.matrixWorldNeedsUpdate = true;
   ball.center.fromArray(world.centre);
   ball.radius = world.radius;
