@@ -1,29 +1,33 @@
-"""The state of one agent: scene, camera, lights, background. No sockets, no OpenGL, no clock.
+"""The state of one agent: scene, camera, lights, background, objects. No sockets, no OpenGL, no clock.
 
 Each method answers the command of its name in ``trompe_shared.sailenv.COMMANDS`` with the values of the reply, if any.
 It refuses with a ``TrompeError`` whose message becomes the reason.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
 import numpy as np
 
-from trompe_renderer.protocol.object_commands import ObjectCommands
+from trompe_renderer.protocol.limits import MIB
 from trompe_renderer.protocol.upload import ModelCache
-from trompe_renderer.world.movement import frustum_walls
-from trompe_renderer.world.objects import ObjectRequest
+from trompe_renderer.world.model import HashedModel, content_key, repainted
+from trompe_renderer.world.movement import NO_WALLS, Pose, frustum_walls, motion_of
+from trompe_renderer.world.objects import ObjectRequest, WorldObject
 from trompe_renderer.world.scenario import read_scenario
-from trompe_renderer.world.scenes import OBJECT_VIEW, SceneSetup, scene_named
+from trompe_renderer.world.scenes import CATEGORIES, OBJECT_VIEW, UPLOADED, SceneSetup, scene_named, shipped_model
 from trompe_renderer.world.snapshot import Matrix, Sky, Snapshot, WorldLight
 from trompe_renderer.world.validation import Ints, Vector, checked_color, checked_number, checked_vector, unit_color
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, TrompeError
 from trompe_shared.geometry import FIELD_OF_VIEW, unity_to_opengl_rotation
 from trompe_shared.sailenv import EXTENSIONS, LIGHT_NOT_FOUND
+from trompe_shared.shipped import shipped_objects
 
+FILE_PREFIX: Final = "file:"
+MAX_SPAWNED: Final = 64
 FRUSTUM_NEAR: Final = 0.3
 FRUSTUM_FAR: Final = 15.0
 """Metres; the values in SAILenv's git client."""
@@ -48,13 +52,13 @@ def _commands(setting: str, check: Callable[[Any], Any]) -> tuple[Callable[..., 
     return get, put
 
 
-class Session(ObjectCommands):
+class Session:
     """State and answers for one agent, used by one thread. ``size`` is (width, height) of its images, pixels."""
 
     def __init__(self, cache: ModelCache, engine: EngineInfo) -> None:
-        super().__init__(cache)
         self.size = (1, 1)
-        self._engine = engine
+        self._cache, self._limits, self._engine = cache, cache.limits, engine
+        self._uploads: dict[str, bytes] = {}
         self._sequence = self._noise = 0
         self._error = ""
         self._refusals: list[str] = []
@@ -63,14 +67,17 @@ class Session(ObjectCommands):
     def _load(self, scene: SceneSetup) -> None:
         """Restart in ``scene``; the camera stays."""
         self._sequence += 1
-        self._lights, self._ambient = dict(scene.lights), scene.ambient
-        self._reset_objects(scene.static_objects, scene.walls)
-        self._background = scene.background
+        self._lights, self._ambient, self._background = dict(scene.lights), scene.ambient, scene.background
+        self._static = tuple(item.instance(number) for number, item in enumerate(scene.static_objects, start=1))
+        self._last_number = len(self._static)
+        self._spawned: dict[int, WorldObject] = {}
+        self._cache.textures.hold(self, 0)
+        self._room, self._frustum = scene.walls, NO_WALLS
 
     def snapshot(self) -> Snapshot:
         """The world as the agent's camera sees it now."""
         return Snapshot(
-            instances=self._instances(),
+            instances=self._static + tuple(item.instance(number) for number, item in self._spawned.items()),
             camera=self._camera(),
             lights=tuple(light for light in self._lights.values() if light.intensity > 0),
             ambient=unit_color(self._ambient),
@@ -84,6 +91,13 @@ class Session(ObjectCommands):
         camera[:3, :3] = unity_to_opengl_rotation(np.array(self._rotation))
         camera[:3, 3] = self._position
         return camera
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass for moving objects."""
+        for number, item in self._spawned.items():
+            if item.motion is not None:
+                walls = np.concatenate([self._room, self._frustum]) if item.limited else self._room
+                self._spawned[number] = item.after(seconds, walls)
 
     def note_refusal(self, reason: str) -> None:
         """Store the reason of a refusal for LAST_ERROR."""
@@ -178,3 +192,98 @@ class Session(ObjectCommands):
         if name not in self._lights:
             raise RendererError(f"{LIGHT_NOT_FOUND}: there is no light {name!r}; choose one of {list(self._lights)}.")
         return self._lights[name]
+
+    def send_obj_zip(self, *, file: tuple[str, bytes]) -> tuple[str]:
+        """Store an archive and answer a path for SPAWN_OBJECT. Beyond the limit the oldest archives go."""
+        data = file[1]
+        path = content_key(data)
+        kept = {other: archive for other, archive in self._uploads.items() if other != path} | {path: data}
+        while len(kept) > 1 and sum(map(len, kept.values())) > self._limits.uploads:
+            kept.pop(next(iter(kept)))
+        self._cache.uploads.hold(self, sum(map(len, kept.values())))
+        self._uploads = kept
+        return (path,)
+
+    def spawn_object(
+        self,
+        *,
+        name: str,
+        position: Vector,
+        rotation: Vector,
+        scale: Vector,
+        frustum_limited: bool = True,
+        dynamic: tuple[str, str] | None = None,
+        **_of_unity: bool,
+    ) -> tuple[str]:
+        """Add an object. ``remove_dynamics`` and ``use_parent`` have no effect: objects have no physics or parents."""
+        if not all(0 < x < 1e6 for x in scale):
+            raise RendererError(f"A scale must be three positive numbers below a million, got {scale}.")
+        motion = motion_of(*dynamic) if dynamic else None
+        pose = _checked_pose(position, rotation)
+        return (self._spawn(ObjectRequest(name, pose, scale, motion, limited=frustum_limited)),)
+
+    def despawn_object(self, *, instance: int) -> None:
+        self._spawned_object(instance)
+        del self._spawned[instance]
+        self._cache.textures.hold(self, _texture_size(item.model for item in self._spawned.values()))
+
+    def move_object(self, *, instance: int, position: Vector, rotation: Vector) -> None:
+        """Set an object's pose. This ends its own movement."""
+        item = self._spawned_object(instance)
+        self._spawned[instance] = replace(item, pose=_checked_pose(position, rotation), motion=None)
+
+    def repaint_object(self, *, instance: int, textures: Sequence[tuple[str, tuple[int, int, bytes]]]) -> None:
+        painted = self._spawned_object(instance)
+        pictures = {name: np.frombuffer(data, np.uint8).reshape(h, w, 3) for name, (h, w, data) in textures}
+        model = repainted(painted.model, pictures)
+        self._admit(model, instead_of=instance)
+        self._spawned[instance] = replace(painted, model=model)
+
+    def _admit(self, model: HashedModel, *, instead_of: int | None = None) -> None:
+        """Raise ``RendererError`` if the textures of ``model`` and of all other spawned objects exceed the limit."""
+        others = (item.model for number, item in self._spawned.items() if number != instead_of)
+        size, limit = _texture_size([model, *others]), self._limits.textures
+        if size > limit:
+            raise RendererError(f"The spawned objects' textures take more than {limit // MIB} MiB. Despawn some first.")
+        self._cache.textures.hold(self, size)
+
+    def get_spawnable_objects_names(self) -> tuple[Sequence[str]]:
+        return (list(shipped_objects()),)
+
+    def get_categories(self) -> tuple[list[tuple[int, str]]]:
+        return ([(number, name) for name, number in CATEGORIES.items()],)
+
+    def _spawn(self, wanted: ObjectRequest) -> str:
+        if len(self._spawned) >= MAX_SPAWNED:
+            raise RendererError(f"{MAX_SPAWNED} objects are spawned. Despawn one first.")
+        model, category = self._model(wanted.name)
+        self._admit(model)
+        radius = model.obj.radius * max(wanted.scale) if wanted.motion else 0.0
+        placed = (wanted.pose, wanted.scale, wanted.motion, wanted.delay, wanted.limited)
+        self._last_number += 1
+        self._spawned[self._last_number] = WorldObject(model, category, *placed, radius)
+        return str(self._last_number)
+
+    def _model(self, name: str) -> tuple[HashedModel, int]:
+        """Model and category of a shipped object by its name, or of an upload by ``file:`` and its path."""
+        path = name.removeprefix(FILE_PREFIX)
+        if path == name:
+            return shipped_model(name), CATEGORIES[name]
+        if path not in self._uploads:
+            raise RendererError(f"There is no upload {path!r}. Send a zip and spawn 'file:' + the answered path.")
+        return self._cache.read(path, self._uploads[path]), CATEGORIES[UPLOADED]
+
+    def _spawned_object(self, instance: int) -> WorldObject:
+        if instance not in self._spawned:
+            raise RendererError(f"No object {instance} is spawned; there are {sorted(self._spawned)}.")
+        return self._spawned[instance]
+
+
+def _texture_size(models: Iterable[HashedModel]) -> int:
+    """Bytes of the textures of all models; one that several share counts once."""
+    sizes = {id(texture): texture.nbytes for each in models for texture in each.obj.textures.values()}
+    return sum(sizes.values())
+
+
+def _checked_pose(position: Vector, degrees: Vector) -> Pose:
+    return Pose.of(checked_vector(position, "position"), checked_vector(degrees, "rotation"))
