@@ -112,21 +112,18 @@ class Agent:
             try:
                 answer = getattr(self._session, command.name)(**values) or ()
             except Exception as error:  # the client waits for a whole reply in any case
-                self._link.send(_refusal(command, values, self._note(command.name, self._reason(error))))
+                self._link.send(_refusal(command, values, self._note(command.name, error)))
             else:
-                for reason in self._session.take_refusals():
-                    self._note(command.name, reason)
+                for refusal in self._session.take_refusals():
+                    self._note(command.name, refusal)
                 self._link.send(command.encode_reply(*answer))
 
-    def _reason(self, error: Exception) -> str:
-        """The reason of a refusal. Internal errors are logged with their traceback."""
-        if isinstance(error, TrompeError):
-            return str(error)
-        log.error("agent %d: internal error", self._number, exc_info=error)
-        return f"Internal error of the renderer: {error!r}"
-
-    def _note(self, command: str, reason: str) -> str:
-        """Log a refusal and store its reason, shortened, for LAST_ERROR; returns the shortened reason."""
+    def _note(self, command: str, error: Exception) -> str:
+        """Log a refusal, an internal error with its traceback. Returns the shortened reason, kept for LAST_ERROR."""
+        reason = str(error)
+        if not isinstance(error, TrompeError):
+            log.error("agent %d: internal error", self._number, exc_info=error)
+            reason = f"Internal error of the renderer: {error!r}"
         told = reason[:MAX_REASON].encode("utf-8", "replace").decode()
         log.warning("agent %d: refused %s: %s", self._number, command, told)
         self._session.note_refusal(told)
@@ -141,7 +138,7 @@ class Agent:
                 self._session.advance(delta_time)
                 views = self._views(names)
             except Exception as error:
-                self._note("frame", self._reason(error))
+                self._note("frame", error)
                 delta_time = math.nan
                 views = [flat_view(name, **self._size) for name in names]
             for number, piece in enumerate(encode_frame(views, delta_time=delta_time, compress=self._gzip)):
@@ -186,7 +183,7 @@ class Agent:
         try:
             picture = drawn.result()
         except Exception as error:
-            self._link.send(encode_status(self._note("render_views", self._reason(error))))
+            self._link.send(encode_status(self._note("render_views", error)))
             return False
         self._link.send(encode_status(), picture.data.cast("B"))
         return True

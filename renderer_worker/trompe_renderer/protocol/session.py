@@ -61,7 +61,7 @@ class Session:
         self._uploads: dict[str, bytes] = {}
         self._sequence = self._noise = 0
         self._error = ""
-        self._refusals: list[str] = []
+        self._refusals: list[TrompeError] = []
         self.change_scene(scene=OBJECT_VIEW)
 
     def _load(self, scene: SceneSetup) -> None:
@@ -103,8 +103,8 @@ class Session:
         """Store the reason of a refusal for LAST_ERROR."""
         self._error = reason
 
-    def take_refusals(self) -> list[str]:
-        """Reasons of the refusals within the last command, which did the rest."""
+    def take_refusals(self) -> list[TrompeError]:
+        """The refusals within the last command, which did the rest."""
         refusals, self._refusals = self._refusals, []
         return refusals
 
@@ -131,7 +131,7 @@ class Session:
                 raise RendererError(item)
             return self._spawn(item)
         except TrompeError as error:
-            self._refusals.append(str(error))
+            self._refusals.append(error)
             return ""
 
     def spawn_view_frustum(self) -> None:
