@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_renderer.check.findings import FINAL, Finding, fault, ok, warning
-from trompe_renderer.check.measures import Blob, blob, border, level, median, patterns, positions
+from trompe_renderer.check.measures import Blob, Picture, blob, border, level, median, patterns, positions
 from trompe_renderer.check.probes import FACES, RINGS, TEXTURE, ball, chart, cube, disc, plain, plate
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View, spherical
@@ -40,7 +40,6 @@ whatever the tone curve. Without decoding it is 0.32, with two decodings 0.80.""
 TWICE: Final = 0.7
 """Level above which textures are decoded twice."""
 
-Picture = NDArray[np.uint8]
 Size = tuple[int, int]
 Findings = Iterator[Finding]
 
@@ -315,15 +314,14 @@ CHART: Final = chart(RADIUS)
 
 def lens(look: _Look, _: EngineInfo) -> Findings:
     """A disc in pictures of three shapes; in the square one before black and white, whose edges bias oppositely."""
-    black = {name: _ellipse(look, FRONT, size) for name, size in LENS.items()}
+    shots = {name: shot for name, size in LENS.items() if (shot := _ellipse(look, FRONT, size))}
     white = _ellipse(look, replace(FRONT, background=(255, 255, 255)), LENS["square"])
-    if None in black.values():
+    if shots.keys() != LENS.keys():
         yield fault("invisible", "A disc at the origin is missing in some of the pictures.")
         return
     if white is None:
         yield fault("overexposed", "A light grey disc in moderate light is white.")
         return
-    shots = {name: shot for name, shot in black.items() if shot}
     square = shots["square"]
     look.scale = square.spread
     yield from _field_of_view((square.spread[1] + white.spread[1]) / 2)
