@@ -54,6 +54,9 @@ class Panda3dEngine:
             raise RendererError(
                 "Panda3D finds no EGL. Install it (Debian and Ubuntu: apt-get install libegl1 libgl1 libgl1-mesa-dri)."
             )
+        self._matt = core.Material()
+        self._matt.set_ambient((1, 1, 1, 1))
+        self._matt.set_diffuse((1, 1, 1, 1))
         self._buffer: _Buffer | None = None
         self._meshes: ContentCache[Any] = ContentCache()
         self._textures: ContentCache[Any] = ContentCache(lambda texture: texture.release_all())
@@ -101,7 +104,7 @@ class Panda3dEngine:
         path.set_mat(_matrix(surface.pose))
         pixels = surface.albedo.pixels
         path.set_texture(self._textures.get(surface.albedo.key, lambda: self._texture(pixels())))
-        path.set_material(_matt())
+        path.set_material(self._matt)
         if surface.opacity is not None:
             path.set_transparency(core.TransparencyAttrib.M_alpha)
             path.set_alpha_scale(surface.opacity)
@@ -185,13 +188,6 @@ def _light(light: WorldLight) -> Any:
         node.set_direction(core.LVector3(*light.direction))
     node.set_color((*color.tolist(), 1))
     return node
-
-
-def _matt() -> Any:
-    material = core.Material()
-    material.set_ambient((1, 1, 1, 1))
-    material.set_diffuse((1, 1, 1, 1))
-    return material
 
 
 def _mesh(surface: Surface) -> tuple[Any, int]:

@@ -114,7 +114,7 @@ def surfaces_of(world: Snapshot) -> Iterator[Surface]:
 class ContentCache(Generic[T]):
     """Values by content key; ``trim`` forgets those unused for longest. ``drop`` is called with forgotten ones."""
 
-    def __init__(self, drop: Callable[[T], None] = lambda _: None) -> None:
+    def __init__(self, drop: Callable[[T], object] = lambda _: None) -> None:
         self._entries: OrderedDict[str, tuple[T, int]] = OrderedDict()
         self._drop = drop
 
@@ -225,8 +225,7 @@ def _sky(height: NDArray[np.float64]) -> Pixels:
     horizon, zenith, ground = np.array([[0.84, 0.89, 0.93], [0.30, 0.52, 0.78], [0.47, 0.49, 0.43]])
     up, edge = np.sqrt(np.clip(height, 0, 1))[..., None], np.clip((height + 0.01) / 0.02, 0, 1)[..., None]
     edge = edge**2 * (3 - 2 * edge)
-    found: Pixels = np.round(255 * (ground + edge * (horizon + up * (zenith - horizon) - ground))).astype(np.uint8)
-    return found
+    return np.asarray(np.round(255 * (ground + edge * (horizon + up * (zenith - horizon) - ground))), np.uint8)
 
 
 def composited(color: NDArray[np.floating[Any]], alpha: NDArray[np.floating[Any]], world: Snapshot) -> Pixels:
@@ -236,8 +235,7 @@ def composited(color: NDArray[np.floating[Any]], alpha: NDArray[np.floating[Any]
     """
     height, width = color.shape[:2]
     behind = background_pixels(world, width=width, height=height) / 255.0
-    blend: Pixels = np.round(255 * (behind + np.clip(alpha, 0, 1) * (np.clip(color, 0, 1) - behind))).astype(np.uint8)
-    return blend
+    return np.asarray(np.round(255 * (behind + np.clip(alpha, 0, 1) * (np.clip(color, 0, 1) - behind))), np.uint8)
 
 
 def rgba_of(pixels: Pixels) -> Pixels:

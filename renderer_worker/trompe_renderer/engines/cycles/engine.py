@@ -58,7 +58,7 @@ class CyclesEngine:
         except (OSError, _BlenderError) as error:
             raise RendererError(f"Blender cannot be started with {options.python} ({error}). {REMEDY}") from error
         self.info = EngineInfo("cycles", version.decode(), deterministic=False)
-        self._kept: ContentCache[str] = ContentCache(self._drop)
+        self._kept: ContentCache[str] = ContentCache(lambda key: self._call("drop", {"key": key}))
 
     def render(self, world: Snapshot, *, width: int, height: int) -> NDArray[np.uint8]:
         surfaces = list(surfaces_of(world))
@@ -76,19 +76,16 @@ class CyclesEngine:
     def _add_mesh(self, surface: Surface) -> tuple[str, int]:
         part = without_backs(surface.part)
         arrays = {"vertices": part.vertices, "normals": part.normals, "uvs": part.uvs, "faces": part.faces}
-        self._call("mesh", {"key": surface.key}, arrays)
+        self._call("mesh", {"key": surface.key}, **arrays)
         return surface.key, sum(array.nbytes for array in arrays.values())
 
     def _add_image(self, image: TextureImage) -> tuple[str, int]:
         pixels = rgba_of(image.pixels())
-        self._call("image", {"key": image.key, "color": image.use == "albedo"}, {"pixels": pixels})
+        self._call("image", {"key": image.key, "color": image.use == "albedo"}, pixels=pixels)
         return image.key, 5 * pixels.nbytes
 
-    def _drop(self, key: str) -> None:
-        self._call("drop", {"key": key})
-
-    def _call(self, function: str, values: dict[str, Any], arrays: dict[str, NDArray[Any]] | None = None) -> bytes:
-        given = {name: np.ascontiguousarray(array) for name, array in (arrays or {}).items()}
+    def _call(self, function: str, values: dict[str, Any], **arrays: NDArray[Any]) -> bytes:
+        given = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         kinds = {name: [array.dtype.str, array.shape] for name, array in given.items()}
         request = {"call": function, "values": values, "arrays": kinds}
         write, read = self._blender.stdin, self._blender.stdout

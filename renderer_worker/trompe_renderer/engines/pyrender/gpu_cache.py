@@ -106,18 +106,14 @@ class _GpuTexture(pyrender.Texture):  # type: ignore[misc]
         self._format = {2: GL.GL_RG, 3: GL.GL_RGB, 4: GL.GL_RGBA}[pixels.shape[2]]
         self._texid = GL.glGenTextures(1)
         self._bind()
-        for name, value in (
-            (GL.GL_TEXTURE_MAG_FILTER, GL.GL_LINEAR),
-            (GL.GL_TEXTURE_MIN_FILTER, GL.GL_LINEAR_MIPMAP_LINEAR),
-            (GL.GL_TEXTURE_WRAP_S, GL.GL_REPEAT),
-            (GL.GL_TEXTURE_WRAP_T, GL.GL_REPEAT),
-        ):
-            GL.glTexParameteri(self.tex_type, name, value)
+        GL.glTexParameteri(self.tex_type, GL.GL_TEXTURE_MAG_FILTER, GL.GL_LINEAR)
+        GL.glTexParameteri(self.tex_type, GL.GL_TEXTURE_MIN_FILTER, GL.GL_LINEAR_MIPMAP_LINEAR)
+        GL.glTexParameteri(self.tex_type, GL.GL_TEXTURE_WRAP_S, GL.GL_REPEAT)
+        GL.glTexParameteri(self.tex_type, GL.GL_TEXTURE_WRAP_T, GL.GL_REPEAT)
         if anisotropy > 1:
             GL.glTexParameterf(self.tex_type, ANISOTROPY, anisotropy)
         height, width, _ = self.shape
-        kind = self._format, GL.GL_UNSIGNED_BYTE
-        GL.glTexImage2D(self.tex_type, 0, self._format, width, height, 0, *kind, None)
+        GL.glTexImage2D(self.tex_type, 0, self._format, width, height, 0, self._format, GL.GL_UNSIGNED_BYTE, None)
         self.repaint(pixels)
 
     def repaint(self, pixels: Pixels) -> None:

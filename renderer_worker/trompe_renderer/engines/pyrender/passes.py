@@ -165,10 +165,9 @@ def _check(options: PyrenderOptions) -> None:
     limits = {
         "MSAA samples": (options.msaa, GL.GL_MAX_SAMPLES),
         "shadow map": (options.shadow_map, GL.GL_MAX_TEXTURE_SIZE),
-        "anisotropy": (options.anisotropy, MAX_ANISOTROPY),
     }
-    if options.anisotropy == 1:
-        del limits["anisotropy"]  # an optional extension
+    if options.anisotropy > 1:  # by an optional extension
+        limits["anisotropy"] = (options.anisotropy, MAX_ANISOTROPY)
     for what, (wanted, name) in limits.items():
         most = int(GL.glGetIntegerv(name))
         if wanted > most:

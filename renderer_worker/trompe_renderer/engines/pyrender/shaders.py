@@ -24,9 +24,9 @@ class Program:
             raise RendererError(f"The driver cannot link a shader program: {GL.glGetProgramInfoLog(self._name)!r}.")
 
     def use(self, **uniforms: float | NDArray[Any]) -> None:
-        """Make the program current and set uniforms: floats, (2,) and (3,) vectors, (4, 4) matrices."""
+        """Make the program current and set uniforms: floats, (2,) vectors, (4, 4) matrices."""
         GL.glUseProgram(self._name)
-        setters = {(): GL.glUniform1fv, (2,): GL.glUniform2fv, (3,): GL.glUniform3fv}
+        setters = {(): GL.glUniform1fv, (2,): GL.glUniform2fv}
         for name, value in uniforms.items():
             place, array = GL.glGetUniformLocation(self._name, name), np.asarray(value, np.float32)
             if array.shape == (4, 4):

@@ -70,26 +70,24 @@ class ThreeEngine:
 
     def render(self, world: Snapshot, *, width: int, height: int) -> NDArray[np.uint8]:
         surfaces = list(surfaces_of(world))
-        picture = self._call("draw", self._world(world, surfaces, width, height), width, height)
-        self._kept.trim()
-        return np.frombuffer(b64decode(picture), np.uint8).reshape(height, width, 4)[::-1, :, :3]
-
-    def _call(self, function: str, *arguments: Any) -> Any:
-        return self._page.evaluate(f"given => trompe.{function}(...given)", list(arguments))
-
-    def _world(self, world: Snapshot, surfaces: list[Surface], width: int, height: int) -> dict[str, Any]:
         near, far = clipping_planes(world.camera, [surface.ball for surface in surfaces])
         centre, radius = sphere_around(surfaces)
         background: Any = world.background
         if isinstance(background, Sky):
             background = _text(rgba_of(background_pixels(world, width=width, height=height)))
-        return scene_table(world, surfaces, self._kept, add_mesh=self._add_mesh, add_image=self._add_texture) | {
+        table = scene_table(world, surfaces, self._kept, add_mesh=self._add_mesh, add_image=self._add_texture) | {
             "near": near,
             "far": far,
             "centre": centre.tolist(),
             "radius": radius,
             "background": background,
         }
+        picture = self._call("draw", table, width, height)
+        self._kept.trim()
+        return np.frombuffer(b64decode(picture), np.uint8).reshape(height, width, 4)[::-1, :, :3]
+
+    def _call(self, function: str, *arguments: Any) -> Any:
+        return self._page.evaluate(f"given => trompe.{function}(...given)", list(arguments))
 
     def _add_mesh(self, surface: Surface) -> tuple[str, int]:
         part = surface.part
