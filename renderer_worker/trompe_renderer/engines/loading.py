@@ -15,13 +15,13 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import ProtocolError, RendererError
 
 ENGINES: Final[Mapping[str, tuple[str, str]]] = {
-    "pyrender": ("PyrenderEngine", "pip install 'trompe[renderer]'"),
-    "three": ("ThreeEngine", "pip install 'trompe[three]'"),
-    "panda3d": ("Panda3dEngine", "pip install 'trompe[panda3d]'"),
-    "mitsuba": ("MitsubaEngine", "pip install 'trompe[mitsuba]'"),
-    "cycles": ("CyclesEngine", "pip install 'trompe[cycles]'"),
+    "pyrender": ("pyrender.engine:PyrenderEngine", "pip install 'trompe[renderer]'"),
+    "three": ("three.engine:ThreeEngine", "pip install 'trompe[three]'"),
+    "panda3d": ("panda3d:Panda3dEngine", "pip install 'trompe[panda3d]'"),
+    "mitsuba": ("mitsuba:MitsubaEngine", "pip install 'trompe[mitsuba]'"),
+    "cycles": ("cycles.engine:CyclesEngine", "pip install 'trompe[cycles]'"),
 }
-"""Class of each engine in the module of its name, and the command that installs its packages."""
+"""Class of each engine in this package, as module:Class, and the command that installs what it needs."""
 
 
 def engine_maker(name: str, settings: Mapping[str, str]) -> Callable[[], Engine]:
@@ -51,17 +51,18 @@ def engine_maker(name: str, settings: Mapping[str, str]) -> Callable[[], Engine]
 
 
 def _engine_class(name: str) -> Callable[..., Any]:
+    if name in ENGINES:
+        path, command = ENGINES[name]
+        return _imported(name, f"trompe_renderer.engines.{path}", f"Install it: {command}")
     module, _, attribute = name.partition(":")
-    if attribute:
-        sys.path.insert(0, "")  # as `python -m` does: a module in the working directory
-        return _imported(name, module, attribute, f"Run the command in the folder of {module}, or set PYTHONPATH.")
-    if name not in ENGINES:
+    if not attribute:
         raise RendererError(f"There is no engine {name!r}. Choose {', '.join(ENGINES)}, or your own as module:Class.")
-    attribute, remedy = ENGINES[name]
-    return _imported(name, f"trompe_renderer.engines.{name}", attribute, f"Install it: {remedy}")
+    sys.path.insert(0, "")  # as `python -m` does: a module in the working directory
+    return _imported(name, name, f"Run the command in the folder of {module}, or set PYTHONPATH.")
 
 
-def _imported(name: str, module: str, attribute: str, remedy: str) -> Callable[..., Any]:
+def _imported(name: str, path: str, remedy: str) -> Callable[..., Any]:
+    module, _, attribute = path.partition(":")
     try:
         found: Callable[..., Any] | None = getattr(import_module(module), attribute, None)
     except ImportError as error:

@@ -1,5 +1,1 @@
 """The three.js engine, in Chromium."""
-
-from trompe_renderer.engines.three.engine import ThreeEngine, ThreeOptions
-
-__all__ = ["ThreeEngine", "ThreeOptions"]
