@@ -272,24 +272,17 @@ def texture(look: _Look, _: EngineInfo) -> Findings:
         yield fault("invisible", "A square at the origin, seen from the front, is missing.")
         return
     right = patterns(QUARTERS)
-    turns = {
-        (): right,
-        ("v flipped",): right[::-1],
-        ("u flipped",): right[:, ::-1],
-        ("v flipped", "u flipped"): right[::-1, ::-1],
-    }
-    found = next((faults for faults, turned in turns.items() if (seen == turned).all()), ("texture turned",))
-    said = {
-        "v flipped": "The texture's top row appears at the bottom.",
-        "u flipped": "The texture's left column appears at the right.",
-        "texture turned": "The quarters of the texture are not where they belong.",
-    }
-    for name in found:
-        yield fault(name, said[name])
+    rows, columns = next((flips for flips in FLIPS if (seen == right[:: flips[0], :: flips[1]]).all()), (0, 0))
+    if rows == 0:
+        yield fault("texture turned", "The quarters of the texture are not where they belong.")
+    if rows < 0:
+        yield fault("v flipped", "The texture's top row appears at the bottom.")
+    if columns < 0:
+        yield fault("u flipped", "The texture's left column appears at the right.")
     again = _quarters(look, REPEATED)
     if again is None or (again != seen).any():
         yield fault("texture not repeated", "Coordinates from 1 to 2 and -1 to 0 show another part of the texture.")
-    elif not found:
+    elif (rows, columns) == FLIPS[0]:
         yield ok("texture", "its lower left corner is u = 0, v = 0; it repeats.")
 
 
