@@ -30,7 +30,6 @@ SHARE: Final = 0.05
 
 Attack = Mapping[str, Any] | JobSpec
 """Arguments of ``Client.attack``, or a job with stored files."""
-T = TypeVar("T")
 J = TypeVar("J")
 K = TypeVar("K")
 
@@ -74,7 +73,8 @@ async def run_all(
         pause = min(max(LEAST_PAUSE, (time.monotonic() - began) / SHARE), LONGEST_PAUSE)
         calls = [partial(_with_result, port, outcome) for outcome in ended]
         for outcome in await port.together(calls, limit=concurrency):
-            del waiting[_id(outcome)]
+            assert outcome.job is not None
+            del waiting[outcome.job.id]
             yield outcome
         await port.sleep(pause if waiting else 0)
 
@@ -83,9 +83,10 @@ async def _submit_all(port: Port, attacks: Sequence[Attack], batch: str, concurr
     """Read and upload each file once, and submit; errors become outcomes."""
     ids: dict[Upload, str] = {}
     read = cache(source_of)
-    requests = [await _caught(partial(_request, port, attack, read, ids), k) for k, attack in enumerate(attacks)]
-    calls = [partial(_submit, port, request, batch, k) for k, request in enumerate(requests)]
-    return await port.together(calls, limit=concurrency)
+    requests: list[Outcome[JobRequest]] = [
+        await _filled(Outcome(k), "job", partial(_request, port, attack, read, ids)) for k, attack in enumerate(attacks)
+    ]
+    return await port.together([partial(_submit, port, each, batch) for each in requests], limit=concurrency)
 
 
 async def _request(port: Port, attack: Attack, read: Read, ids: dict[Upload, str]) -> JobRequest:
@@ -94,34 +95,29 @@ async def _request(port: Port, attack: Attack, read: Read, ids: dict[Upload, str
     return await uploaded(port, await port.off(lambda: plan_attack(**attack, read=read)), ids)
 
 
-async def _submit(port: Port, request: JobRequest | Outcome[Job], batch: str, index: int) -> Outcome[Job]:
-    if isinstance(request, Outcome):
-        return request
-    labelled = request.model_copy(update={"labels": request.labels | {BATCH: batch}})
-    job = await _caught(partial(send, port, _core.submit(labelled, key=f"{batch}/{index}")), index)
-    return job if isinstance(job, Outcome) else Outcome(index, job)
+async def _submit(port: Port, asked: Outcome[JobRequest], batch: str) -> Outcome[Job]:
+    if asked.job is None:
+        return Outcome(asked.index, error=asked.error)
+    labelled = asked.job.model_copy(update={"labels": asked.job.labels | {BATCH: batch}})
+    submission = _core.submit(labelled, key=f"{batch}/{asked.index}")
+    return await _filled(Outcome(asked.index), "job", partial(send, port, submission))
 
 
-async def _caught(call: Callable[[], Awaitable[T]], index: int) -> T | Outcome[Job]:
-    """The value of ``call``, or an outcome with its error."""
+async def _filled(outcome: Outcome[J], field: str, call: Callable[[], Awaitable[Any]]) -> Outcome[J]:
+    """``outcome`` with the value of ``call`` as its ``field``, or else with its error."""
     try:
-        return await call()
+        return replace(outcome, **{field: await call()})
     except (TrompeError, OSError) as error:
-        return Outcome(index, error=error)
+        return replace(outcome, error=error)
 
 
 async def _ended(port: Port, batch: str, waiting: Mapping[str, Outcome[Job]]) -> list[Outcome[Job]]:
     """Jobs of the batch that have ended or were deleted."""
     listed = {job.id: job async for job in pages(port, _core.job_filter({BATCH: batch}))}
     found = [replace(outcome, job=listed[name]) for name, outcome in waiting.items() if name in listed]
-    gone = [await _missed(port, outcome) for name, outcome in waiting.items() if name not in listed]
+    missed = [name for name in waiting if name not in listed]  # probably deleted
+    gone = [await _filled(waiting[name], "job", partial(send, port, _core.job(name))) for name in missed]
     return [outcome for outcome in found + gone if outcome.error or (outcome.job and outcome.job.state.final)]
-
-
-async def _missed(port: Port, outcome: Outcome[Job]) -> Outcome[Job]:
-    """A job missing from the list, probably deleted."""
-    job = await _caught(partial(send, port, _core.job(_id(outcome))), outcome.index)
-    return replace(outcome, error=job.error) if isinstance(job, Outcome) else replace(outcome, job=job)
 
 
 async def _with_result(port: Port, outcome: Outcome[Job]) -> Outcome[Job]:
@@ -130,10 +126,4 @@ async def _with_result(port: Port, outcome: Outcome[Job]) -> Outcome[Job]:
     error = failure(outcome.job)
     if error is not None:
         return replace(outcome, error=error)
-    result = await _caught(partial(send, port, _core.result(outcome.job.id)), outcome.index)
-    return replace(outcome, error=result.error) if isinstance(result, Outcome) else replace(outcome, result=result)
-
-
-def _id(outcome: Outcome[Job]) -> str:
-    assert outcome.job is not None
-    return outcome.job.id
+    return await _filled(outcome, "result", partial(send, port, _core.result(outcome.job.id)))
