@@ -6,7 +6,6 @@ import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, Final, TypeVar
 
@@ -110,17 +109,10 @@ class AsyncPort:
         await self._http.aclose()
 
 
-@dataclass(frozen=True)
 class _Answer:
-    response: httpx.Response
-
-    @property
-    def status(self) -> int:
-        return self.response.status_code
-
-    @property
-    def headers(self) -> Mapping[str, str]:
-        return self.response.headers
+    def __init__(self, response: httpx.Response) -> None:
+        self.response, self.status = response, response.status_code
+        self.headers: Mapping[str, str] = response.headers
 
     async def body(self) -> bytes:
         return self.response.read()

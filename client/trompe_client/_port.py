@@ -19,13 +19,10 @@ T = TypeVar("T")
 class Answer(Protocol):
     """A server's answer with a streamed body."""
 
-    @property
-    def status(self) -> int:
-        """The HTTP status."""
-
-    @property
-    def headers(self) -> Mapping[str, str]:
-        """The headers, with case-insensitive names."""
+    status: int
+    """The HTTP status."""
+    headers: Mapping[str, str]
+    """The headers, with case-insensitive names."""
 
     async def body(self) -> bytes:
         """All of the body."""
@@ -40,9 +37,8 @@ class Answer(Protocol):
 class Port(Protocol):
     """I/O of an operation."""
 
-    @property
-    def retries(self) -> Retries:
-        """Limit and pauses of retries."""
+    retries: Retries
+    """Limit and pauses of retries."""
 
     def open(self, request: Request[Any], *, silence: float | None = None) -> AbstractAsyncContextManager[Answer]:
         """Send one request; the answer is readable within the block. ``silence``: longest time without a byte, seconds.
