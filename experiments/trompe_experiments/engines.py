@@ -18,7 +18,7 @@ def engines_chart(rows: Sequence[ResultRow]) -> Drawing:
         list(dict.fromkeys(values)) for values in zip(*((_what(r), r.renderers) for r in rows), strict=True)
     )
     size = (8.0, 1.4 + 0.45 * len(objects))
-    with drawing(size=size, panels=(1, 2), sharey=True) as made:
+    with drawing(size=size, panels=[2], sharey=True) as made:
         for number, engine in enumerate(engines):
             own = [row for row in rows if row.renderers == engine]
             style = look(number) | {"ls": "", "mec": "white", "mew": 0.6}

@@ -24,8 +24,8 @@ def prediction_histograms(rows: Sequence[ResultRow], predictions: Sequence[Predi
     if not jobs:
         raise SpecError("No predictions of the target views of these rows; run the experiment again.")
     columns = min(COLUMNS, len(jobs))
-    shape = -(-len(jobs) // columns), columns
-    with drawing(size=(3.6 * columns, 0.5 + 2.1 * shape[0]), panels=shape) as made:
+    panels = [columns] * -(-len(jobs) // columns)
+    with drawing(size=(3.6 * columns, 0.5 + 2.1 * len(panels)), panels=panels) as made:
         for axes, row in zip(made.panels, jobs, strict=False):
             _bars(axes, by_key[row.key])
             axes.set_title(f"{row.object}, ε {row.epsilon:g}" + ("" if row.tau is None else f", τ {row.tau:g}"))

@@ -5,19 +5,19 @@ The paper's numbers were published with its code: ``analyze_data.ipynb`` of sail
 we compare the problem, not the pixels.
 """
 
-import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
+from pathlib import Path
 from typing import Any, Final
 
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from pydantic import BaseModel
 
 from trompe_experiments.markdown import figure_words, markdown_table
-from trompe_experiments.style import BLUE, GREEN, GREY, INK, Drawing, drawing, drawing_in_rows, look
-from trompe_experiments.table import ResultRow
+from trompe_experiments.style import BLUE, GREEN, GREY, INK, Drawing, drawing, look
+from trompe_experiments.table import ResultRow, read_table
 from trompe_shared.api import FEW_RECOGNISED
 from trompe_shared.comparison import average, grouped
 
@@ -26,8 +26,7 @@ SUBSTITUTED: Final = "inception_v3"
 MEAN: Final = f"**mean** where A_before ≥ {FEW_RECOGNISED:g}"
 
 
-@dataclass(frozen=True)
-class PaperCell:
+class PaperCell(BaseModel, frozen=True):
     """The paper's result for one object, classifier, epsilon and tau (``None``: no saliency). ``None``: n.a."""
 
     object: str
@@ -61,13 +60,7 @@ class Cell:
 @cache
 def paper_numbers() -> tuple[PaperCell, ...]:
     """The paper's results."""
-    text = resources.files("trompe_experiments").joinpath("paper_table.csv").read_text("utf-8")
-
-    def cell(row: dict[str, str]) -> PaperCell:
-        numbers = (float(row[name]) if row[name] else None for name in ("tau", "target_a_drop", "texels_altered"))
-        return PaperCell(row["object"], row["classifier"], float(row["epsilon"]), *numbers)
-
-    return tuple(map(cell, csv.DictReader(text.splitlines())))
+    return tuple(read_table(Path(__file__).with_name("paper_table.csv"), PaperCell))
 
 
 def recognised(rows: Iterable[ResultRow]) -> list[ResultRow]:
@@ -174,7 +167,7 @@ def table_one_chart(rows: Sequence[ResultRow]) -> Drawing:
     objects = list(dict.fromkeys(cell.object for cell in cells))
     counts = [len(row) for row in grouped(places, lambda place: place[0]).values()]
     size = (1.8 + 2.6 * max(counts), 0.8 + (0.9 + 0.26 * len(objects)) * len(counts))
-    with drawing_in_rows(size=size, rows=counts, sharex=True, sharey=True) as made:
+    with drawing(size=size, panels=counts, sharex=True, sharey=True) as made:
         for axes, place in zip(made.panels, places, strict=True):
             for cell in panels[place]:
                 _draw_line(axes, objects.index(cell.object), cell)
@@ -228,7 +221,7 @@ def texels_scatter(rows: Iterable[ResultRow]) -> Drawing:
     texels = sorted({(dot.keep, dot.tau) for dot in dots}, key=lambda pair: [value or -1.0 for value in pair])
     colours = {pair: look(k)["color"] for k, pair in enumerate(texels)}
     markers = {epsilon: look(k)["marker"] for k, epsilon in enumerate(sorted({dot.epsilon for dot in dots}))}
-    with drawing(size=(1.6 + 3.4 * len(panels), 4.2), panels=(1, len(panels)), sharey=True) as made:
+    with drawing(size=(1.6 + 3.4 * len(panels), 4.2), panels=[len(panels)], sharey=True) as made:
         for axes, (name, group) in zip(made.panels, panels.items(), strict=True):
             for dot in group:
                 style: Any = {"color": colours[dot.keep, dot.tau], "marker": markers[dot.epsilon]}

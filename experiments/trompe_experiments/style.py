@@ -58,19 +58,10 @@ class Drawing:
 
 
 @contextmanager
-def drawing(*, size: tuple[float, float], panels: tuple[int, int] = (1, 1), **options: Any) -> Iterator[Drawing]:
-    """A figure of ``size`` (width, height in inches) with ``panels`` (rows, columns)."""
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(*panels, squeeze=False, **options)
-        yield Drawing(figure, axes.flat)
-
-
-@contextmanager
-def drawing_in_rows(*, size: tuple[float, float], rows: Sequence[int], **options: Any) -> Iterator[Drawing]:
-    """A figure whose rows have different numbers of panels; the panels of a row fill its width."""
-    parts = math.lcm(*rows)
-    places = [[f"{row}.{part * count // parts}" for part in range(parts)] for row, count in enumerate(rows)]
+def drawing(*, size: tuple[float, float], panels: Sequence[int] = (1,), **options: Any) -> Iterator[Drawing]:
+    """A figure of ``size`` (width, height in inches) with ``panels`` in each row, which fill its width."""
+    parts = math.lcm(*panels)
+    places = [[f"{row}.{part * count // parts}" for part in range(parts)] for row, count in enumerate(panels)]
     with matplotlib.rc_context(RC):
         figure = Figure(figsize=size, layout="constrained")
         yield Drawing(figure, list(figure.subplot_mosaic(places, **options).values()))  # type: ignore[arg-type]

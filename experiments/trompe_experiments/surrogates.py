@@ -17,7 +17,7 @@ def surrogates_of(rows: Sequence[ResultRow]) -> list[str]:
 def surrogates_chart(rows: Sequence[ResultRow]) -> Drawing:
     """A panel for each choice of texels, a dot for each object and surrogate: predicted against kept."""
     panels, names = by_texels(with_all_surrogates(rows)), surrogates_of(rows)
-    with drawing(size=(1.2 + 3.2 * len(panels), 3.9), panels=(1, len(panels)), sharex=True, sharey=True) as made:
+    with drawing(size=(1.2 + 3.2 * len(panels), 3.9), panels=[len(panels)], sharex=True, sharey=True) as made:
         for axes, (texels, group) in zip(made.panels, panels.items(), strict=True):
             axes.plot([0, 1], [0, 1], color=GREY, lw=0.8, zorder=1)
             for number, name in enumerate(names):

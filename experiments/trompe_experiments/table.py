@@ -261,7 +261,7 @@ def prediction_rows(key: str, result: Result, classes: Sequence[str] | None) -> 
     return rows
 
 
-R = TypeVar("R", bound=_Row)
+R = TypeVar("R", bound=BaseModel)
 
 
 def write_table(path: Path, rows: Iterable[RowId] | Iterable[PredictionRow], kind: type[BaseModel] = ResultRow) -> None:
@@ -309,7 +309,7 @@ def read_results(folder: str | Path) -> list[ResultRow]:
     return rows
 
 
-def _filled(row: Mapping[str, str], kind: type[_Row]) -> dict[str, str | None]:
+def _filled(row: Mapping[str, str], kind: type[BaseModel]) -> dict[str, str | None]:
     """Cells for pydantic: an empty one is ``None``, except in columns of text."""
     texts = {name for name, field in kind.model_fields.items() if field.annotation is str}
     return {name: cell if cell or name in texts else None for name, cell in row.items()}
