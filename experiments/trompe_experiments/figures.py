@@ -91,6 +91,18 @@ def plain_rows(data: Data) -> list[ResultRow]:
     return [row for row in rows if row.epsilon == nearest]
 
 
+def _accuracy_against(
+    cost: Cost, title: str, table: Callable[[Data], str] | None = None, *, varied: str = "series"
+) -> Kind:
+    """Accuracy of configurations against ``cost``, if the rows have several values in the column ``varied``."""
+    return Kind(
+        f"{title} against accuracy",
+        lambda data: _compares(data, cost) and _values(data, varied) > 1,
+        lambda data: speed_accuracy_chart(data.results, cost=cost),
+        table,
+    )
+
+
 FIGURES: dict[str, Kind] = {
     "table_one": Kind(
         "A_drop per object, classifier and epsilon (the paper's Table I)",
@@ -137,27 +149,10 @@ FIGURES: dict[str, Kind] = {
         lambda data: _one_setting(data) and bool(data.predictions and plain_rows(data)),
         lambda data: prediction_histograms(histogram_rows(plain_rows(data)), data.predictions),
     ),
-    "speed_accuracy": Kind(
-        "Speed against accuracy",
-        lambda data: _compares(data, "seconds"),
-        lambda data: speed_accuracy_chart(data.results),
-        lambda data: pareto_markdown(data.results),
-    ),
-    "evaluations_accuracy": Kind(
-        "Images shown to the classifier against accuracy",
-        lambda data: _compares(data, "evaluations"),
-        lambda data: speed_accuracy_chart(data.results, cost="evaluations"),
-    ),
-    "visibility": Kind(
-        "Visibility of the change (colour difference) against accuracy",
-        lambda data: _compares(data, "delta_e") and _values(data, "perceptual") > 1,
-        lambda data: speed_accuracy_chart(data.results, cost="delta_e"),
-    ),
-    "visibility_ssim": Kind(
-        "Visibility of the change (structure) against accuracy",
-        lambda data: _compares(data, "dissimilarity") and _values(data, "perceptual") > 1,
-        lambda data: speed_accuracy_chart(data.results, cost="dissimilarity"),
-    ),
+    "speed_accuracy": _accuracy_against("seconds", "Speed", lambda data: pareto_markdown(data.results)),
+    "evaluations_accuracy": _accuracy_against("evaluations", "Images shown to the classifier"),
+    "visibility": _accuracy_against("delta_e", "Visibility of the change (colour difference)", varied="perceptual"),
+    "visibility_ssim": _accuracy_against("dissimilarity", "Visibility of the change (structure)", varied="perceptual"),
     "stability": Kind(
         "Where methods fail",
         lambda data: _cases(data) and not data.judgements,

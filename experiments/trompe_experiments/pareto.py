@@ -59,24 +59,19 @@ def _job(row: ResultRow, cost: float, drop: float) -> Job[Place]:
 def _short_names(places: Sequence[Place]) -> dict[Place, Place]:
     """Series and configurations without the options that are the same in all configurations of a series, unless two
     series had one title then."""
-    by_series = grouped(places, lambda place: place[0])
-    short = {series: _shortened(series, group) for series, group in by_series.items()}
-    titles = Counter(title for title, _ in short.values())
-    found: dict[Place, Place] = {}
-    for series, group in by_series.items():
-        title, names = short[series]
-        for place, name in zip(group, names, strict=True):
-            found[place] = (title, name) if titles[title] == 1 else place
-    return found
+    shortened = [_shortened(series, group) for series, group in grouped(places, lambda place: place[0]).items()]
+    titles = Counter(title for names in shortened for title in {title for title, _ in names.values()})
+    return {place: name if titles[name[0]] == 1 else place for names in shortened for place, name in names.items()}
 
 
-def _shortened(series: str, group: Sequence[Place]) -> tuple[str, list[str]]:
-    """Short title of a series, and short names of its configurations."""
+def _shortened(series: str, group: Sequence[Place]) -> dict[Place, Place]:
+    """Short titles and names of the configurations of a series."""
     parts = [name.split(", ") for _, name in group]
     constant = set.intersection(*map(set, parts)) if len(parts) > 1 else set()
     fixed = {part.rpartition(" ")[0] for part in constant}
     title = " x ".join(word for word in series.split(" x ") if word not in fixed)
-    return title, [", ".join(part for part in split if part not in constant) for split in parts]
+    names = (", ".join(part for part in split if part not in constant) for split in parts)
+    return {place: (title, name) for place, name in zip(group, names, strict=True)}
 
 
 def speed_accuracy_chart(rows: Sequence[ResultRow], *, cost: Cost = "seconds") -> Drawing:
