@@ -49,7 +49,7 @@ def result_report(
     result: Result, *, note: str | None = None, seconds: Mapping[str, float] | None = None
 ) -> RenderableType:
     """Accuracies before and after, size of the change, and cost of the attack. ``seconds`` default to the job's own."""
-    table = _table("", "views", "A_before", "A_after", "A_drop", right=4)
+    table = empty_table("", "views", "A_before", "A_after", "A_drop", right=4)
     for name, accuracy in result.accuracies:
         table.add_row(name, accuracy.counted, *_cells(accuracy))
     facts = _pairs(_facts(result, seconds or result.seconds))
@@ -60,7 +60,7 @@ def result_report(
 
 def judgement_report(manifest: Manifest, files: Sequence[Path]) -> RenderableType:
     """Figures of the images as rendered, and the findings. files: what was written."""
-    table = _table("network", "renderer", "before", "after", "A_drop", right=3)
+    table = empty_table("network", "renderer", "before", "after", "A_drop", right=3)
     for cell in manifest.cells:
         if cell.pipeline == AS_RENDERED:
             figures = ["", "", "missing"] if cell.accuracy is None else _cells(cell.accuracy)
@@ -72,7 +72,7 @@ def judgement_report(manifest: Manifest, files: Sequence[Path]) -> RenderableTyp
 def jobs_table(jobs: Sequence[Job]) -> Table:
     """One line per job, with a column of labels if there are any."""
     labels = ["labels"] if any(job.labels for job in jobs) else []
-    table = _table("job", "state", "object", "label", "classifier", "epsilon", "done", "created", *labels)
+    table = empty_table("job", "state", "object", "label", "classifier", "epsilon", "done", "created", *labels)
     for job in jobs:
         what = _judged(job, job.spec) if isinstance(job.spec, JudgementSpec) else _attacked(job, job.spec)
         how = [f"{job.progress.fraction:.0%}", f"{job.created:%Y-%m-%d %H:%M}"]
@@ -133,7 +133,7 @@ def _asked(spec: JobSpec | JudgementSpec) -> dict[str, Any]:
 def records_table(kind: type, records: Sequence[Any]) -> Table:
     """One line per record of a kind: ``ObjectInfo``, ``ClassifierInfo``, ``BackgroundInfo`` and so on."""
     columns, cells = _RECORDS[kind]
-    table = _table(*columns)
+    table = empty_table(*columns)
     for record in records:
         table.add_row(*cells(record))
     return table
@@ -164,12 +164,14 @@ _RECORDS: Final[Mapping[type, tuple[Sequence[str], Callable[[Any], Sequence[str]
 }
 
 
-def _table(*columns: str, right: int = 0) -> Table:
+def empty_table(*columns: str, right: int = 0) -> Table:
     """A table with numbers in the last ``right`` columns: aligned right and never wrapped."""
     table = Table()
     for index, name in enumerate(columns):
-        number = index >= len(columns) - right
-        table.add_column(name, justify="right" if number else "left", overflow="fold", no_wrap=number)
+        if index < len(columns) - right:
+            table.add_column(name, overflow="fold")
+        else:
+            table.add_column(name, justify="right", no_wrap=True)
     return table
 
 

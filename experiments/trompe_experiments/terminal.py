@@ -6,25 +6,26 @@ from statistics import stdev
 from typing import Final
 
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
+from trompe_client._report import empty_table
 from trompe_experiments.markdown import figure_words
 from trompe_experiments.table import ResultRow, read_results
 from trompe_shared.comparison import average, grouped
 from trompe_shared.errors import SpecError
 
+SETTING: Final = ("object", "classifier", "configuration")
+"""Columns of a setting."""
 FIGURES: Final = ("target_a_drop", "held_out_a_drop", "transfer_gap", "texels_altered", "seconds")
 CHANGED: Final = 0.1
 """Smallest difference of ``a_drop`` that is counted."""
-Setting = tuple[str, ...]
 Pair = tuple[list[ResultRow], list[ResultRow]]
 """Rows of one setting in two experiments."""
 
 
 def results_table(rows: Sequence[ResultRow]) -> RenderableType:
     """A line for each setting (object, classifier, configuration) with means over seeds; then the mean of all rows."""
-    table = _table(["seeds", "surrogate", "target", "A_drop", "held-out A_drop", "N%", "s"])
+    table = empty_table(*SETTING, "seeds", "surrogate", "target", "A_drop", "held-out A_drop", "N%", "s", right=7)
     for group in grouped(rows, lambda row: (row.series, *_setting(row))).values():
         first = group[0]
         cells = [_pair(group, "surrogate"), _pair(group, "target"), _spread(group, "target_a_drop")]
@@ -67,7 +68,8 @@ def change(pair: Pair, figure: str) -> float | None:
 
 def comparison_table(found: Sequence[Pair]) -> RenderableType:
     """A line for each shared setting with all figures before and after; then a summary."""
-    table = _table([figure.replace("_a_drop", " A_drop").replace("_", " ") for figure in FIGURES])
+    titles = [figure.replace("_a_drop", " A_drop").replace("_", " ") for figure in FIGURES]
+    table = empty_table(*SETTING, *titles, right=len(titles))
     for before, after in found:
         first = before[0]
         cells = [f"{_mean(before, name)} > {_mean(after, name)}" for name in FIGURES]
@@ -80,17 +82,7 @@ def comparison_table(found: Sequence[Pair]) -> RenderableType:
     return Group(table, Text(summary))
 
 
-def _table(figures: Iterable[str]) -> Table:
-    """An empty table: a setting, and figures."""
-    table = Table()
-    for name in ("object", "classifier", "configuration"):
-        table.add_column(name, overflow="fold")
-    for figure in figures:
-        table.add_column(figure, justify="right", no_wrap=True)
-    return table
-
-
-def _setting(row: ResultRow) -> Setting:
+def _setting(row: ResultRow) -> tuple[str, ...]:
     tau = "" if row.tau is None else f"{row.tau:g}"
     return row.object, row.classifier, f"{row.epsilon:g}", tau, row.configuration
 
