@@ -23,8 +23,6 @@ from trompe_shared.comparison import differing_options
 if TYPE_CHECKING:
     from trompe_experiments.table import ResultRow
 
-_folder = click.argument("folder", metavar="DIR", type=click.Path(exists=True, file_okay=False, path_type=Path))
-
 
 @click.group()
 def experiment() -> None:
@@ -155,7 +153,7 @@ def list_() -> None:
 
 
 @experiment.command()
-@_folder
+@click.argument("folder", metavar="DIR", type=click.Path(exists=True, file_okay=False, path_type=Path))
 def report(folder: Path) -> None:
     """Write the experiment in DIR as one HTML file, and its figures as SVG and PNG."""
     from trompe_experiments.report import write_report

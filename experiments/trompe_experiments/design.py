@@ -16,7 +16,6 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -184,8 +183,7 @@ class _Loader(yaml.SafeLoader):
 
 def shipped_experiments() -> dict[str, Path]:
     """The shipped files by name."""
-    folder = Path(str(resources.files("trompe_experiments"))) / "files"
-    return {file.stem: file for file in sorted(folder.glob("*.yaml"))}
+    return {file.stem: file for file in sorted(Path(__file__).parent.glob("files/*.yaml"))}
 
 
 def experiment_file(source: str | Path) -> Path:

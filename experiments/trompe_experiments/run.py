@@ -66,15 +66,12 @@ class Show(Protocol):
 
     def begin(self, *, total: int, done: int) -> None:
         """Start with ``total`` jobs, ``done`` of them finished before this run."""
-        ...
 
     def look(self, row: Row, job: Job) -> None:
         """Show the current state of a job."""
-        ...
 
     def end(self, row: Row, finished: Finished) -> None:
         """Show a finished job."""
-        ...
 
 
 def run_experiment(plan: Plan, service: Service, folder: Path, *, show: Show, retry_failed: bool = False) -> Rows:
