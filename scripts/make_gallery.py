@@ -40,7 +40,6 @@ COLUMNS: Final = (
 
 
 def main() -> None:
-    """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--classifier", type=Path, required=True, help="a .pt2 file that knows ImageNet's classes")
     options = parser.parse_args()

@@ -5,8 +5,6 @@ python scripts/make_objects.py [--out FOLDER] [--only NAME]
 
 import argparse
 import json
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -35,12 +33,12 @@ KINDS: Final = {
 """How an object is made, and from which elevations (degrees) it is looked at."""
 
 
-def main(arguments: Sequence[str]) -> None:
+def main() -> None:
     """Write archives and ``objects.json`` into a folder, by default the one that is part of the package."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder to write to (default: %(default)s)")
     parser.add_argument("--only", choices=sorted(KINDS), help="make one object's archive and nothing else")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     rows = {}
     for name in [options.only] if options.only else sorted(KINDS):
@@ -55,4 +53,4 @@ def main(arguments: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

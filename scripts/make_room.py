@@ -8,7 +8,6 @@ outside comes in and none of them stands between it and the furniture. A window 
 
 import argparse
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -323,11 +322,11 @@ def scene() -> dict[str, Any]:
     }
 
 
-def main(arguments: Sequence[str]) -> None:
+def main() -> None:
     """Write the archives and ``scene.json`` into a folder, by default the one that is part of the package."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder to write to (default: %(default)s)")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     for name, make in PARTS.items():
         data = make().archive(name)
@@ -337,4 +336,4 @@ def main(arguments: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

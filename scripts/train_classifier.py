@@ -10,7 +10,6 @@ in image space as a check that the network is an ordinary one. About five minute
 
 import argparse
 import hashlib
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from torch.nn import functional as F
 from trompe_server.attack.views import grid_views
 from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, WEIGHTS, TinyNet, load_tiny, save_tiny
 from trompe_server.renderers import local_renderer
-from trompe_server.surrogate import SamplingModel, diffuse_surrogate, prepare_geometry
+from trompe_server.surrogate import SamplingModel, diffuse_surrogate, prepare_geometry, textures_of
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.sailenv_client import SailenvTarget
@@ -86,11 +85,10 @@ def on(colour: tuple[int, int, int], views: Sequence[View]) -> list[View]:
 def surrogate_images(obj: Object3D, views: Sequence[View]) -> Images:
     """Images (2 * views, H, W, 3) on black, then on white, of the surrogate that knows diffuse light alone."""
     geometry = prepare_geometry(obj, views, size=IMAGE_SIZE, sampling=SamplingModel())
-    textures = {name: torch.from_numpy(image).float() / 255 for name, image in obj.textures.items()}
     images = []
     for colour in (BLACK, WHITE):
         surrogate = diffuse_surrogate(geometry, on(colour, views))
-        images.append(surrogate.render(surrogate.texels(textures), range(len(views))))
+        images.append(surrogate.render(surrogate.texels(textures_of(obj)), range(len(views))))
     return np.asarray((torch.cat(images) * 255).round().byte().permute(0, 2, 3, 1).numpy())
 
 
@@ -245,14 +243,14 @@ def accuracy(network: TinyNet, images: Tensor, label: int) -> float:
     return float((network(images).argmax(dim=1) == label).float().mean())
 
 
-def main(arguments: Sequence[str]) -> None:
+def main() -> None:
     """Take the pictures, train, save, judge."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, default=Path("build/pictures"), help="folder that keeps the pictures")
     parser.add_argument("--out", type=Path, default=WEIGHTS, help="file to write (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--epochs", type=int, default=9)
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     with local_renderer() as target:
         network = train(collect(target, options.seed, options.cache), epochs=options.epochs, seed=options.seed)
         save_tiny(network, options.out)
@@ -260,4 +258,4 @@ def main(arguments: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

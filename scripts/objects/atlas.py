@@ -190,14 +190,11 @@ def _obj(name: str, materials: Materials, slots: Mapping[str, list[_Slot]], midd
     lines += ["v {:.6f} {:.6f} {:.6f}".format(*point) for point in points]
     lines += ["vt {:.5f} {:.5f}".format(*uv) for patch, slot in pairs for uv in slot.texture_coordinates(patch)]
     lines += ["vn {:.4f} {:.4f} {:.4f}".format(*normal) for normal in unique]
-    indices, corner, patch_number = corner_normals.reshape(-1, 3) + 1, 0, 0
+    unwritten, indices = iter(faces), iter(corner_normals.reshape(-1, 3) + 1)
     for material, group in materials.items():
         lines.append(f"usemtl {material}")
-        for _ in group:
-            for face in faces[patch_number] + 1:
-                lines.append("f " + " ".join(f"{v}/{v}/{n}" for v, n in zip(face, indices[corner], strict=True)))
-                corner += 1
-            patch_number += 1
+        for face in np.concatenate([next(unwritten) for _ in group]) + 1:
+            lines.append("f " + " ".join(f"{v}/{v}/{n}" for v, n in zip(face, next(indices), strict=True)))
     return "\n".join(lines) + "\n"
 
 
