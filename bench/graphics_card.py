@@ -78,7 +78,6 @@ def synchronised(contender: Contender) -> Contender:
 
 
 def main() -> None:
-    """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--objects", nargs="+", default=["candle", "lamp_floor"], metavar="NAME", help="of one part")
     parser.add_argument("--sides", nargs="+", type=int, default=[224, 512], help="sides of the images, pixels")

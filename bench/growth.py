@@ -13,13 +13,13 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from trimesh.remesh import subdivide
 
 from bench._common import BenchObject, bench_objects, forward_backward, machine, measured_at_random
 from trompe_experiments.markdown import markdown_table
@@ -93,18 +93,10 @@ def refinements(obj: Object3D) -> Iterator[Object3D]:
 
 
 def _refined(part: Part) -> Part:
-    """Each triangle cut into four at the middles of its edges; corners are no longer shared."""
-    a, b, c = (part.faces[:, k] for k in range(3))
-
-    def cut(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        p, q, r = values[a], values[b], values[c]
-        x, y, z = (p + q) / 2, (q + r) / 2, (r + p) / 2
-        return np.concatenate([np.stack(t, 1) for t in ((p, x, z), (x, q, y), (z, y, r), (x, y, z))]).reshape(
-            -1, values.shape[1]
-        )
-
-    faces = np.arange(12 * len(part.faces), dtype=np.int32).reshape(-1, 3)
-    return Part(part.material, cut(part.vertices), cut(part.normals), cut(part.uvs), faces)
+    """Each triangle cut into four at the middles of its edges."""
+    corners, faces = subdivide(np.hstack([part.vertices, part.normals, part.uvs]), part.faces)
+    vertices, normals, uvs = np.split(corners, [3, 6], axis=1)
+    return Part(part.material, vertices, normals, uvs, faces.astype(np.int32))
 
 
 def cost(entry: BenchObject, case: Case, rounds: int) -> Cost:
@@ -196,7 +188,6 @@ def _curve(panel: Any, axis: str, costs: Sequence[Cost], name: str) -> None:
 
 
 def main() -> None:
-    """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--axes", nargs="+", choices=list(AXES), default=list(AXES))
     parser.add_argument("--object", default="teapot", metavar="NAME", help="a shipped object, or one of TROMPE_ASSETS")
@@ -208,7 +199,8 @@ def main() -> None:
     (entry,) = bench_objects([options.object])
     print(machine() + "\n")
     writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(asdict_names := [field.name for field in fields(Cost)])
+    names = [field.name for field in fields(Cost)]
+    writer.writerow(names)
     costs = []
     for case in cases(entry, options.axes):
         costs.append(cost(entry, case, options.rounds))
@@ -217,9 +209,7 @@ def main() -> None:
     print("\n" + exponents(costs))
     if options.csv is not None:
         with options.csv.open("w", newline="", encoding="utf-8") as file:
-            rows = csv.DictWriter(file, asdict_names, lineterminator="\n")
-            rows.writeheader()
-            rows.writerows(asdict(each) for each in costs)
+            csv.writer(file, lineterminator="\n").writerows([names, *map(astuple, costs)])
     if options.chart:
         draw(costs, options.chart)
 

@@ -105,23 +105,19 @@ def submit(store: JobStore, label: str) -> str:
 
 def losses_of(store: JobStore, files: Path, kind: str) -> list[float]:
     """Kill a process of this kind of several jobs twice: seconds until their phases begin again."""
-    return [loss for _ in range(LOSSES // 2) for loss in losses_of_a_job(store, files, kind)]
-
-
-def losses_of_a_job(store: JobStore, files: Path, kind: str) -> list[float]:
-    """Kill a process of a job twice: seconds until its phase begins again."""
-    job = submit(store, "wait")
-    notes = files / "jobs" / job / "notes.txt"
     seconds = []
-    for number in (1, 2):
-        wait_for(lambda number=number: notes.exists() and len(notes.read_text().splitlines()) == number)  # type: ignore[misc]
-        process = task_of(job) if kind == "task" else int(notes.read_text().split()[-1])
-        killed = time.time()
-        os.kill(process, signal.SIGKILL)
-        wait_for(lambda number=number: len(notes.read_text().splitlines()) > number)  # type: ignore[misc]
-        seconds.append(float(notes.read_text().split()[-2]) - killed)
-    store.request_cancel(job)
-    wait_for(lambda: store.get(job).state.final)
+    for _ in range(LOSSES // 2):
+        job = submit(store, "wait")
+        notes = files / "jobs" / job / "notes.txt"
+        for number in (1, 2):
+            wait_for(lambda: notes.exists() and len(notes.read_text().splitlines()) == number)  # noqa: B023
+            process = task_of(job) if kind == "task" else int(notes.read_text().split()[-1])
+            killed = time.time()
+            os.kill(process, signal.SIGKILL)
+            wait_for(lambda: len(notes.read_text().splitlines()) > number)  # noqa: B023
+            seconds.append(float(notes.read_text().split()[-2]) - killed)
+        store.request_cancel(job)
+        wait_for(lambda: store.get(job).state.final)  # noqa: B023
     return seconds
 
 

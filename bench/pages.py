@@ -33,7 +33,6 @@ PATHS = ("/", "/jobs", "/jobs?state=failed", "/jobs?cursor=5000", "/jobs/new", "
 
 
 def main() -> None:
-    """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--jobs", type=int, default=10_000)
     options = parser.parse_args()

@@ -193,16 +193,12 @@ def png(image: Picture, level: int) -> bytes:
     return buffer.getvalue()
 
 
-def decoded(data: bytes) -> Picture:
-    """As a client decodes it."""
-    return np.asarray(Image.open(io.BytesIO(data)))
-
-
 def encodings(target: SailenvTarget, entry: BenchObject, rounds: int) -> list[list[object]]:
     """A row for each level of PNG and one for raw pixels."""
     image = target.render(entry.obj, entry.views()[20:21], size=(224, 224))[0]
     coders: dict[str, tuple[Callable[[], bytes], Callable[[bytes], object]]] = {
-        f"PNG {level}": (partial(png, image, level), decoded) for level in LEVELS
+        f"PNG {level}": (partial(png, image, level), lambda data: np.asarray(Image.open(io.BytesIO(data))))
+        for level in LEVELS
     }
     coders["raw"] = lambda: np.ascontiguousarray(image).tobytes(), lambda data: np.frombuffer(data, np.uint8)
     rows: list[list[object]] = []
@@ -291,7 +287,6 @@ def pose_change(target: SailenvTarget, rounds: int) -> str:
 
 
 def main() -> None:
-    """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--objects", nargs="*", default=[], help="default: the paper's, or those that are shipped")
     parser.add_argument("--rounds", type=int, default=5)

@@ -133,12 +133,9 @@ def _judged(out: Path, label: int, victim: Classifier, left_out: Classifier | No
 
 def half_size(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """``images`` (views, H, W, 3) resized to half (box filter) and back (bilinear)."""
-    return np.stack([_there_and_back(Image.fromarray(image)) for image in images])
-
-
-def _there_and_back(image: Image.Image) -> NDArray[np.uint8]:
-    small = image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
-    return np.asarray(small.resize(image.size, Image.Resampling.BILINEAR))
+    _, height, width, _ = images.shape
+    small = [Image.fromarray(image).resize((width // 2, height // 2), Image.Resampling.BOX) for image in images]
+    return np.stack([np.asarray(image.resize((width, height), Image.Resampling.BILINEAR)) for image in small])
 
 
 def _drop(classifier: Classifier, before: NDArray[np.uint8], after: NDArray[np.uint8], label: int) -> float | None:

@@ -11,6 +11,7 @@ import importlib.util
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import torch
@@ -33,7 +34,7 @@ from trompe_experiments.markdown import markdown_table
 from trompe_server.attack import Budget, Goal, attack, movable, start
 from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
 from trompe_server.job.texture_attack import CHUNK
-from trompe_server.surrogate import Geometry, SamplingModel, Surrogate, prepare_geometry, textures_of
+from trompe_server.surrogate import SamplingModel, Surrogate, prepare_geometry, textures_of
 from trompe_server.surrogate.calibration import build_surrogate
 from trompe_server.surrogate.sampling import Gather
 from trompe_server.surrogate.surrogate import BATCH
@@ -163,21 +164,17 @@ def preparation(entries: Sequence[BenchObject], size: tuple[int, int], n_views: 
     """Table of what preparing takes."""
     rows = []
     for entry in entries:
-        made: list[Geometry] = []
-
-        def prepare(entry: BenchObject = entry, made: list[Geometry] = made) -> None:
-            made[:] = [prepare_geometry(entry.obj, entry.views()[:n_views], size=size, sampling=SamplingModel())]
-
-        times = in_rounds({"prepare": prepare}, rounds)["prepare"]
+        prepare = partial(prepare_geometry, entry.obj, entry.views()[:n_views], size=size, sampling=SamplingModel())
+        times, made = in_rounds({"prepare": prepare}, rounds)["prepare"], prepare()
         wanted = f"<= {WANTED_SECONDS:g}" if entry.name == "toilet" else "-"
-        taps = sum(len(batch.gather.index) for batch in made[0].batches if isinstance(batch.gather, Gather))
-        pixels = sum(len(batch.pixel) for batch in made[0].batches)
+        taps = sum(len(batch.gather.index) for batch in made.batches if isinstance(batch.gather, Gather))
+        pixels = sum(len(batch.pixel) for batch in made.batches)
         rows.append(
             [
                 entry.name,
                 f"{times.median:.2f} / {times.best:.2f}",
                 wanted,
-                f"{made[0].nbytes / 2**20:.0f}",
+                f"{made.nbytes / 2**20:.0f}",
                 f"{taps / max(pixels, 1):.1f}",
             ]
         )
@@ -247,7 +244,6 @@ def same_silhouette(surrogate: Surrogate, alpha: Float[Tensor, "views H W"], vie
 
 
 def main() -> None:
-    """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--objects", nargs="+", default=[], metavar="NAME", help="default: candle toilet")
     parser.add_argument("--size", type=int, default=224 if assets() else 128, help="side of the images, pixels")

@@ -56,7 +56,6 @@ def company(processes: int) -> Iterator[None]:
 
 
 def main() -> None:
-    """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--object", default="toilet" if assets() else "mug", metavar="NAME")
     parser.add_argument("--rounds", type=int, default=3)
