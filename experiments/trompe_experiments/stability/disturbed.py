@@ -22,16 +22,13 @@ class ChangedClassifier(Wrapper):
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """See ``Classifier``."""
         return self.inner.image_size
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
-        """See ``WhiteBoxClassifier``."""
         return self.network(images)
 
     @torch.no_grad()
     def predict(self, images: Images) -> Logits:
-        """See ``Classifier``."""
         return predicted(self.network, images, self.image_size, self.n_classes)
 
 

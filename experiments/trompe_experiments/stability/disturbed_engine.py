@@ -59,13 +59,12 @@ class DisturbedEngine:
         self._options, self._frame = options, 0
 
     def render(self, world: Snapshot, *, width: int, height: int) -> Picture:
-        """See ``Engine``."""
         how, frame = self._options, self._frame
         self._frame += 1
         own = round(width * how.scale), round(height * how.scale)
         picture = self._inner.render(_aimed(world, how, frame), width=own[0], height=own[1])
         if own != (width, height):
-            picture = _scaled(picture, width, height)
+            picture = np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR))
         return np.clip(np.round(_seen(picture.astype(float), how, frame)), 0, 255).astype(np.uint8)
 
 
@@ -121,7 +120,3 @@ def _pipeline(how: Disturbance) -> ImagePipeline:
         filmic=(1, 1) if how.filmic else None,
         jpeg=(how.jpeg, how.jpeg) if how.jpeg else None,
     )
-
-
-def _scaled(picture: Picture, width: int, height: int) -> Picture:
-    return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR))

@@ -12,7 +12,6 @@ from trompe_experiments.service import Service
 from trompe_experiments.stability.cases import CASES, Case
 from trompe_experiments.stability.disturbed_engine import disturbed_renderer
 from trompe_server.classifiers.tiny import CLASSES
-from trompe_server.job.setup import JobSetup
 from trompe_server.judging.metrics import accuracy, transfer_gap
 from trompe_server.renderers import TargetRenderer
 from trompe_shared.api import Job, JobRequest, JobSpec, JobState, Result
@@ -47,7 +46,6 @@ class DisturbedService(Service):
         return Job(id=key, state=state, spec=spec, worker=None, created=datetime.now(UTC), error=error, note=None)
 
     def result(self, job: str) -> Result:
-        """See ``Service.result``."""
         return self._results[job]
 
     def classes(self, classifier: str) -> list[str] | None:
@@ -71,7 +69,7 @@ class DisturbedService(Service):
 
     def _afterwards(self, done: Done, case: Case) -> Result:
         """Judge the finished object under the disturbance; warnings and surrogate are those of the undisturbed job."""
-        setup: JobSetup = done.setup
+        setup = done.setup
         judge = setup.classifier if case.classifier is None else case.classifier(setup.members[0])
         painted = setup.obj if done.painted is None else load_object(done.painted)
         shown = {}
