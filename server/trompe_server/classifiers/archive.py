@@ -30,6 +30,7 @@ from torch.export import ExportedProgram
 from torch.export.pt2_archive import PT2ArchiveReader
 from torch.export.pt2_archive._package import load_pt2
 
+from trompe_server.classifiers.protocol import refusing
 from trompe_shared.errors import ClassifierError
 
 MEMBER: Final = re.compile(
@@ -59,19 +60,13 @@ PROSE: Final = frozenset({"metadata", "torch_version"})
 
 def read_program(path: Path) -> ExportedProgram:
     """Check and read the program in a ``.pt2`` file, onto the CPU. Raises ``ClassifierError``."""
-    try:
+    expected = f"; expected a file of torch.export.save from a version close to {torch.__version__}."
+    with refusing(f"{path.name!r} cannot be read as an exported program", remedy=expected):
         data = path.read_bytes()
         if DEVICE.search(PT2ArchiveReader(io.BytesIO(data)).read_bytes("models/model.json")):
             data = _on_cpu(data)
         _check(PT2ArchiveReader(io.BytesIO(data)), path.name)
         return load_pt2(io.BytesIO(data)).exported_programs["model"]
-    except ClassifierError:
-        raise
-    except Exception as error:
-        raise ClassifierError(
-            f"{path.name!r} cannot be read as an exported program ({type(error).__name__}: {str(error)[:300]}); "
-            f"expected a file of torch.export.save from a version close to {torch.__version__}."
-        ) from error
 
 
 def _on_cpu(data: bytes) -> bytes:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from trompe_server.classifiers.contract import Normalised
 from trompe_server.classifiers.extras import WEIGHTS, hub_file, import_extra
 from trompe_server.classifiers.network import NamedNetwork
+from trompe_server.classifiers.protocol import refusing
 from trompe_shared.errors import ClassifierError
 
 
@@ -48,15 +49,11 @@ def _trained(folder: Path, model: str) -> Any:
     """The network with all its weights from ``folder``. Raises ``ClassifierError``."""
     import_extra("transformers.modeling_utils", extra="hf")  # tells of a torchvision for another torch
     transformers = import_extra("transformers", extra="hf")
-    try:
+    remedy = ". Give a repository of transformers' image classifiers with safetensors, or a .pt2 file."
+    with refusing(f"{model!r} cannot be loaded as an image classifier", remedy=remedy):
         network, report = transformers.AutoModelForImageClassification.from_pretrained(
             folder, use_safetensors=True, trust_remote_code=False, local_files_only=True, output_loading_info=True
         )
-    except Exception as error:  # what a repository contains decides its kind
-        raise ClassifierError(
-            f"{model!r} cannot be loaded as an image classifier ({type(error).__name__}: {str(error)[:300]}). Give a "
-            "repository of transformers' image classifiers with safetensors, or a .pt2 file."
-        ) from error
     missing = sorted(dict(network.named_parameters()).keys() & report["missing_keys"])
     if missing:  # transformers draws them at random
         raise ClassifierError(

@@ -13,14 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from trompe_server.classifiers.contract import SAME, sample_images
-from trompe_server.classifiers.protocol import (
-    BATCH,
-    Images,
-    Logits,
-    broken,
-    predicted,
-    refuse_probabilities,
-)
+from trompe_server.classifiers.protocol import BATCH, Images, Logits, broken, predicted, refuse_probabilities
 from trompe_shared.errors import ClassifierError
 
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # else it records its use in the home folder and reports it

@@ -1,6 +1,7 @@
 """Interfaces of classifiers, and the conversion of images to their input."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -123,6 +124,17 @@ def broken(file: str, what: str, *, batch: str = "") -> ClassifierError:
     )
 
 
+@contextmanager
+def refusing(what: str, *, remedy: str) -> Iterator[None]:
+    """Translate any error, whose kind foreign files and libraries decide, to ``ClassifierError``."""
+    try:
+        yield
+    except ClassifierError:
+        raise
+    except Exception as error:
+        raise ClassifierError(f"{what} ({type(error).__name__}: {str(error)[:300]}){remedy}") from error
+
+
 def refuse_probabilities(outputs: NDArray[np.float32], file: str) -> None:
     """Raise ``ClassifierError`` if every row of ``outputs`` (N, classes) is a distribution, also in half precision."""
     if outputs.shape[1] > 1 and (outputs >= 0).all() and np.allclose(outputs.sum(axis=1), 1, atol=0.01):
@@ -139,17 +151,14 @@ class Wrapper:
 
     @property
     def name(self) -> str:
-        """Its name in reports."""
         return self.inner.name
 
     @property
     def n_classes(self) -> int:
-        """Number of its logits."""
         return self.inner.n_classes
 
     @property
     def classes(self) -> tuple[str, ...] | None:
-        """Class names in the order of the logits, or ``None`` if unknown."""
         return self.inner.classes
 
     def predict(self, images: Images) -> Logits:

@@ -9,7 +9,7 @@ import torch
 
 from trompe_server.classifiers.extras import check_known, import_extra
 from trompe_server.classifiers.network import NamedNetwork
-from trompe_shared.errors import ClassifierError
+from trompe_server.classifiers.protocol import refusing
 
 DATASET = "imagenet"
 
@@ -22,13 +22,9 @@ def load_robustbench(model: str) -> NamedNetwork:
     """
     utils = _robustbench("utils")
     threat = _threat_model(model)
-    try:
+    remedy = f". Put its weights at {str(robustbench_weights(model))!r}."
+    with refusing(f"RobustBench cannot load {model!r}", remedy=remedy):
         network = utils.load_model(model, model_dir=_folder(), dataset=DATASET, threat_model=threat)
-    except Exception as error:  # any that a download or a file raises
-        raise ClassifierError(
-            f"RobustBench cannot load {model!r} ({type(error).__name__}: {str(error)[:300]}). Put its weights at "
-            f"{str(robustbench_weights(model))!r}."
-        ) from error
     steps = _robustbench("data").get_preprocessing(utils.BenchmarkDataset(DATASET), threat, model, None).transforms
     size = next(step.size for step in reversed(steps) if hasattr(step, "size"))
     models = import_extra("torchvision.models", extra="vision")

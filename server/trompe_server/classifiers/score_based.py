@@ -45,7 +45,6 @@ class ScoreBasedClassifier(Wrapper):
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """(H, W) of the inner classifier's input."""
         return self.inner.image_size
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
@@ -89,7 +88,6 @@ class _Asked(Function):
 
     @staticmethod
     def forward(ctx: Any, images: Tensor, classifier: ScoreBasedClassifier) -> Tensor:
-        """The logits of the images."""
         ctx.save_for_backward(images)
         ctx.classifier = classifier
         return classifier.ask(images.detach())

@@ -6,6 +6,7 @@ from typing import Any
 from trompe_server.classifiers.contract import Normalised
 from trompe_server.classifiers.extras import WEIGHTS, check_known, hub_file, import_extra
 from trompe_server.classifiers.network import NamedNetwork
+from trompe_server.classifiers.protocol import refusing
 from trompe_shared.errors import ClassifierError
 
 
@@ -15,14 +16,10 @@ def load_timm(model: str) -> NamedNetwork:
     Raises ``ClassifierError`` if timm, the network or the weights are missing or do not fit together.
     """
     timm, path = _timm(model), timm_weights(model)
-    try:
+    misfit = f"The weights in {str(path)!r} do not fit timm's {model!r}"
+    with refusing(misfit, remedy=". Delete this file, and it is downloaded again."):
         overlay = {"file": str(path), "custom_load": False}
         network = timm.create_model(model, pretrained=True, pretrained_cfg_overlay=overlay)
-    except Exception as error:  # what a file contains decides its kind
-        raise ClassifierError(
-            f"The weights in {str(path)!r} do not fit timm's {model!r} ({type(error).__name__}: {str(error)[:300]}). "
-            "Delete this file, and it is downloaded again."
-        ) from error
     config = timm.data.resolve_model_data_config(network)
     whole = Normalised(network, mean=config["mean"], std=config["std"])
     subset = timm.data.infer_imagenet_subset(network)  # if it has the classes of a part of ImageNet that timm knows

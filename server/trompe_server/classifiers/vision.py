@@ -9,7 +9,6 @@ from typing import Any
 from urllib.parse import urlparse
 
 import torch
-from torch import nn
 
 from trompe_server.classifiers.contract import Normalised
 from trompe_server.classifiers.extras import check_known, import_extra
@@ -40,9 +39,16 @@ def load_torchvision(model: str) -> NamedNetwork:
     """
     models = import_extra("torchvision.models", extra="vision")
     entry, path = _find_weights(models, model)
+    tensors = read_weights(path)
+    try:
+        network = models.get_model(model, weights=_LocalWeights(entry, tensors))
+    except RuntimeError as error:
+        raise ClassifierError(
+            f"The weights in {path.name!r} do not fit torchvision's {model!r} ({str(error)[:300]}). Put the file from "
+            f"{entry.url} there."
+        ) from error
     transforms = entry.transforms()
     (side,) = transforms.crop_size
-    network = _built(models, model, entry, path)
     whole = Normalised(network, mean=tuple(transforms.mean), std=tuple(transforms.std))
     return NamedNetwork(whole, (side, side), entry.meta["categories"])
 
@@ -63,19 +69,6 @@ def _find_weights(models: Any, model: str) -> tuple[Any, Path]:
             f"from {entry.url} there."
         )
     return entry, path
-
-
-def _built(models: Any, model: str, entry: Any, path: Path) -> nn.Module:
-    """The network with the weights of a file. Raises ``ClassifierError`` if they do not fit."""
-    tensors = read_weights(path)
-    try:
-        network: nn.Module = models.get_model(model, weights=_LocalWeights(entry, tensors))
-    except RuntimeError as error:
-        raise ClassifierError(
-            f"The weights in {path.name!r} do not fit torchvision's {model!r} ({str(error)[:300]}). Put the file from "
-            f"{entry.url} there."
-        ) from error
-    return network
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:

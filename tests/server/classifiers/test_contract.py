@@ -38,8 +38,6 @@ from trompe_server.classifiers.protocol import AT_ONCE, fit_images
 from trompe_shared.errors import ClassifierError
 
 SIZE = (20, 24)
-ASSETS = os.environ.get("TROMPE_ASSETS")
-needs_assets = pytest.mark.skipif(ASSETS is None, reason="TROMPE_ASSETS is not set")
 
 
 class Net(nn.Module):
@@ -149,33 +147,28 @@ def white_box(path: Path | str) -> NetworkClassifier:
     return classifier
 
 
-@pytest.fixture(
-    scope="module",
-    params=[
-        *("fake", "pt2", "tiny", "resized", "score based"),
-        *("onnx", "onnx with a batch of 1", "onnx with a batch of 4", "onnx of one image inside"),
-        "onnx with a name for its channels",
-    ],
-)
-def classifier(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Classifier:
-    if request.param == "fake":
-        return fake_classifier()
-    if request.param == "resized":
-        return resized(fake_classifier(), (16, 40))
-    if request.param == "score based":
-        return score_based(fake_classifier(), seed=0)
-    if request.param == "tiny":
-        return load_classifier("tiny")
+MADE: dict[str, Callable[[], Classifier]] = {
+    "fake": fake_classifier,
+    "tiny": lambda: load_classifier("tiny"),
+    "resized": lambda: resized(fake_classifier(), (16, 40)),
+    "score based": lambda: score_based(fake_classifier(), seed=0),
+}
+ONNX: dict[str, dict[str, Any]] = {
+    "onnx": {},
+    "onnx with a batch of 1": {"batch": 1},
+    "onnx with a batch of 4": {"batch": 4},
+    "onnx of one image inside": {"inner": 1},
+    "onnx with a name for its channels": {"channels": "num_channels"},
+}
+
+
+@pytest.fixture(scope="module", params=["pt2", *MADE, *ONNX])
+def classifier(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, pt2: Path) -> Classifier:
+    if request.param in MADE:
+        return MADE[request.param]()
     if request.param == "pt2":
-        return load_classifier(request.getfixturevalue("pt2"))
-    options: dict[str, dict[str, Any]] = {
-        "onnx": {},
-        "onnx with a batch of 1": {"batch": 1},
-        "onnx with a batch of 4": {"batch": 4},
-        "onnx of one image inside": {"inner": 1},
-        "onnx with a name for its channels": {"channels": "num_channels"},
-    }
-    return load_classifier(write_onnx(tmp_path_factory.mktemp("onnx") / "net.onnx", **options[request.param]))
+        return load_classifier(pt2)
+    return load_classifier(write_onnx(tmp_path_factory.mktemp("onnx") / "net.onnx", **ONNX[request.param]))
 
 
 def test_every_classifier_gives_float32_logits_for_any_number_of_images(classifier: Classifier) -> None:
@@ -644,10 +637,9 @@ def test_inspect_prints_one_line_of_json(pt2: Path, tmp_path: Path, capsys: pyte
 
 
 @pytest.mark.assets
-@needs_assets
 @pytest.mark.parametrize("name", ["mobilenet_v2", "mobilenet_edgetpu_075", "squeezenet1_1"])
 def test_real_networks_agree_between_their_exported_and_onnx_files(name: str) -> None:
-    folder = Path(ASSETS or "") / "classifiers"
+    folder = Path(os.environ["TROMPE_ASSETS"], "classifiers")
     exported, judge = (load_classifier(folder / f"{name}{ending}") for ending in (".pt2", ".onnx"))
     assert isinstance(exported, NetworkClassifier)
     assert isinstance(exported.network, Formatted)

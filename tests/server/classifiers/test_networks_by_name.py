@@ -44,20 +44,6 @@ IMAGENET: Final = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 """Mean and standard deviation."""
 
 
-def import_torchvision() -> Any:
-    """torchvision's networks. Where torchvision was built for another torch its compiled operators are missing; no
-    classification network uses one, so names for those that it looks for while it is imported are enough."""
-    try:
-        return importlib.import_module("torchvision.models")
-    except ImportError:
-        pytest.skip("torchvision is not installed")
-    except RuntimeError:
-        for name in ("nms", "qnms"):
-            schema = "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor"
-            torch.library.define(f"torchvision::{name}", schema)
-        return importlib.import_module("torchvision.models")
-
-
 def random_images(side: int, count: int = 1) -> Tensor:
     return torch.rand((count, 3, side, side), generator=torch.Generator().manual_seed(1))
 
@@ -70,7 +56,17 @@ def of_normalised(network: Callable[[Tensor], Tensor], images: Tensor, mean: Any
 
 @pytest.fixture
 def models() -> Any:
-    return import_torchvision()
+    """torchvision's networks. Where torchvision was built for another torch its compiled operators are missing; no
+    classification network uses one, so names for those that it looks for while it is imported are enough."""
+    try:
+        return importlib.import_module("torchvision.models")
+    except ImportError:
+        pytest.skip("torchvision is not installed")
+    except RuntimeError:
+        for name in ("nms", "qnms"):
+            schema = "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor"
+            torch.library.define(f"torchvision::{name}", schema)
+        return importlib.import_module("torchvision.models")
 
 
 @pytest.fixture
@@ -91,10 +87,6 @@ def real(models: Any, name: str, **options: Any) -> nn.Module:
                 module.running_mean = 0.1 * torch.randn(module.num_features)
                 module.running_var = torch.rand(module.num_features) + 0.5
     return network
-
-
-def saved(network: nn.Module, path: Path) -> None:
-    torch.save(network.state_dict(), path)
 
 
 def white_box(reference: str, **options: Any) -> NetworkClassifier:
@@ -156,7 +148,7 @@ def test_a_torchvision_network_has_its_own_size_classes_and_normalisation(
     name: str, options: dict[str, Any], size: int, models: Any, cache: Path
 ) -> None:
     network = real(models, name, **options)
-    saved(network, cache / FILES[name])
+    torch.save(network.state_dict(), cache / FILES[name])
     classifier = white_box(f"torchvision:{name}")
     assert (classifier.name, classifier.image_size, classifier.n_classes) == (name, (size, size), 1000)
     assert classifier.classes is not None
@@ -171,7 +163,7 @@ def test_a_torchvision_network_has_its_own_size_classes_and_normalisation(
 
 def test_weights_are_found_in_torchs_cache(models: Any, cache: Path) -> None:
     network = real(models, "squeezenet1_1")
-    saved(network, cache / FILES["squeezenet1_1"])
+    torch.save(network.state_dict(), cache / FILES["squeezenet1_1"])
     for classifier in (white_box("squeezenet1_1"), white_box("torchvision:squeezenet1_1", name="mine")):
         images = random_images(224)
         expected = of_normalised(network, images, *IMAGENET)
@@ -438,7 +430,7 @@ def test_a_network_of_robustbench_contains_its_normalisation(models: Any) -> Non
     file = classifier_file("robustbench:Salman2020Do_R18")
     os.makedirs(file.parent)
     network = models.resnet18().eval()
-    saved(network, file)
+    torch.save(network.state_dict(), file)
     classifier, images = white_box("robustbench:Salman2020Do_R18"), random_images(224)
     assert (classifier.image_size, classifier.n_classes) == ((224, 224), 1000)
     assert classifier.classes is not None

@@ -27,7 +27,6 @@ from trompe_server.classifiers import (
 from trompe_server.classifiers.protocol import AT_ONCE, Wrapper
 from trompe_shared.errors import ClassifierError, SpecError
 
-ASSETS = os.environ.get("TROMPE_ASSETS")
 MODULE = importlib.import_module("trompe_server.classifiers.score_based")
 SIDE = 8
 
@@ -202,11 +201,11 @@ def test_an_estimate_comes_back_through_a_change_of_size() -> None:
 
 
 @pytest.mark.assets
-@pytest.mark.skipif(ASSETS is None, reason="TROMPE_ASSETS is not set")
 def test_the_scores_of_a_real_network_tell_the_coarse_part_of_its_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(MODULE, "CELLS", 7)
     white, black = (
-        load_classifier(Path(ASSETS or "") / "classifiers" / f"mobilenet_v2{end}") for end in (".pt2", ".onnx")
+        load_classifier(Path(os.environ["TROMPE_ASSETS"], "classifiers", f"mobilenet_v2{end}"))
+        for end in (".pt2", ".onnx")
     )
     assert isinstance(white, WhiteBoxClassifier)
     images = F.interpolate(greyish(1, 8), (224, 224), mode="bilinear")
