@@ -33,7 +33,6 @@ from trompe_shared.api import (
 )
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import Object3D
 
 Images = NDArray[np.uint8]
 Logits = NDArray[np.float32]
@@ -100,15 +99,12 @@ def manifest_of(judged: Judged, *, seconds: float) -> Manifest:
             for pipeline in PIPELINES
         ],
         predictions=[
-            prediction
-            for renderer in judged.engines
-            for network in judged.judges
-            if (prediction := _predictions(judged, renderer, network)) is not None
+            _predictions(judged, renderer, network) for renderer in judged.engines for network in judged.judges
         ],
         seconds=round(seconds, 1),
         versions=versions(),
     )
-    return manifest.model_copy(update={"findings": findings_of(manifest, judged.pair)})
+    return manifest.model_copy(update={"findings": [*findings_of(manifest, judged.pair)]})
 
 
 def view_record(view: View) -> ViewRecord:
@@ -151,10 +147,9 @@ def visibility_in(
     return visibility_of(*pair.textures, before, after, behind(views, {}, before.shape[1:3]), epsilon=epsilon)
 
 
-def _predictions(judged: Judged, renderer: str, network: str) -> Predictions | None:
+def _predictions(judged: Judged, renderer: str, network: str) -> Predictions:
     both = judged.both(renderer, network)
-    if both is None:
-        return None
+    assert both is not None  # the renderer has images, and the network was loaded
     labels = judged.judges[network].labels
     classes = [logits.argmax(axis=1).tolist() for logits in both]
     found = [np.round(margins(logits, labels), 4).tolist() for logits in both]
@@ -168,12 +163,9 @@ def _predictions(judged: Judged, renderer: str, network: str) -> Predictions | N
     )
 
 
-def findings_of(manifest: Manifest, pair: ObjectPair) -> list[Finding]:
+def findings_of(manifest: Manifest, pair: ObjectPair) -> Iterator[Finding]:
     """Findings about the two objects, the budget, and what is missing or rests on little."""
-    return [*pair.findings(), *_findings(manifest, pair.before)]
-
-
-def _findings(manifest: Manifest, before: Object3D) -> Iterator[Finding]:
+    yield from pair.findings()
     epsilon = manifest.epsilon
     for change in manifest.textures:
         if change.texels_beyond_epsilon and epsilon is not None:
@@ -183,7 +175,7 @@ def _findings(manifest: Manifest, before: Object3D) -> Iterator[Finding]:
                 f"({levels_within(epsilon)} levels of 255): {change.texels_beyond_epsilon} of "
                 f"{change.size[0] * change.size[1]} texels change by more, one by {change.max_levels} levels.",
             )
-    for warning in faint_warnings(before):
+    for warning in faint_warnings(pair.before):
         yield Finding(kind="material", text=warning)
     for network in manifest.networks:
         if network.image_size not in (None, manifest.image_size):

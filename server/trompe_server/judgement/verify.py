@@ -207,7 +207,7 @@ def _textures_and_findings(manifest: Manifest, pair: ObjectPair) -> Iterator[str
         if each.texture in changes:
             what = f"The texture {each.texture!r}"
             yield from _differences(what, each, changes[each.texture], TextureChange.model_fields)
-    found = findings_of(manifest, pair)
+    found = [*findings_of(manifest, pair)]
     for finding in found:
         if finding not in manifest.findings:
             yield f"The manifest lacks a finding: {finding.text}"

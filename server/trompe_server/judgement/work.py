@@ -69,22 +69,18 @@ class Kept:
 
     def has(self, key: str) -> bool:
         """Whether the array is there."""
-        return self.files.exists(_name(key))
+        return self.files.exists(key)
 
     def array(self, key: str, make: Callable[[], NDArray[T]]) -> NDArray[T]:
         """The kept array, or else the one that ``make`` gives, which is saved. The write is atomic."""
         with suppress(FileNotFoundError, ValueError, OSError, KeyError):
-            return unpack_arrays(self.files.read(_name(key)))["kept"]
+            return unpack_arrays(self.files.read(key))["kept"]
         made = make()
-        self.files.write(_name(key), pack_arrays({"kept": made}))
+        self.files.write(key, pack_arrays({"kept": made}))
         return made
 
 
-def _name(key: str) -> str:
-    return f"{key}.npz"
-
-
 def key_of(*parts: Any) -> str:
-    """A hash of ``parts`` and of the versions of the software."""
+    """Name of a file by a hash of ``parts`` and of the versions of the software."""
     text = json.dumps([parts, versions()], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return f"{hashlib.sha256(text.encode()).hexdigest()}.npz"

@@ -113,10 +113,7 @@ def test_each_thing_that_does_not_fit_is_a_sentence_and_the_rest_is_judged(
     manifest = manifest_of(judge(dark, **options), seconds=1.0)
     texts = {(found.kind, found.text.split(":")[0]) for found in manifest.findings}
     assert texts == {
-        (
-            "epsilon",
-            f"The texture {TEXTURE!r} exceeds the stated epsilon of 0.1 (25 levels of 255)",
-        ),
+        ("epsilon", f"The texture {TEXTURE!r} exceeds the stated epsilon of 0.1 (25 levels of 255)"),
         ("network", "The network 'tiny' takes images of 128 x 128; those of 64 x 96 are resized."),
         ("network", f"No figures of {str(missing)!r}"),
         ("renderer", "No figures in 'none-such'"),
