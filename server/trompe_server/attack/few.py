@@ -17,7 +17,8 @@ from trompe_server.attack.attack import Step, attack
 from trompe_server.attack.backgrounds import Backgrounds
 from trompe_server.attack.budget import Budget
 from trompe_server.attack.goal import Goal
-from trompe_server.attack.objective import Evaluation, Objective, Textures, members_of
+from trompe_server.attack.objective import Objective, Textures, members_of
+from trompe_server.attack.search import SHOWN
 from trompe_server.attack.state import start
 from trompe_server.attack.texels import TexelMasks, backproject, best_texels, movable
 from trompe_server.classifiers import WhiteBoxClassifier
@@ -70,13 +71,8 @@ def few_texels(
     objective = Objective(textures, surrogate, members_of(classifier, goal), goal, masks, canvas)
     if masks is not None:
         gradients = gradients * masks[..., None].to(gradients)
+    every_view = torch.ones(surrogate.n_views, dtype=torch.bool, device=surrogate.device)
     total, shown = _scaled(backproject(surrogate, textures, gradients)), 0
-    taken: list[Step] = []
-
-    def trial_step(step: Step) -> None:
-        taken.append(step)
-        on_step(step)
-
     for _ in range(ROUNDS):
         tried = attack(
             *(start(textures), textures, surrogate, classifier),
@@ -89,20 +85,14 @@ def few_texels(
             backgrounds=backgrounds,
             pipeline=pipeline,
             seed=seed,
-            on_step=trial_step,
+            on_step=on_step,
         )
-        found = _evaluate_all(objective, tried.deltas)
+        tables = {name: repeated(tried.deltas[name], texture.shape) for name, texture in textures.items()}
+        found = objective.evaluate(objective.join(tables), range(len(surrogate.batches)), every_view)
         gradient = _scaled(objective.split(found.gradient))
         total = {name: total[name] + gradient[name] for name in total}
-        shown += taken[-1].evaluations + found.images
+        shown += int(tried.memory[SHOWN]) + found.images
     return FewTexels(_best(total, keep, within), shown)
-
-
-def _evaluate_all(objective: Objective, deltas: Textures) -> Evaluation:
-    surrogate = objective.surrogate
-    active = torch.ones(surrogate.n_views, dtype=torch.bool, device=objective.source.device)
-    tables = {name: repeated(deltas[name], texture.shape) for name, texture in objective.textures.items()}
-    return objective.evaluate(objective.join(tables), range(len(surrogate.batches)), active)
 
 
 def _scaled(gradient: Gradient) -> Gradient:

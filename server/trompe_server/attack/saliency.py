@@ -11,15 +11,13 @@ from torch import Tensor
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import members_of
 from trompe_server.classifiers import WhiteBoxClassifier
+from trompe_server.classifiers.protocol import fit_images
 from trompe_server.surrogate.surrogate import BATCH
 from trompe_shared.errors import SpecError
 
 
 def saliency(
-    images: NDArray[np.uint8],
-    classifier: WhiteBoxClassifier | Sequence[WhiteBoxClassifier],
-    *,
-    goal: Goal,
+    images: NDArray[np.uint8], classifier: WhiteBoxClassifier | Sequence[WhiteBoxClassifier], *, goal: Goal
 ) -> Float[Tensor, "views H W"]:
     """|dL/dI| of the target's images (views, H, W, 3), mean over channels, rescaled to [0, 1] over all views (the
     paper's equation 5).
@@ -46,8 +44,7 @@ def _gradients(
 ) -> Iterator[Float[Tensor, "batch H W 3"]]:
     """dL/dI by batch; zero where not finite."""
     for start in range(0, len(images), BATCH):
-        batch = torch.from_numpy(np.ascontiguousarray(images[start : start + BATCH])).float().div(255)
-        inputs = batch.permute(0, 3, 1, 2).requires_grad_()
+        inputs = fit_images(images[start : start + BATCH], images.shape[1:3]).requires_grad_()
         losses = (goal.losses(member.logits(inputs), clamped=False).sum() for member in members)
         gradient = torch.stack([torch.autograd.grad(loss, inputs)[0] for loss in losses]).mean(0)
         yield gradient.nan_to_num(0, 0, 0).permute(0, 2, 3, 1).cpu()
