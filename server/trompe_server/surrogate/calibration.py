@@ -285,7 +285,7 @@ class Calibration:
 
 def build_surrogate(
     calibration: Calibration,
-    obj: Object3D | Painted,
+    obj: Object3D,
     views: Sequence[View],
     clean: Image8,
     *,
@@ -300,8 +300,7 @@ def build_surrogate(
     """
     if geometry is None:
         size = (clean.shape[1], clean.shape[2])
-        plain = obj.obj if isinstance(obj, Painted) else obj
-        geometry = prepare_geometry(plain, views, size=size, sampling=calibration.sampling, device=device)
+        geometry = prepare_geometry(obj, views, size=size, sampling=calibration.sampling, device=device)
     if calibration.model == "diffuse":
         return diffuse_surrogate(geometry, views, backdrops=backdrops)
     greys, probes, tone = calibration.greys, calibration.probes, calibration.tone
@@ -331,29 +330,26 @@ def calibrate(
     A few trial views decide; the other views are probed afterwards. Raises ``RendererError`` for images of another
     shape or type.
     """
-    clean = _checked(clean, views, size=clean.shape[1:3])
+    clean, renders = _checked(clean, views, size=clean.shape[1:3]), 0
 
     def asked(painted: Object3D, some: Sequence[View]) -> Image8:
+        nonlocal renders
+        renders += len(some)
         return _checked(ask(painted, some), some, size=clean.shape[1:3])
 
     trial = _Trial(
-        *(obj, views, clean, asked, generator, backdrops),
-        deterministic=deterministic,
-        device=torch.device(device),
+        *(obj, views, clean, asked, generator, backdrops), deterministic=deterministic, device=torch.device(device)
     )
     if wanted in {"auto", "diffuse"}:
-        fidelity = trial.fidelity("diffuse", SamplingModel(), ())
+        fidelity = trial.fidelity(SamplingModel(), ())
         if wanted == "diffuse" or fidelity.good_enough:
             reason = "requested" if wanted == "diffuse" else f"good enough without probes: {_summary(fidelity)}"
             nothing = np.zeros((0, *clean.shape), np.uint8)
-            return Calibration(
-                "diffuse", reason, SamplingModel(), (), nothing, fidelity, trial.renders, noise=trial.noise
-            )
+            return Calibration("diffuse", reason, SamplingModel(), (), nothing, fidelity, renders, noise=trial.noise)
     model, reason, sampling, fidelity = _chosen(trial, wanted)
     on_sampling(sampling)
     greys = CALIBRATED_GREYS if model == "calibrated" else CURVE_GREYS
     probes = np.stack([trial.probe_all(grey, views) for grey in greys])
-    renders = trial.renders + len(greys) * (len(views) - len(trial.views))
     tone = trial.tone if sampling.encoding == "measured" else None
     return Calibration(model, reason, sampling, greys, probes, fidelity, renders, tone, trial.noise)
 
@@ -371,9 +367,9 @@ def _checked(images: Image8, views: Sequence[View], *, size: tuple[int, ...]) ->
 class _Trial:
     """The trial views and the target's images of them: unpainted, repainted at random, and in greys on demand.
 
-    again: unpainted with other noise; ``None`` for a deterministic target. charts: numbers of images of charts that
-    were asked for. probes: images so far, by grey. geometries: of recent hypotheses; hypotheses with the same geometry
-    share one. visible: triangles of the ``KEPT_RASTERS`` most recent rasterisations, by the members that change them.
+    again: unpainted with other noise; ``None`` for a deterministic target. probes: images so far, by grey. geometries:
+    of recent hypotheses; hypotheses with the same geometry share one. visible: triangles of the ``KEPT_RASTERS`` most
+    recent rasterisations, by the members that change them.
     """
 
     def __init__(
@@ -395,25 +391,14 @@ class _Trial:
         self.images = ask(repainted, self.views)
         self.again = None if deterministic else ask(obj, [replace(view, noise=view.noise + 1) for view in self.views])
         self.painted = Painted(obj, device), Painted(repainted, device)
-        self.charts: list[int] = []
         self.probes: dict[int, Image8] = {}
         self.geometries: dict[SamplingModel, Geometry] = {}
-        self.visible: dict[tuple[object, ...], dict[Camera, Visibility]] = {}
-
-    @property
-    def renders(self) -> int:
-        each = 1 + len(self.probes) + (self.again is not None)
-        return len(self.views) * each + sum(self.charts)
+        self.visible = lru_cache(maxsize=KEPT_RASTERS)(_nothing_yet)
 
     @cached_property
     def tone(self) -> ToneMap:
         """The target's tone curve; measured when it is first asked for."""
-
-        def ask(chart: Object3D, views: Sequence[View]) -> Image8:
-            self.charts.append(len(views))
-            return self.ask(chart, views)
-
-        return measure_tone_map(ask, (self.clean.shape[1], self.clean.shape[2]))
+        return measure_tone_map(self.ask, (self.clean.shape[1], self.clean.shape[2]))
 
     @cached_property
     def noise(self) -> float:
@@ -439,39 +424,36 @@ class _Trial:
             images[others] = self.ask(painted_grey(self.obj, grey), [views[k] for k in others])
         return images
 
-    def fidelity(self, model: str, sampling: SamplingModel, greys: tuple[int, ...]) -> Fidelity:
-        """Fidelity of a colour model under a sampling hypothesis, on the trial views."""
-        probes = np.array([self.probe(grey) for grey in greys], np.uint8).reshape(-1, *self.clean.shape)
-        nothing = Fidelity((), (), (), ())
-        tone = self.tone if sampling.encoding == "measured" else None
-        calibration = Calibration(model, "", sampling, greys, probes, nothing, 0, tone)
-        geometry = replace(self._geometry(sampling), sampling=sampling)
+    def fidelity(self, sampling: SamplingModel, greys: tuple[int, ...]) -> Fidelity:
+        """Fidelity of the colour model of some greys under a sampling hypothesis, on the trial views."""
         unpainted, repainted = self.painted
-        surrogate = build_surrogate(
-            calibration, unpainted, self.views, self.clean, geometry=geometry, backdrops=self.backdrops
-        )
+        geometry = replace(self._geometry(sampling), sampling=sampling)
+        if greys:
+            probes = np.stack([self.probe(grey) for grey in greys])
+            tone = self.tone if sampling.encoding == "measured" else None
+            surrogate = curve_surrogate(
+                geometry, unpainted, self.views, self.clean, greys, probes, tone=tone, backdrops=self.backdrops
+            )
+        else:
+            surrogate = diffuse_surrogate(geometry, self.views, backdrops=self.backdrops)
         return measure_fidelity(surrogate, unpainted, self.clean, repainted, self.images)
 
     def _geometry(self, sampling: SamplingModel) -> Geometry:
         key = sampling.but(**{name: getattr(SamplingModel(), name) for name in (*_COLOURS, "kernel")})
         size = (self.clean.shape[1], self.clean.shape[2])
         known = self.geometries.pop(key, None)
-        made = key.but(kernel=sampling.kernel)
+        made, seen = key.but(kernel=sampling.kernel), (sampling.samples, sampling.shift, sampling.cull)
         self.geometries[key] = known or prepare_geometry(
-            self.obj, self.views, size=size, sampling=made, device=self.device, known=self._visible(sampling)
+            self.obj, self.views, size=size, sampling=made, device=self.device, known=self.visible(*seen)
         )
         while len(self.geometries) > 1 and sum(each.nbytes for each in self.geometries.values()) > KEPT_BYTES:
             del self.geometries[next(iter(self.geometries))]
         found = self.geometries[key]
         return found if found.sampling.kernel == sampling.kernel else refiltered(found, sampling.kernel)
 
-    def _visible(self, sampling: SamplingModel) -> dict[Camera, Visibility]:
-        """What earlier hypotheses found visible that differ from ``sampling`` in other members only."""
-        key = sampling.samples, sampling.shift, sampling.cull
-        self.visible[key] = self.visible.pop(key, {})
-        while len(self.visible) > KEPT_RASTERS:
-            del self.visible[next(iter(self.visible))]
-        return self.visible[key]
+
+def _nothing_yet(*_members: object) -> dict[Camera, Visibility]:
+    return {}
 
 
 def _from_all_sides(cameras: Sequence[Camera]) -> list[int]:
@@ -499,14 +481,14 @@ def _chosen(trial: _Trial, wanted: SurrogateModel) -> tuple[str, str, SamplingMo
 
     @cache
     def two(sampling: SamplingModel) -> Fidelity:
-        return trial.fidelity("calibrated", sampling, CALIBRATED_GREYS)
+        return trial.fidelity(sampling, CALIBRATED_GREYS)
 
     def score(sampling: SamplingModel) -> float:
         return two(sampling).score
 
     plain = find_sampling(score)
     if wanted == "curve":
-        return "curve", "requested", plain, trial.fidelity("curve", plain, CURVE_GREYS)
+        return "curve", "requested", plain, trial.fidelity(plain, CURVE_GREYS)
     traced = trial.again is not None  # who draws random light paths bounces light and filters pixels
     sampling = find_physics(plain, score, BEYOND) if traced or score(plain) < SATISFYING else plain
     if _wrong_colours(two(sampling)):
@@ -519,7 +501,7 @@ def _chosen(trial: _Trial, wanted: SurrogateModel) -> tuple[str, str, SamplingMo
         return "calibrated", f"requested{_practices(sampling)}", sampling, fidelity
     if fidelity.good_enough:
         return "calibrated", f"good enough with two probes a view: {told}", sampling, fidelity
-    five = trial.fidelity("curve", plain, CURVE_GREYS)
+    five = trial.fidelity(plain, CURVE_GREYS)
     if five.score > fidelity.score + CLEARLY:
         reason = f"two probes a view are not enough ({told}); with five: {_summary(five)}"
         return "curve", reason, plain, five

@@ -66,11 +66,8 @@ class ToneMap:
 
     @classmethod
     def of(cls, arrays: Mapping[str, NDArray[Any]]) -> "ToneMap":
-        """Inverse of ``arrays``. Raises ``ValueError`` if one is missing."""
-        try:
-            return cls(*(torch.from_numpy(arrays[field.name]) for field in fields(cls)))
-        except KeyError as error:
-            raise ValueError(f"These arrays are not a tone curve: {error} is missing.") from error
+        """Inverse of ``arrays``. Raises ``KeyError`` if one is missing."""
+        return cls(*(torch.from_numpy(arrays[field.name]) for field in fields(cls)))
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """The fields by name."""
