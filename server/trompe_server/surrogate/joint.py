@@ -54,27 +54,22 @@ class JointSurrogate:
 
     @property
     def n_views(self) -> int:
-        """Number of views of all renderers."""
         return sum(part.n_views for part in self.parts)
 
     @property
     def size(self) -> tuple[int, int]:
-        """(H, W) of the images."""
         return self.parts[0].size
 
     @property
     def textures(self) -> tuple[str, ...]:
-        """Names of the textures."""
         return self.parts[0].textures
 
     @property
     def device(self) -> torch.device:
-        """Device of the operators."""
         return self.parts[0].device
 
     @cached_property
     def batches(self) -> tuple[range, ...]:
-        """The views of each batch."""
         return tuple(
             range(first + views.start, first + views.stop)
             for part, first in zip(self.parts, self._first_views, strict=True)
@@ -93,7 +88,7 @@ class JointSurrogate:
     def render(
         self, texels: Float[Tensor, "texels 3"], batch: int, *, masks: Bool[Tensor, "views H W"] | None = None
     ) -> Float[Tensor, "batch 3 H W"]:
-        """See ``Surrogate.render``; ``masks`` are for the views of all renderers."""
+        """``masks`` are for the views of all renderers."""
         number, own = self._places[batch]
         return self.parts[number].render(texels[self._reads[number]], own, masks=self._masks(number, masks))
 
@@ -110,7 +105,6 @@ class JointSurrogate:
         return total
 
     def influence(self, masks: Bool[Tensor, "views H W"] | None = None) -> dict[str, Float[Tensor, "H W"]]:
-        """See ``Surrogate.influence``: the sum over the parts."""
         found = [part.influence(self._masks(number, masks)) for number, part in enumerate(self.parts)]
         return {name: torch.stack([each[name] for each in found]).sum(0) for name in self.textures}
 
@@ -126,7 +120,6 @@ class JointSurrogate:
 
     @cached_property
     def spare_levels(self) -> Mapping[str, int]:
-        """See ``Surrogate.spare_levels``: those of all parts."""
         return {name: min(part.spare_levels[name] for part in self.parts) for name in self.textures}
 
     @cached_property

@@ -259,12 +259,8 @@ def taps_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout, 
     The weights of a pixel sum to one; coverage belongs to the colour model.
     """
     entries, indices, weights = [], [], []
-    share = (
-        fragments.weight
-        / torch.zeros(n_pixels, device=fragments.weight.device).index_add_(0, fragments.entry, fragments.weight)[
-            fragments.entry
-        ]
-    )
+    coverage = torch.zeros(n_pixels, device=fragments.weight.device).index_add_(0, fragments.entry, fragments.weight)
+    share = fragments.weight / coverage[fragments.entry]
     for texture in range(len(layout.sizes)):
         mine = (mesh.texture[fragments.face] == texture).nonzero()[:, 0]
         uv, duv, entry, part = fragments.uv[mine], fragments.duv[mine], fragments.entry[mine], share[mine]

@@ -89,16 +89,13 @@ class Geometry:
     batches: tuple[ViewBatch, ...]
     areas: "Geometry | None" = None
 
-    def texels(self, textures: Sequence[Float[Tensor, "H W 3"]], *, rounded: bool = False) -> Float[Tensor, "texels 3"]:
-        """The texels read by any view from the mip levels of ``textures``. Differentiable."""
-        return read_texels(textures, self.chains, rounded=rounded)
-
     def values(self, textures: Mapping[str, Float[Tensor, "H W 3"]]) -> Float[Tensor, "texels 3"]:
-        """``texels`` of sRGB ``textures`` by name: encoded, or linear if the sampling model filters light."""
+        """The texels read by any view from the mip levels of sRGB ``textures`` by name: encoded, or linear if the
+        sampling model filters light. Differentiable."""
         ordered = [textures[name].to(self.device) for name in self.textures]
         if self.sampling.filtered == "linear":
-            return self.texels([decode(texture) for texture in ordered])
-        return self.texels(ordered, rounded=self.sampling.mips == "rounded")
+            return read_texels([decode(texture) for texture in ordered], self.chains)
+        return read_texels(ordered, self.chains, rounded=self.sampling.mips == "rounded")
 
     def read_weights(self, masks: Bool[Tensor, "views H W"] | None = None) -> Float[Tensor, "texels 1"]:
         """Total weight of each read in the pixels of all views, or in those of ``masks``."""
@@ -444,18 +441,17 @@ class Surrogate:
         """
         if self.missed is None:
             return (0.0,) * self.n_views
-        per_view = [
-            part.abs().mean() if len(part) else part.new_zeros(())
+        return tuple(
+            float(part.abs().mean()) if len(part) else 0.0
             for batch, missed in zip(self.geometry.batches, self.missed, strict=True)
             for part in torch.split(missed, list(batch.counts))
-        ]
-        return tuple(float(error) for error in per_view)
+        )
 
     def influence(self, masks: Bool[Tensor, "views H W"] | None = None) -> dict[str, Float[Tensor, "H W"]]:
         """Total weight of each texel in the pixels of all views, or in those of ``masks``."""
         geometry, device = self._areas, self.base.device
         ones = [torch.ones(*sizes[0], 1, device=device, requires_grad=True) for sizes in geometry.layout.sizes]
-        weights = torch.autograd.grad(geometry.texels(ones), ones, geometry.read_weights(masks))
+        weights = torch.autograd.grad(read_texels(ones, geometry.chains), ones, geometry.read_weights(masks))
         return {name: weight[..., 0] for name, weight in zip(geometry.textures, weights, strict=True)}
 
     @property

@@ -16,15 +16,8 @@ from torch.nn.functional import interpolate
 from tests.attack_runs import surrogate_of
 from tests.fakes import FakeTarget
 from trompe_server.renderers import SailenvTarget, TargetRenderer
-from trompe_server.surrogate import SamplingModel, Surrogate, textures_of
-from trompe_server.surrogate.calibration import (
-    CALIBRATED_GREYS,
-    CURVE_GREYS,
-    Calibration,
-    build_surrogate,
-    painted_grey,
-)
-from trompe_server.surrogate.fidelity import Fidelity
+from trompe_server.surrogate import SamplingModel, Surrogate, curve_surrogate, prepare_geometry, textures_of
+from trompe_server.surrogate.calibration import CALIBRATED_GREYS, CURVE_GREYS, painted_grey
 from trompe_server.surrogate.surrogate import BATCH
 from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D, load_object
@@ -45,9 +38,8 @@ def measured(
     """A surrogate measured on ``target``, and the target's images of ``obj``."""
     clean = target.render(obj, views, size=SIZE)
     probes = np.stack([target.render(painted_grey(obj, grey), views, size=SIZE) for grey in greys])
-    model = "calibrated" if len(greys) == 2 else "curve"
-    calibration = Calibration(model, "", SamplingModel(), tuple(greys), probes, Fidelity((), (), (), ()), 0)
-    return build_surrogate(calibration, obj, views, clean), clean
+    geometry = prepare_geometry(obj, views, size=SIZE, sampling=SamplingModel())
+    return curve_surrogate(geometry, obj, views, clean, greys, probes), clean
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +170,6 @@ def moved_by(obj: Object3D, way: dict[str, NDArray[np.int64]], sign: int) -> Obj
 
 
 @pytest.mark.assets
-@pytest.mark.skipif(not ASSETS.is_dir(), reason="TROMPE_ASSETS does not name the folder with the real objects")
 @pytest.mark.parametrize("name", ["candle", "toilet"])
 def test_the_gradient_is_that_of_finite_differences_of_the_target(name: str, target: SailenvTarget) -> None:
     """Smooth changes of a real object's textures, both ways, in the images of the real target.

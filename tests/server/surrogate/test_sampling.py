@@ -50,13 +50,7 @@ def read_values(obj: Object3D, model: SamplingModel = MODELS[0], views: list[Vie
     return list(torch.split(batch.gather.forward(texels), list(batch.counts)))
 
 
-def front_view(
-    texture: Image8,
-    *,
-    pixels: float,
-    model: SamplingModel = MODELS[0],
-    **options: Any,
-) -> Tensor:
+def front_view(texture: Image8, *, pixels: float, model: SamplingModel = MODELS[0], **options: Any) -> Tensor:
     """What the pixels read of a square, ``pixels`` wide in the image, that faces the camera: (64, 64, 3), NaN around
     it."""
     focal = SIZE[0] / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
