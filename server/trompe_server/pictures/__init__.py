@@ -4,18 +4,11 @@ from trompe_server.pictures.contact_sheet import Verdict, representative, views_
 from trompe_server.pictures.difference import difference_strip, texture_sheet
 from trompe_server.pictures.histogram import prediction_histogram
 from trompe_server.pictures.layout import printable
-from trompe_server.pictures.saliency import (
-    heat_colours,
-    heat_textures,
-    saliency_object_sheet,
-    saliency_sheet,
-    saliency_texture_sheet,
-)
+from trompe_server.pictures.saliency import heat_textures, saliency_object_sheet, saliency_sheet, saliency_texture_sheet
 
 __all__ = [
     "Verdict",
     "difference_strip",
-    "heat_colours",
     "heat_textures",
     "prediction_histogram",
     "printable",

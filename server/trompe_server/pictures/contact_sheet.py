@@ -9,18 +9,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from trompe_server.pictures.layout import (
-    CAPTION,
-    GREEN,
-    RED,
-    Images,
-    beside,
-    captioned,
-    line,
-    sheet,
-    shortened,
-    tile,
-)
+from trompe_server.pictures.layout import CAPTION, GREEN, RED, Images, beside, captioned, line, sheet, shortened, tile
 from trompe_shared.geometry import Camera, spherical
 
 VIEWS: Final = 12

@@ -57,9 +57,8 @@ Scores = Mapping[str, Float[np.ndarray, "H W"]]
 def heat_colours(values: Float[np.ndarray, "*shape"]) -> NDArray[np.float32]:
     """Colours (*shape, 3) in [0, 255] of values in [0, 1]; higher values are lighter."""
     position = np.clip(values, 0, 1) * (len(HEAT) - 1)
-    return np.stack([np.interp(position, np.arange(len(HEAT)), channel) for channel in HEAT.T], axis=-1).astype(
-        np.float32
-    )
+    channels = [np.interp(position, np.arange(len(HEAT)), channel) for channel in HEAT.T]
+    return np.stack(channels, axis=-1).astype(np.float32)
 
 
 def heat_over(image: Images, saliency: Float[np.ndarray, "H W"]) -> Images:

@@ -9,7 +9,6 @@ from PIL import Image
 from trompe_server.pictures import (
     Verdict,
     difference_strip,
-    heat_colours,
     heat_textures,
     prediction_histogram,
     representative,
@@ -37,7 +36,7 @@ from trompe_server.pictures.layout import (
     text_width,
     tile,
 )
-from trompe_server.pictures.saliency import BAR, GREY, OUTLINE, TICKS, heat_legend, heat_over
+from trompe_server.pictures.saliency import BAR, GREY, OUTLINE, TICKS, heat_colours, heat_legend, heat_over
 from trompe_server.pictures.saliency import TILE as SALIENCY_TILE
 from trompe_shared.geometry import Camera
 
