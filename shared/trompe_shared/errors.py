@@ -12,17 +12,6 @@
 Each message says what was wrong, what was expected and what to do.
 """
 
-__all__ = [
-    "ClassifierError",
-    "LabelError",
-    "ObjectError",
-    "ProtocolError",
-    "RendererError",
-    "RendererLostError",
-    "SpecError",
-    "TrompeError",
-]
-
 
 class TrompeError(Exception):
     """Base of all deliberate errors of Trompe."""

@@ -13,20 +13,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "FIELD_OF_VIEW",
-    "Camera",
-    "Light",
-    "View",
-    "euler_to_matrix",
-    "framing_distance",
-    "light_travel_direction",
-    "look_rotation",
-    "sailenv_pose",
-    "spherical",
-    "unity_to_opengl_rotation",
-]
-
 FIELD_OF_VIEW: Final = 60.0
 """Vertical field of view of every camera, degrees."""
 
