@@ -8,10 +8,9 @@ backquotes, with or without a value: `epsilon`, `queries: 10`. The command line 
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from difflib import get_close_matches
 from types import NoneType, UnionType
-from typing import Annotated, Any, Final, Literal, Self, SupportsIndex, Union, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, Self, SupportsIndex, TypedDict, Union, Unpack, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.fields import FieldInfo
@@ -169,29 +168,19 @@ def _even(queries: int) -> int:
 FileKind = Literal["classifier", "background", "mask"]
 
 
-@dataclass(frozen=True)
-class _Spelling:
+class _Spelling(TypedDict, total=False):
     flag: str
-    metavar: str | None
+    metavar: str
     keyword: str
-    file: FileKind | None
+    file: FileKind
     in_form: bool
 
 
-def option(
-    default: Any = ...,
-    help: str = "",
-    *,
-    flag: str = "",
-    metavar: str | None = None,
-    keyword: str = "",
-    file: FileKind | None = None,
-    in_form: bool = False,
-) -> Any:
+def option(default: Any = ..., help: str = "", **spelling: Unpack[_Spelling]) -> Any:
     """A field with its spelling. file: kind of the files that its values may name; in_form: the page's form has it."""
     given = {"default_factory": default} if callable(default) else {"default": default}
     info: FieldInfo = Field(description=help, **given)
-    info.metadata.append(_Spelling(flag, metavar, keyword, file, in_form))
+    info.metadata.append(spelling)
     return info
 
 
@@ -397,9 +386,7 @@ class JobSpec(_Part):
     """What to attack, and how. ``object`` and networks are ids or names of stored ones."""
 
     model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [{"object": "mug", "goal": {"label": "mug"}, "paint": {"epsilon": 0.05}}],
-        },
+        json_schema_extra={"examples": [{"object": "mug", "goal": {"label": "mug"}, "paint": {"epsilon": 0.05}}]}
     )
 
     object: str
@@ -492,11 +479,12 @@ class Option:
     """
 
     def __init__(self, part: str, field: str, info: FieldInfo) -> None:
-        spelling = next(each for each in info.metadata if isinstance(each, _Spelling))
+        spelling: _Spelling = next(filter(lambda each: isinstance(each, dict), info.metadata))
         self.part, self.field, self.info = part, field, info
-        self.keyword = spelling.keyword or field
-        self.flag = spelling.flag or f"--{field.replace('_', '-')}"
-        self.metavar, self.file, self.in_form = spelling.metavar, spelling.file, spelling.in_form
+        self.keyword = spelling.get("keyword", field)
+        self.flag = spelling.get("flag", f"--{field.replace('_', '-')}")
+        self.metavar, self.file = spelling.get("metavar"), spelling.get("file")
+        self.in_form = spelling.get("in_form", False)
         self.type = _plain(info.annotation)
         self.repeated = get_origin(self.type) in {list, dict} or self.type is ViewRanges
         self.help = info.description or ""
