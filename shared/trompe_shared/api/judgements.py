@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Final, Self
 
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from trompe_shared.api.jobs import ClassNames, Distance, Elevation, Option, QueueOptions, Schema, option
 from trompe_shared.colours import colour_of
@@ -15,11 +15,7 @@ JOB_RESULT: Final = "job:"
 MOST_VIEWS: Final = 1000
 
 
-def _plain(given: Any) -> Any:
-    return list(given) if isinstance(given, tuple) else given
-
-
-_Names = Annotated[list[str], BeforeValidator(_plain), Field(max_length=16)]
+_Names = Annotated[list[str], Field(max_length=16)]
 
 
 class JudgementSpec(Schema):
@@ -36,7 +32,7 @@ class JudgementSpec(Schema):
 
     before: str = Field(min_length=1)
     after: str = Field(min_length=1, description="the object of `before`, repainted by anyone")
-    label: Annotated[ClassNames, BeforeValidator(_plain)] = Field(description="each class counts as the object")
+    label: ClassNames = Field(description="each class counts as the object")
     networks: _Names = option(
         [], "network; default: the shipped one, or the suite's", flag="--network", metavar="FILE_OR_NAME"
     )
