@@ -29,11 +29,7 @@ def faults_of(refusal: ValidationError | Sequence[Mapping[str, Any]]) -> Iterato
     The input is left out: it may be a whole document.
     """
     if isinstance(refusal, ValidationError):
-        details: Sequence[Mapping[str, Any]] = refusal.errors(
-            include_url=False, include_input=False, include_context=False
-        )
-    else:
-        details = refusal
-    for each in details:
+        refusal = refusal.errors(include_input=False)
+    for each in refusal:
         place = ".".join(step for step in map(str, each["loc"]) if not step.startswith(INNER_STEPS))
         yield Fault(place, each["msg"].removeprefix(OWN_WORDS), each["type"])
