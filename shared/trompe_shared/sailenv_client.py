@@ -151,12 +151,9 @@ class SailenvTarget:
 
 def engine_at(host: str, port: int, *, timeout: float) -> EngineInfo | None:
     """The engine of the renderer at ``host``:``port``; ``None`` without an answer within ``timeout`` seconds."""
-    try:
-        with contextlib.closing(_Connection(host, port, (1, 1), timeout)) as connection:
-            connection.register()
-            return connection.engine
-    except (RendererError, ProtocolError, OSError, EOFError):
-        return None
+    with contextlib.suppress(RendererError), contextlib.closing(SailenvTarget(host, port, timeout=timeout)) as target:
+        return target.engine
+    return None
 
 
 class _Connection:
