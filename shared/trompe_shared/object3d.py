@@ -123,19 +123,15 @@ class Object3D:
         return self.materials[part.material].albedo
 
     def with_textures(self, textures: Mapping[str, Texture]) -> "Object3D":
-        """The same object with some albedo images replaced, (H, W, 3) uint8 of any size.
+        """The same object with some albedo images replaced, (H, W, 3) uint8 of any size; alpha stays.
 
         Raises ``ObjectError`` for a name that is not one of this object's albedo textures.
         """
         unknown = sorted(set(textures) - set(self.textures))
         if unknown:
             raise ObjectError(f"{unknown} are not albedo textures of {self.name!r}; it has {sorted(self.textures)}.")
-        files = dict(self.files) | {name: self._repaint(name, image) for name, image in textures.items()}
-        return replace(self, files=files, textures=dict(self.textures) | dict(textures))
-
-    def _repaint(self, name: str, image: Texture) -> bytes:
-        """PNG bytes of ``image`` with the alpha channel (opacity) of the replaced file."""
-        return with_alpha_of(image, decode_alpha(self.files[name], name))
+        painted = {name: with_alpha_of(image, decode_alpha(self.files[name], name)) for name, image in textures.items()}
+        return replace(self, files={**self.files, **painted}, textures={**self.textures, **textures})
 
     def to_zip(self) -> bytes:
         """The archive as a flat zip; the same content gives the same bytes."""
