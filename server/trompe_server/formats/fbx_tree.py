@@ -2,7 +2,6 @@
 
 import re
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -43,7 +42,8 @@ class Tree:
     def pictures(self) -> dict[str, bytes]:
         """The image files inside, by their names in materials. Raises ``ObjectError`` for two of one name."""
         found: dict[str, bytes] = {}
-        for name, content in map(_picture, self._videos()):
+        objects = (node for top in self.nodes if top.name == b"Objects" for node in top.children or ())
+        for name, content in (_picture(node) for node in objects if node.name == b"Video"):
             if content is not None and found.setdefault(name, data := content.properties[5:]) != data:
                 raise ObjectError(
                     f"The FBX holds two pictures called {name!r}; rename one of them and export it again."
@@ -56,12 +56,8 @@ class Tree:
 
     def with_links(self, name: re.Pattern[bytes], new: bytes) -> "Tree":
         """The tree with the property ``new`` of materials in connections to a property that matches ``name``."""
-        return replace(self, nodes=tuple(_linked(node, name, _string(new)) for node in self.nodes))
-
-    def _videos(self) -> Iterator[Node]:
-        for top in self.nodes:
-            if top.name == b"Objects":
-                yield from (node for node in top.children or () if node.name == b"Video")
+        text = b"S" + struct.pack("<I", len(new)) + new
+        return replace(self, nodes=tuple(_linked(node, name, text) for node in self.nodes))
 
     def to_bytes(self) -> bytes:
         """The file's bytes."""
@@ -126,11 +122,6 @@ def _picture(video: Node) -> tuple[str, Node | None]:
     inside = content is not None and content.properties[:1] == b"R" and len(content.properties) > 5
     name = named.properties[5:].decode("utf-8", "replace") if named is not None else ""
     return base_name(name), content if inside else None
-
-
-def _string(value: bytes) -> bytes:
-    """The property of a text."""
-    return b"S" + struct.pack("<I", len(value)) + value
 
 
 def _linked(node: Node, name: re.Pattern[bytes], new: bytes) -> Node:
