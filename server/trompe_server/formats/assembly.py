@@ -52,9 +52,10 @@ def painted_flat(surface: Surface, colour: Sequence[float]) -> tuple[Part, Pixel
     return part, bake([(cut, shades[cut.source] * np.asarray(colour))], size=size)
 
 
-def painted_object(stem: str, surface: Surface, colour: Sequence[float]) -> Object3D:
-    """The object of one surface without texture, named after the file ``stem``; see ``painted_flat``."""
+def painted_object(stem: str, surface: Surface) -> Object3D:
+    """The object of one surface in its vertex colours, or else light grey, named after the file ``stem``."""
     name = safe_name(stem)
+    colour = DEFAULT_COLOUR if surface.colours is None else (1.0, 1.0, 1.0)
     (part, picture), file = painted_flat(surface, colour), f"{name}_albedo.png"
     return assemble(name, [part], {part.material: Material(part.material, file)}, {file: encode_png(picture)})
 

@@ -12,15 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_server.formats.assembly import (
-    DEFAULT_COLOUR,
-    assemble,
-    check_numbers,
-    free_name,
-    painted_object,
-    repainted,
-    safe_name,
-)
+from trompe_server.formats.assembly import assemble, check_numbers, free_name, painted_object, repainted, safe_name
 from trompe_server.formats.upload import Upload, refusing
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import PICTURE_SUFFIXES, base_name
@@ -29,7 +21,6 @@ from trompe_shared.polygons import unfold
 from trompe_shared.wavefront import MAX_FACES, Part, Surface, in_unit, smooth_normals
 
 MATERIAL: Final = "surface"
-WHITE: Final = (1.0, 1.0, 1.0)
 MAX_HEADER: Final = 2**16
 REMEDY: Final = "Save it again as triangles, binary or text."
 HEADER: Final = re.compile(rb"ply(?:\r?\n.*?^end_header\r?\n|\r[^\n]*?\rend_header\r)", re.DOTALL | re.MULTILINE)
@@ -79,7 +70,7 @@ def _read(upload: Upload) -> tuple[Object3D, str | None]:
     if not header.textures or surface.uvs is None:
         if surface.colours is None:
             _refuse_unread(upload, header, surface)
-        return painted_object(upload.stem, surface, DEFAULT_COLOUR if surface.colours is None else WHITE), None
+        return painted_object(upload.stem, surface), None
     if len(header.textures) > 1:
         raise ObjectError(
             f"The PLY has {len(header.textures)} textures, {', '.join(header.textures)[:200]}; one is supported. Bake "

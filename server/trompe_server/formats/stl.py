@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from trompe_server.formats.assembly import DEFAULT_COLOUR, check_numbers, painted_object
+from trompe_server.formats.assembly import check_numbers, painted_object
 from trompe_server.formats.upload import Upload, refusing
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D
@@ -35,7 +35,7 @@ def read(upload: Upload) -> Object3D:
         raise ObjectError(f"The STL has {len(faces)} triangles; expected 1 to {MAX_FACES}.")
     check_numbers(vertices, "The STL")
     surface = Surface("surface", vertices, smooth_normals(vertices, np.arange(len(vertices)), faces), faces)
-    return painted_object(upload.stem, surface, DEFAULT_COLOUR)
+    return painted_object(upload.stem, surface)
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
