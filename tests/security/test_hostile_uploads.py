@@ -411,7 +411,7 @@ def big_glb() -> bytes:
 def test_an_upload_that_takes_too_much_memory_is_refused_and_the_next_one_is_read() -> None:
     with pytest.raises(ObjectError, match="400 MiB of memory"):
         import_file(big_glb(), name="t.glb", memory=400 * 2**20)
-    assert import_file(glb(gltf_json()), name="t.glb").triangles == 1
+    assert import_file(glb(gltf_json()), name="t.glb").facts["triangles"] == 1
 
 
 def test_an_upload_that_takes_too_long_is_given_up() -> None:

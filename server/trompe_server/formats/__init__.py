@@ -5,16 +5,6 @@ The server reads uploads in a separate process, ``python -m trompe_server.format
 
 from trompe_server.formats.gltf_write import write_glb
 from trompe_server.formats.isolated import import_file, repaint_limited
-from trompe_server.formats.registry import FORMATS, Exported, Format, Imported, read_object, repaint_file
+from trompe_server.formats.registry import facts_of, read_object, repaint_file
 
-__all__ = [
-    "FORMATS",
-    "Exported",
-    "Format",
-    "Imported",
-    "import_file",
-    "read_object",
-    "repaint_file",
-    "repaint_limited",
-    "write_glb",
-]
+__all__ = ["facts_of", "import_file", "read_object", "repaint_file", "repaint_limited", "write_glb"]

@@ -9,22 +9,15 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from trompe_server.formats.registry import read_object, repaint_file
+from trompe_server.formats.registry import facts_of, read_object, repaint_file
 from trompe_shared.errors import TrompeError
 from trompe_shared.object3d import load_object
 
 
 def _read(file: str, name: str, max_texture: str, archive: str) -> dict[str, object]:
     imported = read_object(Path(file).read_bytes(), name=name, max_texture=int(max_texture) or None)
-    obj = imported.obj
-    Path(archive).write_bytes(obj.to_zip())
-    return {
-        "format": imported.format,
-        "materials": sorted(obj.materials),
-        "textures": {name: list(image.shape[:2]) for name, image in obj.textures.items()},
-        "triangles": sum(len(part.faces) for part in obj.parts),
-        "radius": obj.radius,
-    }
+    Path(archive).write_bytes(imported.obj.to_zip())
+    return {"format": imported.format, **facts_of(imported.obj)}
 
 
 def _repaint(file: str, name: str, archive: str, out: str) -> dict[str, object]:

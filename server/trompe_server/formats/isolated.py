@@ -20,17 +20,10 @@ _MODULE: Final = "trompe_server.formats.convert"
 
 @dataclass(frozen=True)
 class Converted:
-    """An upload converted to SAILenv's zip, and its contents.
-
-    format: the upload's format. textures: (height, width) by name. radius: metres.
-    """
+    """An upload as SAILenv's zip, its format, and the ``facts_of`` the object."""
 
     archive: bytes
-    format: str
-    materials: list[str]
-    textures: Mapping[str, tuple[int, int]]
-    triangles: int
-    radius: float
+    facts: Mapping[str, Any]
 
 
 def import_file(
@@ -47,9 +40,8 @@ def import_file(
         else:
             source.write_bytes(data)
         arguments = ["read", str(source), name, str(max_texture or 0), str(archive)]
-        answer = _run(arguments, memory=memory, seconds=seconds)
-        textures = {name: (int(size[0]), int(size[1])) for name, size in answer["textures"].items()}
-        return Converted(archive.read_bytes(), **{**answer, "textures": textures})
+        facts = run_limited(_MODULE, arguments, memory=memory, seconds=seconds, failure=ObjectError)
+        return Converted(archive.read_bytes(), facts)
 
 
 def repaint_limited(data: bytes, painted: Object3D, *, name: str) -> Exported:
@@ -58,9 +50,6 @@ def repaint_limited(data: bytes, painted: Object3D, *, name: str) -> Exported:
         source, archive, out = Path(folder, "upload"), Path(folder, "archive.zip"), Path(folder, "out")
         source.write_bytes(data)
         archive.write_bytes(painted.to_zip())
-        answer = _run(["repaint", str(source), name, str(archive), str(out)])
+        arguments = ["repaint", str(source), name, str(archive), str(out)]
+        answer = run_limited(_MODULE, arguments, memory=MEMORY, seconds=SECONDS, failure=ObjectError)
         return Exported(out.read_bytes(), str(answer["ending"]))
-
-
-def _run(arguments: list[str], *, memory: int = MEMORY, seconds: float = SECONDS) -> Mapping[str, Any]:
-    return run_limited(_MODULE, arguments, memory=memory, seconds=seconds, failure=ObjectError)

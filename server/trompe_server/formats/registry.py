@@ -3,7 +3,7 @@
 import posixpath
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from trompe_server.formats import fbx, gltf, gltf_repaint, ply, stl, wavefront
 from trompe_server.formats.upload import Upload, is_litter
@@ -55,6 +55,16 @@ class Exported:
 
     data: bytes
     ending: str
+
+
+def facts_of(obj: Object3D) -> dict[str, Any]:
+    """What an ``ObjectInfo`` says about the object itself."""
+    return {
+        "materials": sorted(obj.materials),
+        "textures": {name: image.shape[:2] for name, image in obj.textures.items()},
+        "triangles": sum(len(part.faces) for part in obj.parts),
+        "radius": obj.radius,
+    }
 
 
 def read_object(data: bytes, *, name: str, max_texture: int | None = None) -> Imported:

@@ -102,12 +102,8 @@ class Library:
             info = ObjectInfo(
                 id=identity if max_texture is None else identity_of(f"{identity} at most {max_texture}".encode()),
                 name=_named(name, filename) or "object",
-                materials=made.materials,
-                textures=dict(made.textures),
-                triangles=made.triangles,
-                radius=made.radius,
-                format=made.format,
                 filename=filename,
+                **made.facts,
             )
             self.objects.folder.within(info.id).write(_UPLOAD, upload)
             return self.objects.put(info, "data.zip", made.archive)

@@ -2,30 +2,21 @@
 
 from functools import cache
 
+from trompe_server.formats import facts_of
 from trompe_server.library.catalogue import identity_of
 from trompe_shared.api import ClassifierInfo, ObjectInfo
 from trompe_shared.object3d import load_object
-from trompe_shared.shipped import ShippedObject, shipped_objects
+from trompe_shared.shipped import shipped_objects
 
 
 @cache
 def list_shipped_objects() -> list[ObjectInfo]:
     """The shipped objects. Reads them at the first call."""
-    return [_describe(shipped) for shipped in shipped_objects().values()]
-
-
-def _describe(shipped: ShippedObject) -> ObjectInfo:
-    data = shipped.read()
-    obj = load_object(data)
-    return ObjectInfo(
-        id=identity_of(data),
-        name=shipped.name,
-        materials=sorted(obj.materials),
-        textures={file: (image.shape[0], image.shape[1]) for file, image in obj.textures.items()},
-        triangles=sum(len(part.faces) for part in obj.parts),
-        radius=obj.radius,
-        shipped=True,
-    )
+    archives = {name: shipped.read() for name, shipped in shipped_objects().items()}
+    return [
+        ObjectInfo(id=identity_of(data), name=name, shipped=True, **facts_of(load_object(data)))
+        for name, data in archives.items()
+    ]
 
 
 @cache

@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.small_models import corners, painted, refusal, same_paint, with_picture_inside
-from trompe_server.formats import FORMATS, import_file, read_object, repaint_file, repaint_limited, write_glb
+from trompe_server.formats import import_file, read_object, repaint_file, repaint_limited, write_glb
 from trompe_server.formats.fbx import unit
 from trompe_server.formats.fbx_tree import MAGIC, Node, Tree, parse_tree
 from trompe_server.formats.pictures import cutout_alpha, encode_srgb, linear_rgb, tinted
+from trompe_server.formats.registry import FORMATS
 from trompe_server.formats.unwrap import unwrap
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.errors import ObjectError
@@ -650,9 +651,9 @@ def test_a_file_is_read_and_repainted_in_another_process_as_in_this_one(mug: Obj
     data = mug.to_zip()
     converted = import_file(data, name="mug.zip")
     assert load_object(converted.archive).files == mug.files
-    assert converted.format == "sailenv"
-    assert converted.textures == {name: image.shape[:2] for name, image in mug.textures.items()}
-    assert converted.radius == pytest.approx(mug.radius)
+    assert converted.facts["format"] == "sailenv"
+    assert converted.facts["textures"] == {name: [*image.shape[:2]] for name, image in mug.textures.items()}
+    assert converted.facts["radius"] == pytest.approx(mug.radius)
     new = painted(mug)
     assert repaint_limited(data, new, name="mug.zip") == repaint_file(data, new, name="mug.zip")
 
