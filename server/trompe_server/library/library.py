@@ -114,19 +114,15 @@ class Library:
         Raises ``NotFoundError``, ``AmbiguousError``, or ``ClassifierError`` for a network by name that is not
         allowed or cannot be loaded.
         """
-        if reference.startswith(LOOKED_UP):
-            self._check_allowed(reference)
-            return _named_classifier(reference, self._inspect)
-        return self.classifiers.find(reference)
-
-    def _check_allowed(self, reference: str) -> None:
-        """Raise ``ClassifierError`` unless jobs may use the network by name."""
+        if not reference.startswith(LOOKED_UP):
+            return self.classifiers.find(reference)
         if not any(fnmatchcase(reference, pattern) for pattern in self._networks):
             allowed = ", ".join(self._networks) or "none"
             raise ClassifierError(
                 f"This service does not allow the network {reference!r}; it allows {allowed}. Its operator names "
                 "them in TROMPE_NETWORKS; or upload a .pt2 file."
             )
+        return _named_classifier(reference, self._inspect)
 
     def classifier_path(self, reference: str) -> str:
         """Argument for ``load_classifier``: the path of an upload, or the name of any other classifier."""
