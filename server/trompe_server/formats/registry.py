@@ -14,31 +14,26 @@ from trompe_shared.object3d import MAX_ARCHIVE_BYTES, Object3D, definition_of, u
 
 @dataclass(frozen=True)
 class Format:
-    """endings: of the mesh file; one without gets the last. read, repaint: raise ``ObjectError``."""
+    """endings: of the mesh file; one without gets the last. beginnings: of its bytes.
+
+    read, repaint: raise ``ObjectError``.
+    """
 
     name: str
     endings: tuple[str, ...]
+    beginnings: tuple[bytes, ...]
     read: Callable[[Upload], Object3D]
     repaint: Callable[[Upload, Object3D], Upload]
 
 
 FORMATS: Final = (
-    Format("obj", (".obj",), wavefront.read, wavefront.repaint),
-    Format("gltf", (".gltf", ".glb"), gltf.read, gltf_repaint.repaint),
-    Format("fbx", (".fbx",), fbx.read, fbx.repaint),
-    Format("ply", (".ply",), ply.read, ply.repaint),
-    Format("stl", (".stl",), stl.read, stl.repaint),
+    Format("obj", (".obj",), (), wavefront.read, wavefront.repaint),
+    Format("gltf", (".gltf", ".glb"), (b"glTF", b"{"), gltf.read, gltf_repaint.repaint),
+    Format("fbx", (".fbx",), (b"Kaydara FBX Binary", b"; FBX"), fbx.read, fbx.repaint),
+    Format("ply", (".ply",), (b"ply\n", b"ply\r"), ply.read, ply.repaint),
+    Format("stl", (".stl",), (), stl.read, stl.repaint),
 )
 """In order of precedence for archives with meshes of several formats."""
-
-_BEGINNINGS: Final = (
-    (b"glTF", "gltf"),
-    (b"{", "gltf"),
-    (b"Kaydara FBX Binary", "fbx"),
-    (b"; FBX", "fbx"),
-    (b"ply\n", "ply"),
-    (b"ply\r", "ply"),
-)
 
 
 @dataclass(frozen=True)
@@ -98,9 +93,9 @@ def _opened(data: bytes, name: str) -> tuple[Upload, Format]:
 def _recognised(data: bytes, name: str) -> Format:
     by_name = {format.name: format for format in FORMATS}
     head = data[:64].removeprefix(b"\xef\xbb\xbf").lstrip() if data[:4] != b"ply\n" else data
-    for beginning, format in _BEGINNINGS:
-        if head.startswith(beginning):
-            return by_name[format]
+    for format in FORMATS:
+        if head.startswith(format.beginnings):
+            return format
     if stl.looks_binary(data) or head.lower().startswith(b"solid") or name.lower().endswith(".stl"):
         return by_name["stl"]
     if name.lower().endswith(".obj"):
