@@ -129,8 +129,8 @@ class _Editor(Writer):
         self._serving = _users_of_images(self.document)
 
     def _has_own_chunk(self) -> bool:
-        buffers = self._container.document.buffers
-        return self._container.binary and bool(buffers) and buffers[0].uri is None
+        buffers = self.document.get("buffers", [])
+        return self._container.binary and bool(buffers) and buffers[0].get("uri") is None
 
     def serves_only(self, image: int, materials: list[int]) -> bool:
         """Whether an image serves as base colour of these materials and nothing else."""
@@ -157,18 +157,11 @@ class _Editor(Writer):
     def _show_in_all_readers(self, image: int) -> None:
         """Leave the textures of an image no copy in another encoding, which other readers would show instead."""
         textures = self.document["textures"]
-        dropped: set[str] = set()
         for texture in textures:
-            if image in _sources(texture) and (others := _encodings(texture).keys()):
+            if image in _sources(texture) and (others := _encodings(texture)):
                 texture["source"] = image
-                dropped |= others
-                _keep(texture, "extensions", {k: v for k, v in texture["extensions"].items() if k not in others})
-        unused = dropped.difference(*map(_encodings, textures))
-        self._unlist(unused)
-
-    def _unlist(self, unused: set[str]) -> None:
-        for key in {"extensionsUsed", "extensionsRequired"} & self.document.keys():
-            _keep(self.document, key, [name for name in self.document[key] if name not in unused])
+                for name in others:
+                    self.drop_extension(name, texture, textures)
 
     def _replace_file(self, entry: Json, uri: str, png: bytes) -> None:
         upload = self._container.upload
@@ -229,7 +222,8 @@ class _Editor(Writer):
         if _extensions(entry).pop(name, None) is not None:
             _keep(entry, "extensions", entry["extensions"])
             if not any(name in _extensions(each) for each in alike):
-                self._unlist({name})
+                for key in {"extensionsUsed", "extensionsRequired"} & self.document.keys():
+                    _keep(self.document, key, [used for used in self.document[key] if used != name])
 
     def _gather(self, index: int, source: NDArray[np.int64]) -> int:
         accessor = self.document["accessors"][index]
@@ -243,8 +237,7 @@ class _Editor(Writer):
         """Add a buffer view of new bytes, in the GLB's own chunk or in a new buffer; return its number."""
         if self._container.binary and not self.document.get("buffers"):
             self.document["buffers"] = [{"byteLength": 0}]
-        own = self._container.binary and "uri" not in self.document["buffers"][0]
-        if own:
+        if self._has_own_chunk():
             return super().add_view(data, entry)
         place = {"buffer": len(self._before.get("buffers", [])), "byteOffset": append(self._extra, data)}
         return self.add("bufferViews", place | {"byteLength": len(data)} | (entry or {}))
