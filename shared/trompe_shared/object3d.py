@@ -41,6 +41,8 @@ UTF_8: Final = 0x800
 """Flag of a zip's member whose name is UTF-8, not code page 437."""
 SPHERE_STEPS: Final = 100
 """Steps of the search for the smallest sphere around an object; the error falls with their number."""
+PLAIN_ROUGHNESS: Final = 0.9
+"""Roughness where no metallic map tells another one."""
 IMAGE_FORMATS: Final = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF", "GIF")
 """Formats of textures. Pillow reads none of them through another program."""
 
@@ -200,6 +202,15 @@ def decode_alpha(data: bytes, name: str) -> Texture | None:
     """Alpha (H, W) uint8 of an image file; ``None`` for a file without. Raises ``ObjectError`` as ``decode_rgb``."""
     with open_image(data, name) as image:
         return np.array(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
+
+
+def roughness_metallic(data: bytes, name: str) -> Texture:
+    """Roughness and metallic (H, W, 2) uint8 of a metallic map (``Material``). Raises ``ObjectError``."""
+    with open_image(data, name) as image:
+        smoothness = np.array(image.getchannel("A")) if "A" in image.getbands() else None
+        metallic = np.array(image.convert("RGB"))[..., 0]
+    plain = np.full(metallic.shape, round(255 * PLAIN_ROUGHNESS), np.uint8)
+    return np.stack([plain if smoothness is None else 255 - smoothness, metallic], axis=-1)
 
 
 def load_object(source: bytes | str | Path) -> Object3D:

@@ -12,15 +12,13 @@ from trompe_renderer.world.model import HashedModel
 from trompe_renderer.world.snapshot import Matrix, Sky, Snapshot
 from trompe_renderer.world.validation import unit_color
 from trompe_shared.geometry import FIELD_OF_VIEW
-from trompe_shared.object3d import Material, decode_rgb, open_image
+from trompe_shared.object3d import PLAIN_ROUGHNESS, Material, decode_rgb, roughness_metallic
 from trompe_shared.opacity import CUTOFF
 from trompe_shared.wavefront import Part
 
 NEAR: Final = 0.005
 FAR: Final = 1000.0
 """Clipping planes, metres, for all but tiny and huge objects."""
-PLAIN_ROUGHNESS: Final = 0.9
-"""Roughness of a material without a roughness map."""
 MAX_ENTRIES: Final = 256
 MAX_BYTES: Final = 512 * 2**20
 
@@ -62,7 +60,7 @@ class TextureImage:
             alike = opacity is not None and opacity.shape == texture.shape[:2]
             return np.dstack([texture, opacity]) if alike else texture  # type: ignore[list-item]
         data = obj.files[name]
-        return decode_rgb(data, name) if self.use == "normal" else _roughness_metallic(data, name)
+        return decode_rgb(data, name) if self.use == "normal" else roughness_metallic(data, name)
 
 
 @dataclass(frozen=True)
@@ -255,13 +253,3 @@ def encoded_light(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     """Linear light to sRGB, clipped to [0, 1]."""
     clipped = np.clip(linear, 0, 1)
     return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
-
-
-def _roughness_metallic(data: bytes, name: str) -> Pixels:
-    """(H, W, 2) uint8 from a MetallicSmoothness file: 1 - alpha (smoothness), red."""
-    with open_image(data, name) as image:
-        smoothness = image.getchannel("A") if "A" in image.getbands() else None
-        metallic = np.array(image.convert("RGB"))[..., 0]
-    plain = np.full(metallic.shape, round(255 * PLAIN_ROUGHNESS), np.uint8)
-    roughness = plain if smoothness is None else 255 - np.array(smoothness)
-    return np.stack([roughness, metallic], axis=-1)

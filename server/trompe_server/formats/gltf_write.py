@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_server.formats.gltf_container import BIN_CHUNK, GLB_MAGIC, JSON_CHUNK
-from trompe_shared.object3d import Material, Object3D, encode_png, open_image
+from trompe_shared.object3d import PLAIN_ROUGHNESS, Material, Object3D, encode_png, open_image, roughness_metallic
 from trompe_shared.opacity import CUTOFF, opacity_of
 from trompe_shared.wavefront import Part
 
-PLAIN_ROUGHNESS: Final = 0.9
-"""Roughness of materials without a map in SAILenv's renderers."""
 TRILINEAR: Final = {"magFilter": 9729, "minFilter": 9987, "wrapS": 10497, "wrapT": 10497}
 
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -127,7 +125,8 @@ class _ObjectWriter(Writer):
         if material.metallic is None:
             pbr |= {"metallicFactor": 0.0, "roughnessFactor": PLAIN_ROUGHNESS}
         else:
-            converted = _metallic_roughness(files[material.metallic], material.metallic)
+            maps = roughness_metallic(files[material.metallic], material.metallic)  # glTF's green and blue
+            converted = encode_png(np.dstack([np.full(maps.shape[:2], 255, np.uint8), maps]))
             pbr["metallicRoughnessTexture"] = {"index": self._texture(f"{material.metallic} as glTF", converted)}
         entry: Json = {"name": material.name, "pbrMetallicRoughness": pbr}
         if material.normal is not None:
@@ -154,13 +153,3 @@ def _portable(data: bytes, name: str) -> tuple[bytes, str]:
         if image.format in {"PNG", "JPEG"}:
             return data, f"image/{image.format.lower()}"
         return encode_png(image.convert("RGBA" if image.has_transparency_data else "RGB")), "image/png"
-
-
-def _metallic_roughness(data: bytes, name: str) -> bytes:
-    """glTF's map, green roughness and blue metallic, from Unity's, red metallic and alpha smoothness."""
-    with open_image(data, name) as image:
-        smoothness = np.array(image.getchannel("A")) if "A" in image.getbands() else None
-        metallic = np.array(image.convert("RGB"))[..., 0]
-    plain = np.full(metallic.shape, round(255 * PLAIN_ROUGHNESS), np.uint8)
-    roughness = plain if smoothness is None else 255 - smoothness
-    return encode_png(np.stack([np.full_like(metallic, 255), roughness, metallic], axis=-1))

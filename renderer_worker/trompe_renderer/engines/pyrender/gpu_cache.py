@@ -6,9 +6,9 @@ import numpy as np
 
 from trompe_renderer.engines.pyrender.blending import BlendedPrimitive
 from trompe_renderer.engines.pyrender.platform import ANISOTROPY, GL, pyrender
-from trompe_renderer.engines.surfaces import PLAIN_ROUGHNESS, ContentCache, Pixels, TextureImage, Use
+from trompe_renderer.engines.surfaces import ContentCache, Pixels, TextureImage, Use
 from trompe_renderer.world.model import HashedModel
-from trompe_shared.object3d import Material
+from trompe_shared.object3d import PLAIN_ROUGHNESS, Material
 from trompe_shared.wavefront import Part
 
 MAX_SHAPES: Final = 32  # twice the need of the furnished room
