@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 
 from trompe_server.formats.assembly import assemble, repainted, safe_name
 from trompe_server.formats.fbx_tree import MAGIC, Tree, parse_tree
-from trompe_server.formats.pictures import decode
 from trompe_server.formats.upload import Upload
 from trompe_server.formats.wavefront import complete, dissolved
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import base_name, named
-from trompe_shared.object3d import Object3D, object_from_files, with_alpha_of
+from trompe_shared.object3d import Object3D, decode_alpha, object_from_files, with_alpha_of
 
 CENTIMETRE: Final = 0.01
 """Metres of FBX's default unit."""
@@ -90,7 +89,7 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
     pictures = {**beside, **inside}
     if homeless := sorted(changed.keys() - pictures.keys()):
         raise ObjectError(f"The FBX has plain colours in place of the textures {homeless}; take the GLB.")
-    pngs = {name: with_alpha_of(rgb, decode(pictures[name], name)[1]) for name, rgb in changed.items()}
+    pngs = {name: with_alpha_of(rgb, decode_alpha(pictures[name], name)) for name, rgb in changed.items()}
     files = {found: png for name, png in pngs.items() if (found := named(name, beside)) is not None}
     if tree is not None and pngs.keys() & inside.keys():
         files[base_name(upload.main)] = tree.with_pictures({**pngs}).to_bytes()

@@ -11,28 +11,22 @@ from numpy.typing import NDArray
 
 from trompe_server.formats.assembly import assemble, flat_picture, free_name, safe_name
 from trompe_server.formats.gltf_container import Container, at, open_container
-from trompe_server.formats.gltf_schema import Document, Material, TextureInfo
+from trompe_server.formats.gltf_schema import Material, TextureInfo
 from trompe_server.formats.gltf_shapes import Instance, Shape, instances, placed, read_shape
-from trompe_server.formats.pictures import (
-    cutout_alpha,
-    decode,
-    metallic_smoothness,
-    scaled_normals,
-    tinted,
-)
+from trompe_server.formats.pictures import cutout_alpha, metallic_smoothness, scaled_normals, tinted
 from trompe_server.formats.unwrap import Unwrapped, bake, unwrap
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import base_name
+from trompe_shared.object3d import PLAIN_ROUGHNESS, Object3D, decode_alpha, decode_rgb, encode_png, with_alpha_of
 from trompe_shared.object3d import Material as Maps
-from trompe_shared.object3d import Object3D, encode_png, with_alpha_of
 from trompe_shared.wavefront import Part
 
 Key = tuple[int, int]
 """(Number of a mesh, number of one of its primitives)."""
 KEPT: tuple[float, float] = (1.0, 0.5)
 """Factor and cutoff that leave alpha unchanged."""
-PLAIN: tuple[float, float] = (0.0, 0.9)
+PLAIN: tuple[float, float] = (0.0, PLAIN_ROUGHNESS)
 """Metallic and roughness of SAILenv's materials without a map."""
 
 
@@ -66,11 +60,6 @@ class Model:
     _names: dict[tuple[int | None, bool], str] = field(default_factory=dict)
     _converted: dict[tuple[object, ...], str] = field(default_factory=dict)
 
-    @property
-    def document(self) -> Document:
-        """The file's JSON."""
-        return self.container.document
-
     def object(self) -> Object3D:
         """The object. Raises ``ObjectError``."""
         return assemble(safe_name(self.container.upload.stem), self.parts, self.materials, self.files)
@@ -79,19 +68,14 @@ class Model:
         """Read all meshes of the scene."""
         standing = list(instances(self.container))
         for mesh in dict.fromkeys(instance.mesh for instance in standing):
-            self._read_mesh(mesh)
+            numbered = enumerate(at(self.container.document.meshes, mesh, "mesh").primitives)
+            self.shapes |= {(mesh, k): read_shape(self.container, each) for k, each in numbered if each.mode >= 4}
         self._unwrap()
         for shape in self.shapes.values():
             self._paint(shape)
         for instance in standing:
             own = (shape for (mesh, _), shape in self.shapes.items() if mesh == instance.mesh)
             self.parts += [part for shape in own for part in self._place(shape, instance)]
-
-    def _read_mesh(self, index: int) -> None:
-        mesh = at(self.document.meshes, index, "mesh")
-        for number, primitive in enumerate(mesh.primitives):
-            if primitive.mode >= 4:
-                self.shapes[index, number] = read_shape(self.container, primitive)
 
     def _unwrap(self) -> None:
         """Unwrap the shapes without texture coordinates; those of one material share a texture."""
@@ -106,19 +90,15 @@ class Model:
             self._add_baked(index, list(zip(shapes, cuts, strict=True)), size)
 
     def _add_baked(self, index: int | None, pieces: list[tuple[Shape, Unwrapped]], size: tuple[int, int]) -> None:
-        material = self._material(index)
-        factor = np.array(material.pbr.base_color_factor[:3])
-        if any(shape.colours is not None for shape, _ in pieces):
-            picture = bake([(cut, (_colours(shape) * factor)[cut.source]) for shape, cut in pieces], size=size)
-        else:
-            picture = flat_picture(factor.tolist(), size)
         slot = self._slot(index, unwrapped=True)
-        alpha = None if slot.alpha is None else np.full(size, 255, np.uint8)
-        png = _albedo_png(picture, alpha, slot)
-        self.slots[slot] = self._new_file(f"{self._material_name(index)}_albedo.png", png)
+        if any(shape.colours is not None for shape, _ in pieces):
+            picture = bake([(cut, (_colours(shape) * slot.factor)[cut.source]) for shape, cut in pieces], size=size)
+        else:
+            picture = flat_picture(slot.factor, size)
+        self.slots[slot] = self._new_file(f"{self._material_name(index)}_albedo.png", _albedo_png(picture, None, slot))
 
     def _material(self, index: int | None) -> Material:
-        return Material() if index is None else at(self.document.materials, index, "material")
+        return Material() if index is None else at(self.container.document.materials, index, "material")
 
     def _slot(self, index: int | None, *, unwrapped: bool) -> Slot:
         material = self._material(index)
@@ -131,7 +111,7 @@ class Model:
         return Slot(image, (red, green, blue), alpha)
 
     def _image_of(self, info: TextureInfo) -> int:
-        image = at(self.document.textures, info.index, "texture").image
+        image = at(self.container.document.textures, info.index, "texture").image
         if image is None:
             raise ObjectError(f"Texture {info.index} of the glTF has no supported image; use PNG, JPEG or WebP.")
         return image
@@ -157,17 +137,12 @@ class Model:
 
     def _add_albedo(self, slot: Slot, material: str) -> str:
         if slot.image is None:
-            name = self._new_file(f"{material}_albedo.png", b"")
-            rgb, alpha = flat_picture(slot.factor), None
-        else:
-            data = self.container.image_bytes(slot.image)
-            name = self._new_file(f"{self._image_name(slot.image)}.png", data)
-            rgb, alpha = decode(data, name)
-            if _kept_as_is(slot, data, alpha is not None):
-                return name
-        if alpha is None and slot.alpha is not None:
-            alpha = np.full(rgb.shape[:2], 255, np.uint8)
-        self.files[name] = _albedo_png(rgb if slot.image is None else tinted(rgb, slot.factor), alpha, slot)
+            return self._new_file(f"{material}_albedo.png", _albedo_png(flat_picture(slot.factor), None, slot))
+        data = self.container.image_bytes(slot.image)
+        name = self._new_file(f"{self._image_name(slot.image)}.png", data)
+        rgb, alpha = decode_rgb(data, name), decode_alpha(data, name)
+        if not _kept_as_is(slot, data, alpha is not None):
+            self.files[name] = _albedo_png(tinted(rgb, slot.factor), alpha, slot)
         return name
 
     def _new_file(self, wanted: str, data: bytes) -> str:
@@ -176,7 +151,7 @@ class Model:
         return name
 
     def _image_name(self, index: int) -> str:
-        image = at(self.document.images, index, "image")
+        image = at(self.container.document.images, index, "image")
         uri = image.uri if image.uri is not None and not image.uri.startswith("data:") else None
         return safe_name(image.name or base_name(uri or "").rsplit(".", 1)[0], default=f"image_{index}")
 
@@ -188,7 +163,7 @@ class Model:
         key = ("normal", image, info.scale)
         if key not in self._converted:
             data = self.container.image_bytes(image)
-            rgb, _ = decode(data, f"{self._image_name(image)} (a normal map)")
+            rgb = decode_rgb(data, f"{self._image_name(image)} (a normal map)")
             scaled = scaled_normals(rgb, info.scale)
             ending = _ending(data) if scaled is rgb else None
             kept = data if ending is not None else encode_png(scaled)
@@ -206,7 +181,7 @@ class Model:
         if key not in self._converted:
             pixels = np.full((1, 1, 3), 255, np.uint8)
             if image is not None:
-                pixels, _ = decode(self.container.image_bytes(image), "metallic map")
+                pixels = decode_rgb(self.container.image_bytes(image), "metallic map")
             converted = metallic_smoothness(pixels, metallic=factors[0], roughness=factors[1])
             flat = f"{safe_name(material.name or 'material')}_metallic"
             stem = flat if image is None else self._image_name(image)
@@ -259,7 +234,8 @@ def _kept_as_is(slot: Slot, data: bytes, has_alpha: bool) -> bool:
 
 
 def _albedo_png(rgb: NDArray[np.uint8], alpha: NDArray[np.uint8] | None, slot: Slot) -> bytes:
-    if slot.alpha is None or alpha is None:
+    if slot.alpha is None:
         return encode_png(rgb)
     factor, cutoff = slot.alpha
-    return with_alpha_of(rgb, cutout_alpha(alpha, factor=factor, cutoff=cutoff))
+    opaque = np.full(rgb.shape[:2], 255, np.uint8)
+    return with_alpha_of(rgb, cutout_alpha(opaque if alpha is None else alpha, factor=factor, cutoff=cutoff))

@@ -22,11 +22,11 @@ from trompe_server.formats.gltf_container import BIN_CHUNK, Container, split_glb
 from trompe_server.formats.gltf_schema import DRACO
 from trompe_server.formats.gltf_shapes import Shape
 from trompe_server.formats.gltf_write import Json, Writer, append, glb
-from trompe_server.formats.pictures import Pixels, decode
+from trompe_server.formats.pictures import Pixels
 from trompe_server.formats.unwrap import Unwrapped
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
-from trompe_shared.object3d import Object3D, with_alpha_of
+from trompe_shared.object3d import Object3D, decode_alpha, with_alpha_of
 
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
@@ -54,8 +54,7 @@ class _Repainting:
         elif image is None:
             self._point_to(self._editor.add_texture(with_alpha_of(rgb, None), {}))
         else:
-            _, alpha = decode(self._model.container.image_bytes(image), "the image")
-            png = with_alpha_of(rgb, alpha)
+            png = with_alpha_of(rgb, decode_alpha(self._model.container.image_bytes(image), "the image"))
             if self._editor.serves_only(image, self._materials):
                 self._editor.replace_image(image, png)
                 self._point_to(None)

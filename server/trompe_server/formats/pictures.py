@@ -1,4 +1,4 @@
-"""Texture images: decoding within limits, resizing, tinting, conversion of maps.
+"""Texture images: resizing, tinting, conversion of maps.
 
 Colours are sRGB-encoded uint8 in images and linear in [0, 1] as factors.
 """
@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trompe_shared.object3d import decode_alpha, decode_rgb, resized
+from trompe_shared.object3d import resized
 
 Pixels = NDArray[np.uint8]
 
@@ -29,15 +29,10 @@ def encode_srgb(linear: ArrayLike) -> Pixels:
     return np.asarray(np.rint(255 * encoded), np.uint8)
 
 
-def decode(data: bytes, name: str) -> tuple[Pixels, Pixels | None]:
-    """Colours (H, W, 3) and alpha (H, W) or ``None``. Raises ``ObjectError``."""
-    return decode_rgb(data, name), decode_alpha(data, name)
-
-
-def shrink(pixels: Pixels, side: int | None) -> Pixels:
+def shrink(pixels: Pixels, side: int) -> Pixels:
     """The image with its longer side at most ``side``."""
     height, width = pixels.shape[:2]
-    if side is None or max(height, width) <= side:
+    if max(height, width) <= side:
         return pixels
     size = max(1, round(width * side / max(height, width))), max(1, round(height * side / max(height, width)))
     return resized(pixels, size)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_server.formats.assembly import DEFAULT_COLOUR, free_name, painted_flat, repainted, safe_name
-from trompe_server.formats.pictures import decode, shrink
+from trompe_server.formats.pictures import shrink
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import PICTURE_SUFFIXES, encoding_of, libraries, library_names, named, text_of
@@ -54,10 +54,9 @@ def shrunk(obj: Object3D, side: int | None) -> Object3D:
         return obj
     files = dict(obj.files)
     for name in obj.maps:
-        rgb, alpha = decode(files[name], name)
-        small = shrink(rgb, side)
-        if small is not rgb:
-            files[name] = encode_png(small) if alpha is None else with_alpha_of(small, shrink(alpha, side))
+        rgb, alpha = decode_rgb(files[name], name), decode_alpha(files[name], name)
+        if (small := shrink(rgb, side)) is not rgb:
+            files[name] = with_alpha_of(small, alpha)
     return obj if files == obj.files else object_from_files(files)
 
 
