@@ -81,7 +81,7 @@ class Model:
         """Unwrap the shapes without texture coordinates; those of one material share a texture."""
         needy: dict[int | None, list[Key]] = {}
         for key, shape in self.shapes.items():
-            if _needs_unwrapping(shape, self._material(shape.material)):
+            if _needs_unwrapping(shape, self.container.material(shape.material)):
                 needy.setdefault(shape.material, []).append(key)
         for index, keys in needy.items():
             shapes = [self.shapes[key] for key in keys]
@@ -97,11 +97,8 @@ class Model:
             picture = flat_picture(slot.factor, size)
         self.slots[slot] = self._new_file(f"{self._material_name(index)}_albedo.png", _albedo_png(picture, None, slot))
 
-    def _material(self, index: int | None) -> Material:
-        return Material() if index is None else at(self.container.document.materials, index, "material")
-
     def _slot(self, index: int | None, *, unwrapped: bool) -> Slot:
-        material = self._material(index)
+        material = self.container.material(index)
         red, green, blue, opacity = material.pbr.base_color_factor
         alpha = {"OPAQUE": None, "MASK": (opacity, material.alpha_cutoff), "BLEND": KEPT}[material.alpha_mode]
         info = material.pbr.base_color_texture
@@ -126,14 +123,14 @@ class Model:
         if key not in self._names:
             wanted = self._material_name(shape.material) + ("_unwrapped" if key[1] else "")
             self._names[key] = free_name(wanted, self._names.values())
-            material = self._material(shape.material)
+            material = self.container.material(shape.material)
             opacity = material.pbr.base_color_factor[3] if material.alpha_mode == "BLEND" else None
             maps = self._names[key], self.slots[slot], self._normal(material), self._metallic(material)
             self.materials[self._names[key]] = Maps(*maps, opacity)
 
     def _material_name(self, index: int | None) -> str:
         default = "default" if index is None else f"material_{index}"
-        return safe_name(self._material(index).name or default, default=default)
+        return safe_name(self.container.material(index).name or default, default=default)
 
     def _add_albedo(self, slot: Slot, material: str) -> str:
         if slot.image is None:
@@ -191,7 +188,7 @@ class Model:
     def _place(self, shape: Shape, instance: Instance) -> tuple[Part, ...]:
         """The shape at the place of an instance; both sides if the material is double-sided."""
         part = placed(shape, instance, self._names[shape.material, shape.cut is not None])
-        if not self._material(shape.material).double_sided:
+        if not self.container.material(shape.material).double_sided:
             return (part,)
         return part, replace(part, normals=-part.normals, faces=np.ascontiguousarray(part.faces[:, ::-1]))
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from trompe_server.formats.gltf_schema import READ_EXTENSIONS, Document, Draco, Primitive
+from trompe_server.formats.gltf_schema import READ_EXTENSIONS, Document, Draco, Material, Primitive
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
 from trompe_shared.faults import faults_of
@@ -44,6 +44,10 @@ class Container:
     buffers: tuple[bytes, ...]
     binary: bool
     decompressed: Mapping[int, NDArray[np.generic]] = field(default_factory=dict)
+
+    def material(self, index: int | None) -> Material:
+        """A material, or glTF's default one."""
+        return Material() if index is None else at(self.document.materials, index, "material")
 
     def view(self, index: int) -> bytes:
         """Bytes of a buffer view."""

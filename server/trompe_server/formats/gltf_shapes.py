@@ -48,7 +48,7 @@ def instances(container: Container) -> Iterator[Instance]:
     """Each mesh of the scene. Raises ``ObjectError`` unless the nodes form a tree."""
     document = container.document
     world = _worlds(document)
-    triangles, count_of = 0, cache(partial(_triangles, document))
+    triangles, count_of = 0, cache(partial(_triangles, container))
     for index, matrix in world.items():
         node = document.nodes[index]
         if node.mesh is None:
@@ -98,13 +98,13 @@ def _roots(document: Document) -> Sequence[int]:
     return [index for index in range(len(document.nodes)) if index not in children]
 
 
-def _triangles(document: Document, mesh: int) -> int:
+def _triangles(container: Container, mesh: int) -> int:
     """Approximate number of triangles of a mesh; double-sided ones count twice."""
     count = 0
-    for primitive in at(document.meshes, mesh, "mesh").primitives:
+    for primitive in at(container.document.meshes, mesh, "mesh").primitives:
         source = primitive.attributes.get("POSITION", 0) if primitive.indices is None else primitive.indices
-        corners = at(document.accessors, source, "accessor").count
-        sides = 2 if _material(document, primitive).double_sided else 1
+        corners = at(container.document.accessors, source, "accessor").count
+        sides = 2 if container.material(primitive.material).double_sided else 1
         count += sides * (corners // 3 if primitive.mode == 4 else corners)
     return count
 
@@ -167,14 +167,9 @@ def _faces(container: Container, primitive: Primitive, count: int) -> NDArray[np
     return faces.astype(np.int32)
 
 
-def _material(document: Document, primitive: Primitive) -> Material:
-    return Material() if primitive.material is None else at(document.materials, primitive.material, "material")
-
-
 def _uvs(container: Container, primitive: Primitive) -> NDArray[np.float32] | None:
     """Texture coordinates (V, 2) of the material's maps, v upwards, or ``None``."""
-    document = container.document
-    material = _material(document, primitive)
+    material = container.material(primitive.material)
     if not material.maps:
         which, transform = 0, UvTransform()
     else:
@@ -192,7 +187,7 @@ def _uvs(container: Container, primitive: Primitive) -> NDArray[np.float32] | No
             )
         return None
     uvs = _moved(container.numbers(primitive.attributes[f"TEXCOORD_{which}"], 2), transform)
-    _check_wrapping(document, material, uvs)
+    _check_wrapping(container.document, material, uvs)
     return np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1)
 
 
@@ -230,7 +225,7 @@ def _vertex_colours(container: Container, primitive: Primitive) -> NDArray[np.fl
     index = primitive.attributes["COLOR_0"]
     width = 4 if at(container.document.accessors, index, "accessor").type == "VEC4" else 3
     colours, alpha = np.split(container.numbers(index, width).astype(np.float64), [3], axis=1)
-    material = _material(container.document, primitive)
+    material = container.material(primitive.material)
     if material.alpha_mode != "OPAQUE" and (alpha < 0.999).any():
         raise ObjectError(
             f"Material {material.name or primitive.material!r} has vertex colours with alpha, which is not supported; "
