@@ -12,7 +12,7 @@ from typing import BinaryIO, Final, cast
 from fastapi import Request
 from fastapi.responses import Response, StreamingResponse
 
-from trompe_server.api.problems import problem_response
+from trompe_server.api.problems import RefusedError
 from trompe_server.storage.folders import JobArtifacts
 
 PART: Final = 256 * 2**10
@@ -41,8 +41,7 @@ def send_file(request: Request, artifacts: JobArtifacts, name: str, *, digest: s
     asked = _asked_range(request, size, etag)
     if asked is not None and not 0 <= asked.start < asked.stop:
         detail = f"The file has {size} bytes; the range {request.headers['range']!r} is outside."
-        lengths = {"Content-Range": f"bytes */{size}"}
-        return problem_response(request, 416, code="no-such-range", detail=detail, headers=lengths)
+        raise RefusedError(416, "no-such-range", detail, Content_Range=f"bytes */{size}")
     part = asked or range(size)
     headers |= {"Content-Length": str(len(part)), "Content-Disposition": f'inline; filename="{name}"'}
     if asked is not None:

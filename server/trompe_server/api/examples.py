@@ -1,23 +1,18 @@
 """Examples of the OpenAPI document. A test posts the requests and checks the answers against their schemas."""
 
+from functools import partial
 from typing import Any, Final
 
 Answers = dict[int | str, dict[str, Any]]
 
 
-def found(example: Any) -> Answers:
-    """The answer 200 with this example."""
-    return _answer(200, "Found", example)
+def answer(status: int, description: str, example: Any, **more: Any) -> Answers:
+    """One answer with an example."""
+    return {status: {"description": description, "content": {"application/json": {"example": example}}, **more}}
 
 
-def made(example: Any) -> Answers:
-    """The answer 201 with this example."""
-    return _answer(201, "Created", example)
-
-
-def _answer(status: int, description: str, example: Any) -> Answers:
-    return {status: {"description": description, "content": {"application/json": {"example": example}}}}
-
+found: Final = partial(answer, 200, "Found")
+made: Final = partial(answer, 201, "Created")
 
 JOB_REQUESTS: Final[dict[str, Any]] = {
     "shortest": {

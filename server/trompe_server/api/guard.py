@@ -17,7 +17,7 @@ from fastapi import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from trompe_server.api.middleware import HttpMiddleware
-from trompe_server.api.problems import problem_response
+from trompe_server.api.problems import RefusedError
 from trompe_server.api.rate import RateLimit
 from trompe_server.storage.tokens import Right, Token, Tokens, hash_secret
 
@@ -36,15 +36,6 @@ FRESH: Final = 1.0
 _CREATE: Final = "`trompe token create NAME --right read|write` makes one."
 
 
-class _RefusedError(Exception):
-    """A refused request."""
-
-    def __init__(self, status: int, code: str, detail: str, **headers: str) -> None:
-        super().__init__(detail)
-        self.status, self.code = status, code
-        self.headers = {name.replace("_", "-"): value for name, value in headers.items()}
-
-
 class Guard(HttpMiddleware):
     """Admits requests by token and rate; without tokens, by origin."""
 
@@ -56,27 +47,18 @@ class Guard(HttpMiddleware):
         self._lock = asyncio.Lock()
 
     async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request, or refuse it."""
-        request = Request(scope)
-        try:
-            await self._admit(request)
-        except _RefusedError as refusal:
-            response = problem_response(
-                request, refusal.status, code=refusal.code, detail=str(refusal), headers=refusal.headers
-            )
-            await response(scope, receive, send)
-        else:
-            await self._app(scope, receive, send)
+        await self._admit(Request(scope))
+        await self._app(scope, receive, send)
 
     async def _admit(self, request: Request) -> None:
-        """Raise ``_RefusedError`` for a request to refuse."""
+        """Raise ``RefusedError`` for a request to refuse."""
         path = request.scope["path"]  # not request.url.path: a forged Host header can change it
         address = request.client.host if request.client else "unknown"
         try:
             _check_origin(request)
             is_open = path in OPEN_PATHS or path.startswith(OPEN_FOLDER)
             token = None if is_open else await self._identify(request)
-        except _RefusedError:
+        except RefusedError:
             self._check_rate(address)
             raise
         if path not in UNLIMITED_PATHS:
@@ -99,7 +81,7 @@ class Guard(HttpMiddleware):
     async def _check_right(self, token: Token, request: Request) -> None:
         reads = request.method in READING or request.scope["path"] in STORES_NOTHING
         if not reads and token.right is not Right.write:
-            raise _RefusedError(
+            raise RefusedError(
                 403,
                 "read-only",
                 f"The token {token.name!r} may only read, and {request.method} writes. {_CREATE}",
@@ -111,7 +93,7 @@ class Guard(HttpMiddleware):
     def _check_rate(self, client: str) -> None:
         wait = self._limit.wait(client)
         if wait:
-            raise _RefusedError(
+            raise RefusedError(
                 429,
                 "too-many-requests",
                 f"Too many requests; retry in {wait:.2f} s (limit: TROMPE_RATE_LIMIT).",
@@ -131,7 +113,7 @@ def _secret(request: Request) -> str:
     """The secret in the request's header, or in the cookie of a signed-in browser."""
     if "authorization" not in request.headers and COOKIE in request.cookies:
         if request.method not in READING and "origin" not in request.headers:
-            raise _RefusedError(403, "other-origin", "A browser must send the header Origin with a write.")
+            raise RefusedError(403, "other-origin", "A browser must send the header Origin with a write.")
         return request.cookies[COOKIE]
     scheme, _, secret = request.headers.get("authorization", "").partition(" ")
     if scheme.lower() != "bearer" or not secret:
@@ -153,7 +135,7 @@ def _check_origin(request: Request) -> None:
         return
     host = request.headers.get("host")
     if _split(origin).netloc != host:
-        raise _RefusedError(
+        raise RefusedError(
             403, "other-origin", f"Pages of {origin} may not write at {host}. A proxy must pass on the header Host."
         )
 
@@ -162,7 +144,7 @@ def _check_host(request: Request) -> None:
     """Without tokens, refuse public host names, against DNS rebinding."""
     name = _split(f"//{request.headers.get('host', '')}").hostname or ""
     if "." in name and not _is_address(name):
-        raise _RefusedError(
+        raise RefusedError(
             403, "other-host", f"Without tokens the service answers by its address only, not as {name!r}. {_CREATE}"
         )
 
@@ -171,7 +153,7 @@ def _split(url: str) -> SplitResult:
     try:
         return urlsplit(url)
     except ValueError as error:
-        raise _RefusedError(400, "no-address", f"{url[:80]!r} is not an address ({error}).") from error
+        raise RefusedError(400, "no-address", f"{url[:80]!r} is not an address ({error}).") from error
 
 
 def _is_address(name: str) -> bool:
@@ -182,5 +164,5 @@ def _is_address(name: str) -> bool:
     return True
 
 
-def _unauthorized(detail: str, error: str = "") -> _RefusedError:
-    return _RefusedError(401, "unauthorized", detail, WWW_Authenticate=f'Bearer realm="trompe"{error}')
+def _unauthorized(detail: str, error: str = "") -> RefusedError:
+    return RefusedError(401, "unauthorized", detail, WWW_Authenticate=f'Bearer realm="trompe"{error}')

@@ -3,13 +3,12 @@
 from pathlib import Path
 from typing import Final
 
-from fastapi import APIRouter, Request, Response
-from fastapi.responses import JSONResponse
+from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, generate_latest
 from prometheus_client.multiprocess import MultiProcessCollector
 
 from trompe_server.api import examples
-from trompe_server.api.problems import PROBLEMS, problem_response
+from trompe_server.api.problems import PROBLEMS, RefusedError
 from trompe_server.api.services import ServicesDep
 from trompe_server.queue.store import JobStore
 from trompe_shared.api import RendererInfo, WorkerInfo
@@ -38,13 +37,13 @@ def health() -> dict[str, str]:
 
 
 @router.get("/readyz", tags=["health"], responses=examples.found({"status": "ready"}))
-def readiness(services: ServicesDep, request: Request) -> Response:
+def readiness(services: ServicesDep) -> dict[str, str]:
     """Database, worker and renderer are up; 503 names the missing ones."""
     services.store.page(limit=1)
     missing = services.missing()
     if missing:
-        return problem_response(request, 503, code="not-ready", detail="; ".join(missing))
-    return JSONResponse({"status": "ready"})
+        raise RefusedError(503, "not-ready", "; ".join(missing))
+    return {"status": "ready"}
 
 
 @router.get(

@@ -6,7 +6,7 @@ An experiment is the jobs with the label ``experiment=<name>``.
 import re
 from collections.abc import Mapping
 from pathlib import PurePath
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from fastapi import APIRouter, Body, Header, Query, Request
 from fastapi.responses import Response, StreamingResponse
@@ -38,14 +38,8 @@ experiments = APIRouter(prefix="/v1/experiments", tags=["experiments"], response
 
 RESULT: Final = "result.json"
 
-NEW_OR_KNOWN: Final[dict[int | str, dict[str, Any]]] = {
-    200: {
-        **examples.found(examples.JOB)[200],
-        "model": Job,
-        "description": "The job of an earlier request with the same key",
-    },
-    **examples.made(examples.JOB),
-}
+KNOWN: Final = "The job of an earlier request with the same key"
+NEW_OR_KNOWN: Final = examples.answer(200, KNOWN, examples.JOB, model=Job) | examples.made(examples.JOB)
 
 AskedJob = Annotated[JobRequest, Body(openapi_examples=examples.JOB_REQUESTS)]
 IdempotencyKey = Annotated[

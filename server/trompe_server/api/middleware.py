@@ -14,7 +14,7 @@ from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from trompe_server.api.problems import failure_response, problem_response
+from trompe_server.api.problems import RefusedError, failure_response
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +46,6 @@ class HttpMiddleware:
         await (self.serve if scope["type"] == "http" else self._app)(scope, receive, send)
 
     async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
         raise NotImplementedError
 
 
@@ -168,8 +167,7 @@ class BodyLimit(HttpMiddleware):
         refusal = f"The {what} is larger than {limit / 2**20:g} MiB, {whose}."
         announced = dict(scope["headers"]).get(b"content-length", b"0")
         if announced.isdigit() and int(announced) > limit:
-            await problem_response(Request(scope), 413, code="too-large", detail=refusal)(scope, receive, send)
-            return
+            raise RefusedError(413, "too-large", refusal)
         received = 0
 
         async def receive_within_limit() -> Message:

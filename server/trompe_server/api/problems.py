@@ -52,6 +52,15 @@ PROBLEMS: Final[dict[int | str, dict[str, Any]]] = {
 """Documentation of errors, for all routes."""
 
 
+class RefusedError(Exception):
+    """A refused request. ``code``: as of ``problem_response``. ``headers``: of the answer, with ``_`` for ``-``."""
+
+    def __init__(self, status: int, code: str, detail: str, **headers: str) -> None:
+        super().__init__(detail)
+        self.status, self.code = status, code
+        self.headers = {name.replace("_", "-"): value for name, value in headers.items()}
+
+
 def answer_with_problems(app: FastAPI) -> None:
     """Make ``app`` answer its refusals with problem details. ``Envelope`` does so with all other errors."""
     app.add_exception_handler(RequestValidationError, _validation_error)
@@ -62,8 +71,8 @@ def problem_response(
     request: Request,
     status: int,
     *,
+    detail: str,
     code: str | None = None,
-    detail: str | None = None,
     errors: list[dict[str, Any]] | None = None,
     headers: Mapping[str, str] | None = None,
 ) -> JSONResponse:
@@ -113,7 +122,9 @@ def _methods(request: Request) -> str:
 
 
 def failure_response(request: Request, error: Exception) -> JSONResponse:
-    """Answer to an exception: an error of ours, a full disk, a database that is down, or a bug."""
+    """Answer to an exception: a refusal, an error of ours, a full disk, a database that is down, or a bug."""
+    if isinstance(error, RefusedError):
+        return problem_response(request, error.status, code=error.code, detail=str(error), headers=error.headers)
     if _is_disk_full(error):
         return _disk_full(request, error)
     if isinstance(error, PoolTimeoutError):
