@@ -59,7 +59,6 @@ class JobStore:
         upgrade(self.engine)
 
     def close(self) -> None:
-        """Close the connections to the database."""
         self.engine.dispose()
 
     def create(
@@ -72,24 +71,23 @@ class JobStore:
         """
         row = _row(request, names or {}, idempotency_key)
         try:
-            with write(self.engine) as connection:
-                return self._create(connection, request, row)
+            return self._create(request, row)
         except IntegrityError:  # a request with the same key created the job meanwhile
-            with write(self.engine) as connection:
-                return self._create(connection, request, row)
+            return self._create(request, row)
 
-    def _create(self, connection: sa.Connection, request: AnyRequest, values: dict[str, Any]) -> tuple[Job, bool]:
+    def _create(self, request: AnyRequest, values: dict[str, Any]) -> tuple[Job, bool]:
         key = values["idempotency_key"]
-        if key is not None:
-            known = connection.execute(sa.select(jobs).where(jobs.c.idempotency_key == key)).one_or_none()
-            if known is not None:
-                return _the_same(job_of(known), request, key), False
-        row = connection.execute(jobs.insert().values(values).returning(jobs)).one()
-        if request.labels:
-            pairs = [{"key": name, "value": value, "number": row.number} for name, value in request.labels.items()]
-            connection.execute(labels.insert(), pairs)
-        append_event(connection, row, "queued")
-        return job_of(row), True
+        with write(self.engine) as connection:
+            if key is not None:
+                known = connection.execute(sa.select(jobs).where(jobs.c.idempotency_key == key)).one_or_none()
+                if known is not None:
+                    return _the_same(job_of(known), request, key), False
+            row = connection.execute(jobs.insert().values(values).returning(jobs)).one()
+            if request.labels:
+                pairs = [{"key": name, "value": value, "number": row.number} for name, value in request.labels.items()]
+                connection.execute(labels.insert(), pairs)
+            append_event(connection, row, "queued")
+            return job_of(row), True
 
     def get(self, job: str) -> Job:
         """The job with this id. Raises ``NotFoundError``."""
@@ -140,7 +138,6 @@ class JobStore:
         ]
 
     def counts(self) -> dict[JobState, int]:
-        """Number of jobs by state."""
         query = sa.select(jobs.c.state, sa.func.count().label("amount")).group_by(jobs.c.state)
         with self.engine.connect() as connection:
             found = {row.state: row.amount for row in connection.execute(query)}
@@ -240,12 +237,8 @@ def _network(request: AnyRequest) -> str:
 
 def _the_same(job: Job, request: AnyRequest, key: str) -> Job:
     """Return ``job``; raise ``ConflictError`` if ``request`` asks for another one."""
-    if (job.spec, job.priority, job.labels, job.needs) != (
-        request.spec(),
-        request.priority,
-        request.labels,
-        request.needs,
-    ):
+    asked = (request.spec(), request.priority, request.labels, request.needs)
+    if (job.spec, job.priority, job.labels, job.needs) != asked:
         raise ConflictError(
             f"The idempotency key {key!r} was used with another request (job {job.id}). "
             "Use a new key for a new request."

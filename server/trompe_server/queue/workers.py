@@ -27,7 +27,6 @@ class Worker:
 
 
 def record_workers(engine: sa.Engine, living: Sequence[Worker]) -> None:
-    """Record the workers that live now."""
     with write(engine) as connection:
         for worker in living:
             entry = asdict(worker) | {"seen": clock()}

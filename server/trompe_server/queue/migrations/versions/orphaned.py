@@ -7,5 +7,4 @@ revision, down_revision = "4", "3"
 
 
 def upgrade() -> None:
-    """Add the column ``orphaned``."""
     op.add_column("jobs", sa.Column("orphaned", sa.Integer, nullable=False, server_default="0"))

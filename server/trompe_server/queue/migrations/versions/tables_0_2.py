@@ -7,7 +7,6 @@ revision, down_revision = "1", None
 
 
 def upgrade() -> None:
-    """Create all tables."""
     number = sa.BigInteger().with_variant(sa.Integer, "sqlite")
     op.create_table(
         "jobs",
