@@ -17,6 +17,7 @@ from trompe_server.executor.process import READY, Setup, ending, fork
 from trompe_server.queue.claims import Claim
 from trompe_server.queue.workers import Worker
 from trompe_server.settings import Settings
+from trompe_server.system.memory import GIB
 from trompe_shared.api import Needs
 
 logger = logging.getLogger(__name__)
@@ -34,7 +35,8 @@ class LocalExecutor:
     def __init__(self, setup: Setup) -> None:
         settings = setup.settings
         gpu = float(settings.device.startswith("cuda"))
-        self._room = Needs(cpu=settings.workers, gpu=gpu, memory=_memory())
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GIB
+        self._room = Needs(cpu=settings.workers, gpu=gpu, memory=memory)
         self._device = settings.device
         shutil.rmtree(settings.metrics_folder, ignore_errors=True)
         settings.metrics_folder.mkdir(parents=True)
@@ -100,7 +102,6 @@ class _Slot:
             theirs.close()
 
     def run(self, claim: Claim) -> None:
-        """Start an attempt."""
         self.claim = claim
         try:
             self.connection.send(claim)
@@ -163,8 +164,3 @@ def _environment(settings: Settings) -> dict[str, str]:
         "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(threads)),
         "PROMETHEUS_MULTIPROC_DIR": str(settings.metrics_folder),
     }
-
-
-def _memory() -> float:
-    """GiB of this machine."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30

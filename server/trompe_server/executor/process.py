@@ -38,7 +38,8 @@ def fork(connection: Connection, environment: Mapping[str, str], setup: Setup) -
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["trompe_server.executor.preload"])
     process = context.Process(target=run_attempts, args=(connection, environment, setup), daemon=True)
-    with _FORKING, _added(_modules(setup.settings) | dict(environment)):
+    found = {"PYTHONPATH": os.pathsep.join(sys.path), "PYTHONSAFEPATH": "1"}  # the modules that we see
+    with _FORKING, _added({**found, "TROMPE_PIPELINE": setup.settings.pipeline, **environment}):
         process.start()
     return process
 
@@ -62,15 +63,6 @@ def run_attempts(connection: Connection, environment: Mapping[str, str], setup: 
         except EOFError:
             os._exit(0)
         connection.send(attempts.run(claim))
-
-
-def _modules(settings: Settings) -> dict[str, str]:
-    """Environment in which the fork server finds the modules that it imports: those that we see."""
-    return {
-        "PYTHONPATH": os.pathsep.join(sys.path),
-        "PYTHONSAFEPATH": "1",
-        "TROMPE_PIPELINE": settings.pipeline,
-    }
 
 
 def ending(status: int | None) -> str:

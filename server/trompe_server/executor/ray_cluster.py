@@ -20,6 +20,7 @@ from trompe_server.executor.task import run_task
 from trompe_server.queue.claims import Claim
 from trompe_server.queue.workers import Worker
 from trompe_server.storage.folders import open_folder
+from trompe_server.system.memory import GIB
 from trompe_shared.addresses import host_and_port
 from trompe_shared.api import Needs
 
@@ -42,7 +43,6 @@ MOST_DEMANDED: Final = 1000
 """Jobs of one kind of needs that the autoscaler is told at most."""
 OBJECT_STORE: Final = 80 * 2**20
 """Bytes of Ray's object store on one machine; attempts pass nothing through it."""
-GIB: Final = 2**30
 
 
 @dataclass
