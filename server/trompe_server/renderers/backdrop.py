@@ -4,15 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from trompe_server.renderers.protocol import OnFrame, TargetRenderer
+from trompe_server.renderers.protocol import Images, OnFrame, TargetRenderer
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
-
-Images = NDArray[np.uint8]
 
 
 def fitted(picture: Images, size: tuple[int, int]) -> Images:
@@ -31,7 +28,6 @@ class BackdropTarget:
 
     @property
     def engine(self) -> EngineInfo:
-        """Engine of the inner renderer."""
         return self._target.engine
 
     def render(
@@ -51,7 +47,6 @@ class BackdropTarget:
         return images
 
     def close(self) -> None:
-        """Close the inner renderer."""
         self._target.close()
 
 

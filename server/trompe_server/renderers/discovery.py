@@ -8,12 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from trompe_server.renderers.choice import listed
-from trompe_server.renderers.pool import RendererPool
-from trompe_server.renderers.protocol import OnFrame, TargetRenderer
+from trompe_server.renderers.pool import Address, RendererPool
+from trompe_server.renderers.protocol import Images, OnFrame, TargetRenderer
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, RendererLostError
 from trompe_shared.geometry import View
@@ -21,8 +18,6 @@ from trompe_shared.object3d import Object3D
 from trompe_shared.sailenv_client import SailenvTarget, engine_at
 
 logger = logging.getLogger(__name__)
-
-Address = tuple[str, int]
 
 RESOLVE_INTERVAL: Final = 10.0
 """Seconds between two resolutions of a name: renderers come and go."""
@@ -75,14 +70,13 @@ class DiscoveredRenderers:
 
     def render(
         self, obj: Object3D, views: Sequence[View], *, size: tuple[int, int], on_frame: OnFrame | None = None
-    ) -> NDArray[np.uint8]:
+    ) -> Images:
         """Render with the current renderers. Arguments as in ``TargetRenderer.render``."""
         if time.monotonic() - self._looked > RESOLVE_INTERVAL:
             self._look()
         return self._target.render(obj, views, size=size, on_frame=on_frame)
 
     def close(self) -> None:
-        """Close the connections to all renderers."""
         self._target.close()
 
     def _look(self) -> None:

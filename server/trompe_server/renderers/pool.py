@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from trompe_server.renderers.protocol import OnFrame
+from trompe_server.renderers.protocol import Images, OnFrame
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, RendererLostError
 from trompe_shared.geometry import View
@@ -23,7 +22,6 @@ from trompe_shared.sailenv_client import SailenvTarget, engine_at
 logger = logging.getLogger(__name__)
 
 Address = tuple[str, int]
-Images = NDArray[np.uint8]
 
 SHARE: Final = (4, 8)
 """Fewest and most views per share: enough to pay for an upload, few enough for all workers to finish together."""
@@ -81,7 +79,6 @@ class RendererPool:
 
     @property
     def engine(self) -> EngineInfo:
-        """See ``TargetRenderer.engine``."""
         with self._engine_lock:
             if self._engine is None:
                 self._engine = self._first_engine()

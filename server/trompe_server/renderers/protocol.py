@@ -10,6 +10,8 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
+Images = NDArray[np.uint8]
+"""(views, H, W, 3), or one image without the first axis."""
 OnFrame = Callable[[], None]
 
 
@@ -23,7 +25,7 @@ class TargetRenderer(Protocol):
 
     def render(
         self, obj: Object3D, views: Sequence[View], *, size: tuple[int, int], on_frame: OnFrame | None = None
-    ) -> NDArray[np.uint8]:
+    ) -> Images:
         """Images of ``obj``, (views, H, W, 3) uint8, sRGB, row 0 on top, not mirrored; ``size`` is (H, W).
 
         on_frame: called after each image, for progress bars. Raises ``RendererError`` if the renderer cannot be reached

@@ -85,7 +85,6 @@ def in_words(finding: Finding) -> str:
 
 
 def in_json(findings: Sequence[Finding]) -> str:
-    """All findings as JSON."""
     return json.dumps({"ok": all(each.ok for each in findings), "findings": [asdict(each) for each in findings]})
 
 

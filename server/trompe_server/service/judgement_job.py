@@ -24,11 +24,9 @@ class JudgementJob:
         self._sources = StoredSources(artifacts=artifacts, **sources)
 
     def phases(self) -> list[str]:
-        """See ``PhasedJob.phases``."""
         return [PHASE]
 
     def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
-        """See ``PhasedJob.run``."""
         began = time.perf_counter()
         judged = judge_files(self._spec, self._sources, kept=self._artifacts, on_progress=on_progress)
         manifest, files = written(judged, seconds=time.perf_counter() - began)

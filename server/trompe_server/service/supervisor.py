@@ -15,7 +15,8 @@ from contextlib import suppress
 from typing import IO, Final
 
 from trompe_server.errors import ServiceError
-from trompe_server.renderers.discovery import MAX_PROBES, Address, RendererAddresses
+from trompe_server.renderers.discovery import MAX_PROBES, RendererAddresses
+from trompe_server.renderers.pool import Address
 from trompe_server.settings import Settings
 from trompe_shared.api import RendererInfo
 from trompe_shared.errors import RendererError
@@ -147,7 +148,6 @@ class Supervisor:
             renderer.wait_ready(deadline)
 
     def close(self) -> None:
-        """End all children."""
         with ThreadPoolExecutor(max(1, len(self._renderers))) as pool:
             list(pool.map(_Renderer.stop, self._renderers))
 

@@ -4,5 +4,4 @@ from importlib.metadata import version
 
 
 def versions() -> dict[str, str]:
-    """Versions by package."""
     return {name: version(name) for name in ("trompe", "torch", "numpy", "pyrender", "onnxruntime")}
