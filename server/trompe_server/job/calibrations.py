@@ -3,7 +3,6 @@
 import logging
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -48,7 +47,6 @@ class JobCalibrations:
         return [self._files.load_calibration(number) for number in range(len(self._setup.attacked))]
 
     def surrogate(self, number: int, calibration: Calibration, clean: Image8) -> Surrogate:
-        """The surrogate of an attacked renderer."""
         setup = self._setup
         self._prepare_geometry(calibration.sampling)
         return build_surrogate(
@@ -94,8 +92,7 @@ class JobCalibrations:
             return
         setup = self._setup
         executor = ThreadPoolExecutor(1, thread_name_prefix="rasterise")
-        prepare = partial(
+        self._geometries[sampling] = executor.submit(
             prepare_geometry, setup.obj, setup.views, size=setup.size, sampling=sampling, device=setup.device
         )
-        self._geometries[sampling] = executor.submit(prepare)
         executor.shutdown(wait=False)

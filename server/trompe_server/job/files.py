@@ -18,6 +18,7 @@ T = TypeVar("T")
 
 OPEN: Final = "open"
 """Kind of the time before and between phases."""
+_HASH: Final = hashlib.sha256().digest_size
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,9 @@ class JobFiles:
 
     @property
     def phases(self) -> list[str]:
-        """Names of the phases."""
         return ["prepare", "calibrate", *(f"attack-{chunk:03d}" for chunk in range(self.chunks)), "judge"]
 
     def save(self, name: str, **arrays: NDArray[Any]) -> None:
-        """Save arrays under ``name``."""
         self._seal(name, pack_arrays(arrays))
 
     def load(self, name: str) -> dict[str, NDArray[Any]]:
@@ -97,16 +96,13 @@ class JobFiles:
 
     def save_look(self, chunk: int, arrays: Mapping[str, NDArray[Any]], *, views: int, renders: int) -> None:
         """Save what a look at further views found before a chunk, and its number of added ``views`` and images."""
-        self._write(f"{_LOOK}-{chunk:03d}", {"views": views, "renders": renders})
-        self.save(f"{_LOOK}-{chunk:03d}", **arrays)
+        self._write(_look(chunk), {"views": views, "renders": renders})
+        self.save(_look(chunk), **arrays)
 
-    def has_look(self, chunk: int) -> bool:
-        """Whether there was a look before a chunk."""
-        return self.artifacts.exists(f"{_LOOK}-{chunk:03d}.npz")
-
-    def load_look(self, chunk: int) -> dict[str, NDArray[Any]]:
-        """The arrays of ``save_look``. Raises ``DamagedFileError``."""
-        return self.load(f"{_LOOK}-{chunk:03d}")
+    def load_looks(self, chunk: int) -> dict[int, dict[str, NDArray[Any]]]:
+        """The arrays of the looks before earlier chunks than ``chunk``, by theirs. Raises ``DamagedFileError``."""
+        taken = [earlier for earlier in range(chunk) if self.artifacts.exists(f"{_look(earlier)}.npz")]
+        return {earlier: self.load(_look(earlier)) for earlier in taken}
 
     def note_seconds(self, phase: str, seconds: float) -> None:
         """Record the duration of a phase, or of what came before it since the phase before (``open-<phase>``)."""
@@ -135,7 +131,7 @@ class JobFiles:
         spent = [each for each in found if each is not None]
         queries = sum(each["queries"] for each in spent)
         evaluations = spent[-1]["evaluations"] + (self._read("shown-before") or 0) if spent else None
-        looks = [look for chunk in range(self.chunks) if (look := self._read(f"{_LOOK}-{chunk:03d}")) is not None]
+        looks = [look for chunk in range(self.chunks) if (look := self._read(_look(chunk))) is not None]
         added, renders = (sum(look[name] for look in looks) for name in ("views", "renders"))
         return Spent(sum(each["steps"] for each in spent), evaluations, queries or None, added, renders)
 
@@ -166,5 +162,5 @@ class JobFiles:
             return None
 
 
-_LOOK: Final = "look"
-_HASH: Final = hashlib.sha256().digest_size
+def _look(chunk: int) -> str:
+    return f"look-{chunk:03d}"

@@ -69,8 +69,7 @@ class GrowingPool:
     def load(self, chunk: int) -> None:
         """Take up the looks before ``chunk``. Raises ``DamagedFileError``."""
         if not self._loaded:
-            taken = [earlier for earlier in range(chunk) if self._files.has_look(earlier)]
-            self._looks = {earlier: self._opened(self._files.load_look(earlier)) for earlier in taken}
+            self._looks = {earlier: self._opened(found) for earlier, found in self._files.load_looks(chunk).items()}
             self._loaded = True
         self._looks = {earlier: look for earlier, look in self._looks.items() if earlier < chunk}
 

@@ -103,7 +103,6 @@ class JobSetup:
 
     @property
     def attacked(self) -> tuple[JobRenderer, ...]:
-        """The attacked renderers."""
         return tuple(renderer for renderer in self.renderers if renderer.attacked)
 
     @property

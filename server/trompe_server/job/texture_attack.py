@@ -114,11 +114,9 @@ class TextureAttack:
         self._scenes: dict[tuple[View, ...], tuple[AnySurrogate, Backgrounds | None, TexelMasks]] = {}
 
     def phases(self) -> list[str]:
-        """See ``PhasedJob.phases``."""
         return self.files.phases
 
     def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
-        """See ``PhasedJob.run``."""
         kind, _, number = phase.partition("-")
         self._counts.clear()
         self._running = kind, time.perf_counter()

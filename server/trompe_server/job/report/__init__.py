@@ -3,12 +3,12 @@
 from collections.abc import Callable, Mapping, Sequence
 
 from trompe_server.job.protocol import VIEWS_AFTER, VIEWS_BEFORE, Artifacts, numbered
-from trompe_server.job.report.data import Images, ReportData
+from trompe_server.job.report.data import ReportData
 from trompe_server.job.report.models import model_files
 from trompe_server.job.report.pictures import picture_files, saliency_views
 from trompe_server.job.report.result import result_of, worst
 
-__all__ = ["Images", "ReportData", "saliency_views", "worst", "write_report"]
+__all__ = ["ReportData", "saliency_views", "worst", "write_report"]
 
 
 def write_report(

@@ -45,7 +45,6 @@ class ReportData:
 
     @property
     def renderer(self) -> JobRenderer:
-        """The renderer."""
         return self.setup.renderers[self.number]
 
     @cached_property
