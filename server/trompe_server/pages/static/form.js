@@ -1,5 +1,5 @@
 // Shared by the forms: uploads at once, faults beside their fields, one job for one request.
-import { Refused, answered, ask, words } from "./common.js";
+import { answered, ask, words } from "./common.js";
 
 const form = document.getElementById("new");
 const button = form.querySelector("button.button");
@@ -14,14 +14,12 @@ function keyOf(body) {
 export function complain(error, fallback = "") {
   for (const place of form.querySelectorAll("[data-error]")) place.hidden = true;
   if (!error) return;
-  const problems = error instanceof Refused && error.problem.errors?.length
-    ? error.problem.errors.map((each) => [String(each.field ?? each.loc?.at(-1) ?? ""), each.message ?? each.msg ?? ""])
-    : [[fallback, words(error)]];
-  for (const [field, text] of problems) {
+  const faults = error.problem?.errors ?? [{ field: fallback, message: words(error) }];
+  for (const { field, message } of faults) {
     const known = [...form.querySelectorAll("[data-error]")].find(
       (each) => each.dataset.error && each.dataset.error.split(" ").some((name) => `${field}.`.startsWith(`${name}.`) || name.startsWith(`${field}.`)));
     const place = known ?? form.querySelector('[data-error=""]');
-    place.textContent = known || !field ? text : `${field}: ${text}`;
+    place.textContent = known || !field ? message : `${field}: ${message}`;
     place.hidden = false;
   }
 }

@@ -70,15 +70,10 @@ function check() {
 }
 
 file.onchange = () => take(file.files[0]);
-for (const name of ["dragenter", "dragover"])
+for (const name of ["dragenter", "dragover", "dragleave", "drop"])
   drop.addEventListener(name, (event) => {
     event.preventDefault();
-    drop.classList.add("over");
-  });
-for (const name of ["dragleave", "drop"])
-  drop.addEventListener(name, (event) => {
-    event.preventDefault();
-    drop.classList.remove("over");
+    drop.classList.toggle("over", name === "dragenter" || name === "dragover");
   });
 drop.addEventListener("drop", ({ dataTransfer: { files, items } }) => {
   const many = files.length > 1 || items[0]?.webkitGetAsEntry()?.isDirectory;

@@ -40,8 +40,7 @@ class Stage {
   // `onShare` is told what is loaded, in words.
   static async open(given, onShare) {
     onShare("Loading three.js");
-    const modules = [import(given.files.three), import(given.files.lights)];
-    const [THREE, lights] = await Promise.all(modules);
+    const [THREE, lights] = await Promise.all([import(given.files.three), import(given.files.lights)]);
     const loaded = [0, 0];
     const models = await Promise.all([given.models.before, given.models.after].map(async (address, side) => {
       const data = await download(address, (bytes) => {
