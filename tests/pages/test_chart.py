@@ -17,7 +17,7 @@ def point(object: str, configuration: str, seconds: float, drop: float) -> Point
 
 
 def drawn(*points: Point) -> Any:
-    return chart(points, measure="A_drop")
+    return chart(points)
 
 
 def test_a_job_on_an_easy_object_does_not_beat_jobs_on_a_hard_one() -> None:

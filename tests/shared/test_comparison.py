@@ -104,6 +104,6 @@ def test_a_page_and_a_report_show_the_same_front_for_the_same_jobs() -> None:
             options = asked | {"object": object, "image_size": "128x128", "views": 60}
             rows.append(ResultRow.model_validate(place | options | found))
     report = [f"{mean.drop:.3f} in {mean.cost:.1f} s" for mean in pareto_front(configurations(rows))]
-    page = chart(points_of(entries, differing_options(entries)), measure="A_drop")
+    page = chart(points_of(entries, differing_options(entries)))
     assert report == ["0.495 in 20.0 s", "0.595 in 47.5 s"]
     assert [words.partition("A_drop ")[2] for words in page.best] == ["0.49 in 20 s", "0.59 in 48 s"]

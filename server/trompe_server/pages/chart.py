@@ -40,13 +40,12 @@ class Chart:
     x_ticks: Sequence[dict[str, Any]]
     y_ticks: Sequence[dict[str, Any]]
     looks: Mapping[str, str]
-    measure: str
 
 
-def chart(points: Sequence[Point], *, measure: str) -> Chart:
-    """The chart of finished jobs. ``measure`` names their drop."""
+def chart(points: Sequence[Point]) -> Chart:
+    """The chart of finished jobs."""
     if not points:
-        return Chart((), (), (), (), "", (), (), {}, measure)
+        return Chart((), (), (), (), "", (), (), {})
     jobs = charged(point.job for point in points)
     marks = _marks(min(job.cost for job in jobs), max(job.cost for job in jobs))
     low, high = marks[0], marks[-1]
@@ -77,7 +76,6 @@ def chart(points: Sequence[Point], *, measure: str) -> Chart:
         x_ticks=[{"at": x(value), "text": f"{value:g}"} for value in marks],
         y_ticks=[{"at": y(value / 5), "text": f"{value / 5:.1f}"} for value in range(math.ceil(5 * bottom), 6)],
         looks=looks,
-        measure=measure,
     )
 
 

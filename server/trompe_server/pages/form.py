@@ -21,7 +21,6 @@ class Field:
 
 
 def form_fields() -> dict[str, Field]:
-    """The form's fields by keyword."""
     return {keyword: field_of(option) for keyword, option in OPTIONS.items() if option.in_form}
 
 

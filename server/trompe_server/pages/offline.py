@@ -55,15 +55,15 @@ def offline_page(services: Services, job: Job, row: JobRow, shown: Shown) -> str
 
 def _pictured(services: Services, job: Job, views: Sequence[Record]) -> list[Record]:
     """Records of the views with their images inside; of many views, some at equal steps."""
-    artifacts, step, number = services.artifacts(job.id), 1, 0
-    pictured: list[Record] = []
-    while number < len(views):
-        before, after = (_image(artifacts, views[number][side]) for side in ("before", "after"))
-        if number == 0:
-            step = -(-len(views) * (len(before) + len(after)) // PICTURE_BYTES)
-        pictured.append({**views[number], "before": before, "after": after, "difference": None})
-        number += step
-    return pictured
+    artifacts = services.artifacts(job.id)
+
+    def pictured(view: Record) -> Record:
+        images = {side: _image(artifacts, view[side]) for side in ("before", "after")}
+        return {**view, **images, "difference": None}
+
+    first = pictured(views[0])
+    step = -(-len(views) * (len(first["before"]) + len(first["after"])) // PICTURE_BYTES)
+    return [first, *map(pictured, views[step::step])]
 
 
 def _image(artifacts: JobArtifacts, path: str) -> str:

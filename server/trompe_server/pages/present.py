@@ -80,7 +80,6 @@ class JobRow(Job):
 
     @property
     def live(self) -> bool:
-        """Whether the job has not ended."""
         return not self.state.final
 
     @property
@@ -119,7 +118,6 @@ class JobRow(Job):
 
     @property
     def percent(self) -> int:
-        """Progress in per cent."""
         return round(100 * self.progress.fraction)
 
     @property
@@ -213,14 +211,9 @@ def _views(views: Sequence[ViewPrediction], result: Result, names: ClassNames, p
 def viewer_record(view: ViewPrediction, labels: Sequence[int], names: ClassNames, place: str) -> dict[str, Any]:
     """One view for the viewer; the addresses of its pictures begin with ``place``."""
     attacked, known = view.after is not None, view.before in labels
-    after, confidence, truth = (
-        (view.after, view.after_confidence, view.after_true_confidence)
-        if attacked
-        else (view.before, view.before_confidence, view.before_true_confidence)
-    )
-    assert after is not None
-    assert confidence is not None
-    assert truth is not None
+    after = view.before if view.after is None else view.after
+    confidence = view.before_confidence if view.after_confidence is None else view.after_confidence
+    truth = view.before_true_confidence if view.after_true_confidence is None else view.after_true_confidence
     return {
         "before": f"{place}/before.png",
         "after": f"{place}/{'after' if attacked else 'before'}.png",

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import re
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -58,7 +59,6 @@ Label = Annotated[str, Query(max_length=264)]
 
 @router.get("/")
 def home(request: Request, services: ServicesDep) -> HTMLResponse:
-    """Example, latest jobs and explanation."""
     return page(request, "home.html", gallery=GALLERY, rows=_rows(services, limit=LATEST)[0])
 
 
@@ -66,7 +66,6 @@ def home(request: Request, services: ServicesDep) -> HTMLResponse:
 def jobs(
     request: Request, services: ServicesDep, state: State = "", label: Label = "", cursor: Cursor = None
 ) -> HTMLResponse:
-    """The list of jobs."""
     rows, older = _rows(services, state=state, label=label, cursor=cursor)
     filters = {"state": state, "label": label}
     # Older pages show the same jobs, updated.
@@ -76,8 +75,7 @@ def jobs(
         "jobs.html",
         rows=rows,
         filters=filters,
-        states=[each.value for each in JobState],
-        counts={state.value: n for state, n in services.store.counts().items()},
+        counts=services.store.counts(),
         stream=stream,
         first=cursor is None,
         newest=_list_url(filters),
@@ -103,7 +101,6 @@ def follow_list(
 
 @router.get("/jobs/new")
 def new_job(request: Request, services: ServicesDep) -> HTMLResponse:
-    """The form of a new job."""
     return page(
         request,
         "new.html",
@@ -143,7 +140,6 @@ router.get("/jobs/turntable/{reference}.png")(turntable)
 def compare(
     request: Request, services: ServicesDep, job: Annotated[list[str], Query(min_length=2, max_length=MOST_COMPARED)]
 ) -> HTMLResponse:
-    """Several results side by side."""
     names, sides, asked, results = Names(services.library), [], [], []
     for each in job:
         found = services.store.get(each)
@@ -159,7 +155,6 @@ def compare(
 
 @router.get("/jobs/{job}")
 def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
-    """One job: its progress, or its result."""
     found = services.store.get(job)
     row, result = _row(services, found), _result(services, found)
     if result is None:
@@ -172,8 +167,7 @@ def show_job(request: Request, services: ServicesDep, job: str) -> HTMLResponse:
 def result_file(services: ServicesDep, job: str) -> Response:
     """The result as one HTML file to keep. It has scripts of its own, so it is not to be opened on this server."""
     found = services.store.get(job)
-    result, text = _result(services, found), ""
-    if result is not None:
+    if (result := _result(services, found)) is not None:
         row = Names(services.library).row(found)
         text = offline_page(services, found, row, _shown(services, row, result))
     elif MANIFEST_PAGE in found.artifacts:
@@ -209,7 +203,6 @@ def picture(
     index: Annotated[int, PathParam(ge=0)],
     kind: Kind,
 ) -> Response:
-    """One target image of an ended job."""
     services.store.get(job)
     try:
         data = picture_png(services.artifacts(job), view_set, index, kind)
@@ -220,27 +213,24 @@ def picture(
 
 @router.get("/experiments")
 def experiments(request: Request, services: ServicesDep) -> HTMLResponse:
-    """All experiments."""
     return page(request, "experiments.html", experiments=services.store.experiments())
 
 
 @router.get("/experiments/{name:path}")
 def show_experiment(request: Request, services: ServicesDep, name: str, cursor: Cursor = None) -> HTMLResponse:
-    """Jobs of an experiment, and a chart of seconds and accuracy."""
     found = services.store.page(labels={EXPERIMENT: name}, limit=EXPERIMENT_PAGE, cursor=cursor)
     if not found.jobs:
         raise NotFoundError(f"There is no experiment {name!r}.")
     names = Names(services.library)
     attacks = [job for job in found.jobs if isinstance(job.spec, JobSpec)]
     entries = [(names.row(job), names.options(job), _result(services, job)) for job in attacks]
-    states = [row.state for row, _, _ in entries]
     options = differing_options(entries)
     return page(
         request,
         "experiment.html",
         name=name,
-        counts={state: states.count(state) for state in dict.fromkeys(states)},
-        chart=chart(points_of(entries, options), measure="A_drop in the target (held-out views, if any)"),
+        counts=Counter(row.state for row, _, _ in entries),
+        chart=chart(points_of(entries, options)),
         columns=[*options, *OUTCOME],
         lines=[(entry[0], cells_of(entry, options)) for entry in entries],
         whole=cursor is None and found.next_cursor is None,
@@ -250,13 +240,11 @@ def show_experiment(request: Request, services: ServicesDep, name: str, cursor: 
 
 @router.get("/docs")
 def docs(request: Request) -> HTMLResponse:
-    """The operations and schemas of the API."""
     return page(request, "docs.html", api=request.app.openapi())
 
 
 @router.get("/login")
 def login(request: Request, next: str = "/") -> HTMLResponse:
-    """The sign-in page."""
     return page(request, "login.html", next=next, wrong=None)
 
 
@@ -281,7 +269,6 @@ def sign_in(
 
 @router.post("/logout")
 def sign_out() -> Response:
-    """Delete the token's cookie."""
     answer = RedirectResponse("/", status_code=303)
     answer.delete_cookie(COOKIE, httponly=True, samesite="strict")
     return answer
@@ -303,16 +290,10 @@ def _painted(job: Job) -> dict[str, Any]:
 
 def _choices(services: Services) -> dict[str, Any]:
     """What the forms choose from."""
-    labels = {name: shipped.label for name, shipped in shipped_objects().items()}
     return {
-        "objects": [
-            {"reference": info.reference, "name": info.name, "label": labels.get(info.name, "")}
-            for info in services.library.objects.all()
-        ],
-        "classifiers": [
-            {"reference": info.reference, "name": info.name, "white_box": info.white_box}
-            for info in services.library.classifiers.all()
-        ],
+        "objects": services.library.objects.all(),
+        "labels": {name: shipped.label for name, shipped in shipped_objects().items()},
+        "classifiers": services.library.classifiers.all(),
         "endings": ".zip,.glb,.gltf,.fbx,.ply,.stl,.obj",
         "formats": "GLB, FBX, PLY, STL, or a zip of an .obj or .gltf with its textures.",
         "turns": TURNS,

@@ -59,7 +59,6 @@ def static(name: str) -> str:
 
 
 def page(request: Request, template: str, /, status: int = 200, **values: Any) -> HTMLResponse:
-    """Render a page."""
     values |= {"version": version("trompe"), "static": static, "signed_in": COOKIE in request.cookies}
     return _TEMPLATES.TemplateResponse(request, template, values, status_code=status, headers=HEADERS)
 
@@ -109,10 +108,4 @@ def _problem_page(request: Request, status: int, body: bytes) -> Response:
         wanted = str(request.url.replace(scheme="", netloc=""))
         return RedirectResponse(f"/login?next={quote(wanted)}", status_code=303)
     problem = json.loads(body)
-    return page(
-        request,
-        "problem.html",
-        status=status,
-        title=problem["title"],
-        detail=problem.get("detail") or "There are no details.",
-    )
+    return page(request, "problem.html", status=status, title=problem["title"], detail=problem["detail"])
