@@ -180,10 +180,12 @@ def echo() -> Iterator[Callable[[bytes], None]]:
         ours.sendall(len(data).to_bytes(4, "little") + data)
         ours.recv(1)
 
-    yield send
-    ours.close()
-    thread.join()
-    theirs.close()
+    try:
+        yield send
+    finally:
+        ours.close()
+        thread.join()
+        theirs.close()
 
 
 def png(image: Picture, level: int) -> bytes:

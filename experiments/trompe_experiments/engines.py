@@ -32,6 +32,7 @@ def engines_chart(rows: Sequence[ResultRow]) -> Drawing:
         drops.set_xlim(0, 1)
         drops.set_xlabel("A_drop on held-out views (share)")
         errors.set_xlim(left=0)
+        errors.locator_params(axis="x", nbins=5)
         errors.set_xlabel("margin error over margin moved (share)")
         made.figure.legend(loc="outside lower center", ncols=4)
     return made

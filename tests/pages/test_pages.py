@@ -70,6 +70,7 @@ def test_a_wrong_file_and_a_wrong_class_are_told_in_the_servers_words(
         expect(page.locator(f'[data-error^="{field}"]')).to_contain_text(told)
         page.wait_for_timeout(1500)  # the form is checked meanwhile
         expect(page.locator(f'[data-error^="{field}"]')).to_be_visible()
+    expect(page.locator('[data-error="object"]')).to_be_visible()
 
     for label, told in (("", "Field required"), ("elephant", "elephant")):
         page.fill("[name='goal.label']", label)

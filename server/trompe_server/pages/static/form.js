@@ -11,10 +11,14 @@ function keyOf(body) {
   return keys.get(body);
 }
 
-export function complain(error, fallback = "") {
-  for (const place of form.querySelectorAll("[data-error]")) place.hidden = true;
+// Show the faults of an error, or none. Those of an upload (`own`: its place) leave what is told of others.
+export function complain(error, own = "") {
+  for (const place of form.querySelectorAll("[data-error]")) {
+    const { error: names } = place.dataset;
+    if (!own || !names || names.split(" ").includes(own)) place.hidden = true;
+  }
   if (!error) return;
-  const faults = error.problem?.errors ?? [{ field: fallback, message: words(error) }];
+  const faults = error.problem?.errors ?? [{ field: own, message: words(error) }];
   for (const { field, message } of faults) {
     const known = [...form.querySelectorAll("[data-error]")].find(
       (each) => each.dataset.error && each.dataset.error.split(" ").some((name) => `${field}.`.startsWith(`${name}.`) || name.startsWith(`${field}.`)));
@@ -38,7 +42,7 @@ export async function upload(path, picked, select, place, onShare = () => {}) {
     const option = [...select.options].find((each) => each.value === stored.id) ?? new Option(stored.name, stored.id);
     option.selected = true;
     select.append(option);
-    complain(null);
+    complain(null, place);
     return stored;
   } catch (error) {
     if (uploads.get(select) !== request) return undefined;
