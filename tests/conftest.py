@@ -11,7 +11,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 from tests.pretend_device import register
-from tests.worker_process import started
+from tests.worker_process import shared_worker
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.object3d import Object3D, load_object
 from trompe_shared.shipped import shipped_objects
@@ -84,11 +84,7 @@ def pytest_runtest_makereport(
     return report
 
 
-@pytest.fixture(scope="session")
-def worker() -> Iterator[tuple[str, int]]:
-    """The address of a renderer worker shared by all tests."""
-    with started() as running:
-        yield running.address
+worker = shared_worker()
 
 
 @pytest.fixture

@@ -1,13 +1,14 @@
-"""Stand-ins for a target renderer and a classifier: coarse, deterministic and fast."""
+"""Stand-ins for a target renderer and classifiers: coarse, deterministic and fast."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from trompe_server.classifiers import NetworkClassifier
 from trompe_shared.engine import EngineInfo
@@ -31,6 +32,24 @@ def fake_classifier(
         for parameter in network.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator) * (2 / parameter.shape[-1]) ** 0.5)
     return NetworkClassifier("fake", network, image_size, n_classes, classes)
+
+
+class Scores:
+    """A network seen through an .onnx file: scores, no gradients."""
+
+    def __init__(self, inner: Any) -> None:
+        self.inner: Any = inner
+        self.name, self.classes = "net", inner.classes
+        self.image_size, self.n_classes = inner.image_size, inner.n_classes
+
+    def predict(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
+        scores: NDArray[np.float32] = self.inner.predict(images)
+        return scores
+
+    def scores(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
+        with torch.no_grad():
+            logits: Tensor = self.inner.logits(images)
+        return logits
 
 
 Floats = NDArray[np.float64]

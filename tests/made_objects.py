@@ -27,17 +27,7 @@ class Scene:
 
     def __init__(self) -> None:
         self.data = b""
-        self.document: Json = {
-            "asset": {"version": "2.0"},
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
-            "meshes": [],
-            "materials": [],
-            "textures": [],
-            "images": [],
-            "accessors": [],
-            "bufferViews": [],
-        }
+        self.document: Json = {"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
 
     def add(self, kind: str, entry: Json) -> int:
         self.document.setdefault(kind, []).append(entry)

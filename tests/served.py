@@ -192,36 +192,36 @@ class Served(Queue, Child):
 
     def children(self) -> dict[str, int]:
         """Process ids of the children, by command; an attack worker is ``worker``."""
-        table, found = process_table(), dict[str, int]()
-        for pid in table:
-            if pid != self.process.pid and self.process.pid in ancestry(pid, table):
-                command = command_of(Path("/proc", str(pid)))
-                found |= {command: pid} if command is not None else {}
-        return found
+        found = {command_of(pid): pid for pid in descendants(self.process.pid)}
+        return {command: pid for command, pid in found.items() if command is not None}
 
 
-def command_line(process: Path) -> list[str]:
-    """Words of a process by its folder in /proc; none if it has ended."""
+def command_line(pid: int) -> list[str]:
+    """Words of a process; none if it has ended."""
     with suppress(FileNotFoundError, ProcessLookupError):
-        return (process / "cmdline").read_text().split("\0")
+        return Path(f"/proc/{pid}/cmdline").read_text().split("\0")
     return []
 
 
-def command_of(process: Path) -> str | None:
+def command_of(pid: int) -> str | None:
     """Command of one of our processes; ``worker`` for an attack worker, ``None`` for processes of others."""
-    words = command_line(process)
+    words = command_line(pid)
     if CHILD[-1] in words:
         return words[words.index(CHILD[-1]) + 1]
     forked = any("multiprocessing.forkserver" in word for word in words)
-    above = process_table().get(int(process.name)) if forked else None
-    return "worker" if above and command_line(Path("/proc", str(above))) == words else None
+    above = process_table().get(pid) if forked else None
+    return "worker" if above and command_line(above) == words else None
 
 
 def workers_of(service: int) -> list[int]:
     """Ids of the attack workers of a process."""
+    return [pid for pid in descendants(service) if command_of(pid) == "worker"]
+
+
+def descendants(process: int) -> list[int]:
+    """Ids of the children of a process, of theirs, and so on."""
     table = process_table()
-    found = [pid for pid in table if pid != service and service in ancestry(pid, table)]
-    return [pid for pid in found if command_of(Path("/proc", str(pid))) == "worker"]
+    return [pid for pid in table if pid != process and process in ancestry(pid, table)]
 
 
 def process_table() -> dict[int, int]:

@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, Literal
+
+import pytest
 
 SHARP, SHARP_SETTINGS = ("--set", "msaa=1"), "msaa=1"
 FLAT, FLAT_SETTINGS = ("--set", "shadows=no"), "shadows=False"
@@ -59,3 +61,14 @@ def started(
             yield Worker(process, (ready[1], int(ready[2])))
         finally:
             process.kill()
+
+
+def shared_worker(*options: str, code: str | None = None, scope: Literal["session", "module"] = "session") -> Any:
+    """A fixture: the address of a worker, ``started`` with these arguments, that the tests of a scope share."""
+
+    @pytest.fixture(scope=scope)
+    def address() -> Iterator[tuple[str, int]]:
+        with started(*options, code=code) as running:
+            yield running.address
+
+    return address

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.wire import Wire
-from tests.worker_process import Worker, started
+from tests.worker_process import Worker, shared_worker, started
 
 Address = tuple[str, int]
 
@@ -31,23 +31,10 @@ def agent(wire: Callable[..., Wire]) -> Wire:
     return wire()
 
 
-@pytest.fixture(scope="session")
-def shadowless_worker() -> Iterator[Address]:
-    with started("--set", "shadows=no") as running:
-        yield running.address
-
-
-@pytest.fixture(scope="session")
-def ticking_worker() -> Iterator[Address]:
-    """Half a second passes in its world from frame to frame."""
-    with started("--time-step", "0.5", "--depth-range", "0.8") as running:
-        yield running.address
-
-
-@pytest.fixture(scope="session")
-def second_worker() -> Iterator[Address]:
-    with started() as running:
-        yield running.address
+second_worker = shared_worker()
+shadowless_worker = shared_worker("--set", "shadows=no")
+ticking_worker = shared_worker("--time-step", "0.5", "--depth-range", "0.8")
+"""Half a second passes in its world from frame to frame."""
 
 
 @pytest.fixture
@@ -65,10 +52,5 @@ from trompe_shared import sailenv
 del Session.get_light_type, sailenv._BY_CODE[0xE1], sailenv._BY_CODE[0xE2]
 render(["--port", "0"])
 """
-
-
-@pytest.fixture(scope="session")
-def plain_worker() -> Iterator[Address]:
-    """A worker without our extensions but ``last_error``."""
-    with started(code=_WITHOUT_EXTENSIONS) as worker:
-        yield worker.address
+plain_worker = shared_worker(code=_WITHOUT_EXTENSIONS)
+"""A worker without our extensions but ``last_error``."""

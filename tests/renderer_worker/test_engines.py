@@ -19,7 +19,7 @@ from trimesh.creation import uv_sphere
 
 from tests.documentation import blocks
 from tests.made_objects import CANDLE, FLAG, GLASS, LATTICE, lantern
-from tests.served import ancestry, process_table, wait_until
+from tests.served import descendants, process_table, wait_until
 from tests.surfaces import object_of, quad
 from tests.wire import Wire, boxes, linear, on_screen, plain
 from tests.worker_process import Worker, started
@@ -361,18 +361,12 @@ def test_a_picture_of_the_wrong_kind_is_refused() -> None:
         picture(target, boxes(), Camera(0.3, 0, 0))
 
 
-def children_of(process: int) -> set[int]:
-    """All descendants of a process."""
-    table = process_table()
-    return {pid for pid in table if pid != process and process in ancestry(pid, table)}
-
-
 @pytest.mark.parametrize("name", ["three", "cycles"])
 def test_a_worker_ends_with_the_process_of_its_engine(name: str, tmp_path: Path) -> None:
     with (tmp_path / "log").open("w+") as log, started(*options_of(name), log=log) as worker:
         with closing(SailenvTarget(*worker.address, timeout=240)) as target:
             picture(target, boxes(), Camera(0.3, 0, 0))
-            for child in children_of(worker.process.pid):
+            for child in descendants(worker.process.pid):
                 with suppress(ProcessLookupError):  # it may have ended with the one before
                     os.kill(child, signal.SIGKILL)
             with pytest.raises(RendererError):
@@ -387,7 +381,7 @@ def test_the_process_of_an_engine_ends_with_its_worker(name: str, running: dict[
     worker = running[name]
     with closing(SailenvTarget(*worker.address, timeout=240)) as target:
         picture(target, boxes(), Camera(0.3, 0, 0))
-    left = children_of(worker.process.pid)
+    left = descendants(worker.process.pid)
     assert left
     del running[name]  # no other test gets a dead worker
     worker.process.kill()

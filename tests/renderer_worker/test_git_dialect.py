@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.wire import ORIGIN, Wire, received
-from tests.worker_process import started
+from tests.worker_process import shared_worker
 from trompe_shared.sailenv import COMMANDS
 
 TRANSCRIPT = Path(__file__).parent / "git_dialect.txt"
@@ -95,13 +95,8 @@ from trompe_renderer.protocol import agent
 agent.DIALECT_WAIT = 120.0
 render(["--port", "0"])
 """
-
-
-@pytest.fixture(scope="module")
-def patient_worker() -> Iterator[tuple[str, int]]:
-    """A worker that waits for the tail of a spawn for longer than a busy machine keeps it back."""
-    with started(code=_PATIENT) as worker:
-        yield worker.address
+patient_worker = shared_worker(code=_PATIENT, scope="module")
+"""A worker that waits for the tail of a spawn for longer than a busy machine keeps it back."""
 
 
 @pytest.mark.parametrize("pause", [0.0, 0.1], ids=["at once", "after a moment"])

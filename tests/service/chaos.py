@@ -377,12 +377,11 @@ def _letter(event: Event) -> str:
 
 def kind_of(pid: int) -> str | None:
     """Kind of one of our processes; ``None`` for others."""
-    folder = Path("/proc", str(pid))
     with suppress(PermissionError):
-        words = command_line(folder)
+        words = command_line(pid)
         if words and re.match(r"ray::[0-9a-f]{16}/", words[0]):
             return KINDS["worker"]
-        command = command_of(folder)
+        command = command_of(pid)
         if command == "worker" and CHILD[-1] in words:
             command = "dispatcher"
         return KINDS.get(command or "")

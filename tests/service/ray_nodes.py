@@ -9,10 +9,9 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import IO, Any, Final, Self
 
-from tests.served import FAKE, free_port
+from tests.served import FAKE, command_line, free_port, process_table
 
 TOKEN: Final = "t" * 32
 ACCESS: Final = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN, "RAY_USAGE_STATS_ENABLED": "0"}
@@ -65,12 +64,9 @@ class RayNodes:
 
 def task_of(job: str) -> int:
     """The process of the task that holds an attempt of the job, by the name that Ray gives it."""
-    named = f"ray::{job}/".encode()
-    for entry in Path("/proc").iterdir():
-        with contextlib.suppress(OSError):  # it has ended
-            if entry.name.isdecimal() and (entry / "cmdline").read_bytes().startswith(named):
-                return int(entry.name)
-    raise AssertionError(f"no process runs {job}")
+    found = [pid for pid in process_table() if "".join(command_line(pid)).startswith(f"ray::{job}/")]
+    assert found, f"no process runs {job}"
+    return found[0]
 
 
 def serve(port: int, answers: IO[str]) -> None:

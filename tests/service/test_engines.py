@@ -2,7 +2,6 @@
 
 import json
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +11,7 @@ from click.testing import CliRunner
 
 from tests.served import Served, reserved_port, wait_until
 from tests.service.processes import listening
-from tests.worker_process import FLAT, FLAT_SETTINGS, SHARP, SHARP_SETTINGS, started
+from tests.worker_process import FLAT, FLAT_SETTINGS, SHARP, SHARP_SETTINGS, shared_worker, started
 from trompe_client.cli import main
 from trompe_server.executor.opener import JobOpener
 from trompe_server.queue.claims import Claim
@@ -30,16 +29,8 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(discovery, "PATIENCE", 60.0)
 
 
-@pytest.fixture(scope="module")
-def sharp() -> Iterator[tuple[str, int]]:
-    with started(*SHARP) as running:
-        yield running.address
-
-
-@pytest.fixture(scope="module")
-def flat() -> Iterator[tuple[str, int]]:
-    with started(*FLAT) as running:
-        yield running.address
+sharp = shared_worker(*SHARP, scope="module")
+flat = shared_worker(*FLAT, scope="module")
 
 
 def pipeline(_spec: JobSpec, **parts: Any) -> Any:
@@ -132,14 +123,8 @@ def test_one_paint_for_two_renderers_judged_by_a_third(
         ours = f"pyrender {listed[0]['version']}"
         words = ["attack", "mug", "--label", "mug", "--server", served.url, "--pool", "16", "--held-out", "12"]
         words += ["--steps", "15", "--epsilon", "0.1", "--surrogate", "calibrated", "--out", str(tmp_path / "out")]
-        asked = [
-            "--renderer",
-            ours,
-            "--renderer",
-            f"{ours} ({SHARP_SETTINGS})",
-            "--judge-renderer",
-            f"{ours} ({FLAT_SETTINGS})",
-        ]
+        asked = ["--renderer", ours, "--renderer", f"{ours} ({SHARP_SETTINGS})"]
+        asked += ["--judge-renderer", f"{ours} ({FLAT_SETTINGS})"]
         done = CliRunner().invoke(main, [*words, *asked])
         assert done.exit_code == 0, done.output
         (job,) = served.get("/v1/jobs")["jobs"]

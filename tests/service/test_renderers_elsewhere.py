@@ -51,7 +51,7 @@ def test_a_renderer_is_restarted_and_stopped_whatever_its_engine_prints_and_leav
     service = Supervisor(Settings(engine="tests.renderer_worker.noisy_engine:Talkative"), RendererAddresses())
     with closing(service):
         service.start()
-        (worker,) = (pid for pid in children(os.getpid()) if "render" in command_line(Path(f"/proc/{pid}")))
+        (worker,) = (pid for pid in children(os.getpid()) if "render" in command_line(pid))
         helpers = children(worker)
         assert helpers
         os.kill(worker, signal.SIGKILL)

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.fakes import FakeTarget
+from tests.fakes import FakeTarget, Scores
 from tests.job_runs import MemoryArtifacts, run_job, spec_of
 from tests.pretend_device import pretend_device
-from tests.scores_only import Scores
 from trompe_server.attack import (
     Budget,
     Goal,

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from tests.fakes import Scores
 from tests.job_runs import CHAIR, MemoryArtifacts, run_job, spec_of
-from tests.scores_only import Scores
 from trompe_server.classifiers import load_classifier
 from trompe_server.image_pipelines import SUITE
 from trompe_server.library import Library

@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from tests.fakes import FakeTarget
+from tests.fakes import FakeTarget, Scores
 from tests.job_runs import CHAIR, MemoryArtifacts, opened, setup_of, spec_of
-from tests.scores_only import Scores
 from trompe_server.classifiers import load_classifier
 from trompe_server.errors import NotFoundError
 from trompe_server.library import Library
