@@ -1,8 +1,8 @@
 """Worker processes of several kinds, and bare clients that are closed after each test."""
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -15,15 +15,8 @@ Address = tuple[str, int]
 @pytest.fixture
 def wire(worker: Address) -> Iterator[Callable[..., Wire]]:
     """Connects clients, by default to the worker that all tests share."""
-    opened: list[Wire] = []
-
-    def connect(address: Address = worker, **options: Any) -> Wire:
-        opened.append(Wire(address, **options))
-        return opened[-1]
-
-    yield connect
-    for each in opened:
-        each.close()
+    with ExitStack() as opened:
+        yield lambda address=worker, **options: opened.enter_context(closing(Wire(address, **options)))
 
 
 @pytest.fixture

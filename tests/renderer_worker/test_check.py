@@ -113,16 +113,18 @@ def encoded(light: Levels) -> Levels:
     return 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.clip(light, 1e-9, None) ** (1 / 2.4) - 0.055)
 
 
+def showing(other: Callable[[Instance], Instance]) -> Fault:
+    """Another one in the place of each object."""
+    return aimed(lambda world, *_: replace(world, instances=tuple(map(other, world.instances))))
+
+
 def painted(change: Callable[[Picture], NDArray[Any]]) -> Fault:
-    def aim(world: Snapshot, *_: int) -> Snapshot:
-        def other(each: Instance) -> Instance:
-            images = {name: change(texture) for name, texture in each.model.obj.textures.items()}
-            new = {name: np.ascontiguousarray(image).astype(np.uint8) for name, image in images.items()}
-            return replace(each, model=model_of(each.model.obj.with_textures(new)))
+    def other(each: Instance) -> Instance:
+        images = {name: change(texture) for name, texture in each.model.obj.textures.items()}
+        new = {name: np.ascontiguousarray(image).astype(np.uint8) for name, image in images.items()}
+        return replace(each, model=model_of(each.model.obj.with_textures(new)))
 
-        return replace(world, instances=tuple(map(other, world.instances)))
-
-    return aimed(aim)
+    return showing(other)
 
 
 def read(change: Callable[[Levels], Levels]) -> Fault:
@@ -135,15 +137,13 @@ def read(change: Callable[[Levels], Levels]) -> Fault:
         obj = replace(each.model.obj, parts=tuple(map(moved, each.model.obj.parts)))
         return replace(each, model=replace(each.model, shape=f"{each.model.shape} moved", obj=obj))
 
-    return aimed(lambda world, *_: replace(world, instances=tuple(map(other, world.instances))))
+    return showing(other)
 
 
 def turned_world(matrix: list[list[int]]) -> Fault:
     pose = np.eye(4)
     pose[:3, :3] = matrix
-    return aimed(
-        lambda world, *_: replace(world, instances=tuple(replace(i, pose=pose @ i.pose) for i in world.instances))
-    )
+    return showing(lambda each: replace(each, pose=pose @ each.pose))
 
 
 def upright(world: Snapshot, *_: int) -> Snapshot:
@@ -190,23 +190,17 @@ def paint_by_name(engine: Engine) -> Engine:
     """The first texture with a file name is kept for all objects."""
     known: dict[str, Picture] = {}
 
-    def aim(world: Snapshot, *_: int) -> Snapshot:
-        def other(each: Instance) -> Instance:
-            shown = {name: known.setdefault(name, texture) for name, texture in each.model.obj.textures.items()}
-            return replace(each, model=model_of(each.model.obj.with_textures(shown)))
+    def other(each: Instance) -> Instance:
+        shown = {name: known.setdefault(name, texture) for name, texture in each.model.obj.textures.items()}
+        return replace(each, model=model_of(each.model.obj.with_textures(shown)))
 
-        return replace(world, instances=tuple(map(other, world.instances)))
-
-    return Wrong(engine, aim=aim)
+    return showing(other)(engine)
 
 
-def centred(world: Snapshot, *_: int) -> Snapshot:
-    def moved(each: Instance) -> Instance:
-        pose = np.eye(4)
-        pose[:3, 3] = -np.concatenate([part.vertices for part in each.model.obj.parts]).mean(axis=0)
-        return replace(each, pose=pose)
-
-    return replace(world, instances=tuple(map(moved, world.instances)))
+def centred(each: Instance) -> Instance:
+    pose = np.eye(4)
+    pose[:3, 3] = -np.concatenate([part.vertices for part in each.model.obj.parts]).mean(axis=0)
+    return replace(each, pose=pose)
 
 
 def between(near: float, far: float) -> Aim:
@@ -303,10 +297,7 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "GBR": ("channel order", seen(lambda picture, _: picture[..., [1, 2, 0]])),
     "encoded twice": ("gamma twice", seen(on_object(lambda picture: encoded(picture / 255)))),
     "not encoded": ("gamma missing", seen(on_object(lambda picture: 255 * linear(picture)))),
-    "8 times as bright": (
-        "overexposed",
-        seen(on_object(lambda picture: encoded(np.clip(8 * linear(picture), 0, 1)))),
-    ),
+    "8 times as bright": ("overexposed", seen(on_object(lambda picture: encoded(np.clip(8 * linear(picture), 0, 1))))),
     "texture not decoded": ("texture not decoded", painted(lambda texture: np.round(encoded(texture / 255)))),
     "decoded twice": ("texture decoded twice", painted(lambda texture: np.round(255 * linear(texture.astype(float))))),
     "half a pixel right": ("shifted", shifted(0.5, 0)),
@@ -317,7 +308,7 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "earlier objects": ("stale scene", keeping(hoarded)),
     "cached by name": ("stale object", by_name),
     "textures cached by file name": ("stale texture", paint_by_name),
-    "centred": ("moved object", aimed(centred)),
+    "centred": ("moved object", showing(centred)),
     "cut off at 0.2 m": ("clipped", aimed(between(0.2, 100))),
     "cut off at 5 m": ("clipped", aimed(between(0.01, 5))),
     "light reversed": ("light reversed", lit(lambda light, _: turned(light, -np.eye(3)))),

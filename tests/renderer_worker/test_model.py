@@ -3,7 +3,6 @@
 import gc
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.surfaces import with_alpha
 from tests.wire import ORIGIN, boxes
 from trompe_renderer.protocol import upload
 from trompe_renderer.protocol.limits import Limits, StorageQuota
@@ -21,9 +21,11 @@ from trompe_renderer.world.model import HashedModel, content_key, model_of, repa
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import ObjectError, RendererError
 from trompe_shared.local_files import pack_zip
-from trompe_shared.object3d import Object3D, encode_png, load_object, object_from_files
+from trompe_shared.object3d import Object3D, load_object, object_from_files
 
 ENGINE = EngineInfo("test", "1")
+HOLE = np.array([[0, 0, 255, 255]] * 4, np.uint8)
+"""An alpha channel of half a side."""
 
 
 def noise(seed: int, *shape: int) -> Any:
@@ -76,10 +78,8 @@ def test_an_archive_that_differs_in_an_albedo_alone_is_not_parsed_again(parsed: 
 
 
 def test_an_archive_that_differs_in_the_alpha_of_an_albedo_has_its_own() -> None:
-    models, box, cut = cache(), boxes(), np.full((8, 8, 4), 255, np.uint8)
-    cut[:, :4, 3] = 0
-    pierced = pack_zip({**box.files, "front_albedo.png": encode_png(cut)})
-    for archive in (box.to_zip(), pierced, box.to_zip()):
+    models, box = cache(), boxes()
+    for archive in (box.to_zip(), with_alpha(box, "front_albedo.png", HOLE).to_zip(), box.to_zip()):
         assert read(models, archive).key == model_of(load_object(archive)).key
 
 
@@ -104,13 +104,8 @@ def test_any_other_difference_makes_another_shape() -> None:
 
 
 def test_models_that_differ_in_their_alpha_alone_have_different_keys() -> None:
-    box, cut = boxes(), np.full((8, 8, 4), 255, np.uint8)
-    cut[:, :4, 3] = 0
-    keys = {
-        model_of(replace(box, files=dict(box.files) | {"front_albedo.png": encode_png(each)})).key
-        for each in (cut, cut[:, ::-1], cut[..., :3])
-    }
-    assert len(keys) == 3
+    pierced = [with_alpha(boxes(), "front_albedo.png", alpha) for alpha in (HOLE, HOLE[:, ::-1])]
+    assert len({model_of(each).key for each in (boxes(), *pierced)}) == 3
 
 
 @pytest.mark.parametrize(

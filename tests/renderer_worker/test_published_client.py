@@ -20,7 +20,6 @@ from trompe_shared.shipped import shipped_objects
 @pytest.fixture
 def connect(worker: tuple[str, int]) -> Iterator[Callable[..., Any]]:
     """Registers agents of the published client and deletes them in the end."""
-    pytest.importorskip("PIL")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the client imports typing.io
         module = pytest.importorskip("sailenv", reason="pip install sailenv==0.5b0 (Python 3.12 at most)")

@@ -265,10 +265,6 @@ class _Engine:
         return np.zeros((height, width, 3), np.uint8)
 
 
-def thread_of(engine: _Engine, **options: Any) -> RenderThread:
-    return RenderThread(lambda: engine, **options)
-
-
 def draw(thread: RenderThread, *, fails: bool = False, seconds: float = 0.0, agent: object = Session) -> Any:
     """A picture in the future."""
     world = Snapshot((1,) if fails else (), np.eye(4), (), (seconds, 0.0, 0.0), (0.0, 0.0, 0.0))  # type: ignore[arg-type]
@@ -279,7 +275,7 @@ def draw(thread: RenderThread, *, fails: bool = False, seconds: float = 0.0, age
 def test_an_engine_counts_as_lost_when_not_even_an_empty_picture_can_be_drawn(failure: type[BaseException]) -> None:
     engine, lost = _Engine(), list[str]()
     engine.failure = failure
-    thread = thread_of(engine, lost=lost.append)
+    thread = RenderThread(lambda: engine, lost=lost.append)
     for _ in range(2):
         with pytest.raises(RuntimeError, match="out of memory"):
             draw(thread, fails=True).result()
@@ -318,7 +314,7 @@ def test_an_engine_counts_as_lost_when_a_picture_takes_for_ever(engine: _Engine)
         assert looked.acquire(timeout=120)
 
     engine.sleep = sleep
-    thread = thread_of(engine, lost=note, turn_limit=2.0)
+    thread = RenderThread(lambda: engine, lost=note, turn_limit=2.0)
     assert looked.acquire(timeout=120)
     for seconds in (0.8, 0.8, 0.8, 0.8, 3.0):
         assert lost == []
@@ -350,7 +346,7 @@ def test_the_next_turn_goes_to_the_agent_with_the_least_time_used() -> None:
 
 
 def test_large_pictures_do_not_delay_small_ones(engine: _Engine) -> None:
-    thread, (large, small, other) = thread_of(engine), sessions(3)
+    thread, (large, small, other) = RenderThread(lambda: engine), sessions(3)
     order: list[str] = []
     all_asked = threading.Event()
     asked: list[Any] = [thread.run(lambda _: all_asked.wait(120), agent=other)]

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
+from tests.surfaces import with_alpha
 from tests.wire import Wire, boxes, on_screen, pixel_rays
 from trompe_renderer.protocol.label_views import instance_color
 from trompe_shared.geometry import Camera, euler_to_matrix
-from trompe_shared.object3d import encode_png
 
 Array = NDArray[np.float64]
 
@@ -209,10 +209,8 @@ def test_labels_lie_on_the_objects_of_the_main_view(empty: Wire) -> None:
 
 
 def test_pixels_in_a_texture_hole_belong_to_the_scene_behind_it(empty: Wire) -> None:
-    front = np.full((8, 8, 4), 255, np.uint8)
-    front[:, :4, 3] = 0
-    box = boxes()
-    empty.spawn(replace(box, files=dict(box.files) | {"front_albedo.png": encode_png(front)}))
+    hole = np.array([[0, 0, 255, 255]] * 4, np.uint8)
+    empty.spawn(with_alpha(boxes(), "front_albedo.png", hole))
     empty.look(Camera(0.4, 0, 0))
     empty.ask("set_clear_color", color=(0, 255, 0))
     mask, shown = empty.mask(), np.any(empty.picture() != (0, 255, 0), axis=-1)
