@@ -3,15 +3,15 @@
 import json
 import os
 import signal
-import subprocess
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.fake_job import PHASES, trace
-from tests.served import CHILD, Served, process_table, wait_until
+from tests.served import Child, Served, process_table, wait_until
 
 
 @pytest.fixture(scope="module")
@@ -66,12 +66,16 @@ def test_a_renderer_that_is_killed_comes_back_at_the_same_address(serve: Served)
     wait_until(lambda: serve.state(job).state == "succeeded")
 
 
+def refusal(data: Path, **environment: str) -> str:
+    """What a service says that ends instead of serving."""
+    with closing(Child(data.with_name("refused.log"), environment)) as serve:
+        assert serve.launch("serve", "--port", "0", "--data", str(data)) == ""
+        assert serve.process.wait(240) == 1
+        return serve.words()
+
+
 def test_a_second_serve_on_the_same_data_is_refused(serve: Served) -> None:
-    command = [*CHILD, "serve", "--port", "0", "--data", str(serve.data)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as second:
-        assert second.wait(120) == 1
-        assert second.stderr is not None
-        assert f"Another `trompe serve` uses the data folder {serve.data}" in second.stderr.read()
+    assert f"Another `trompe serve` uses the data folder {serve.data}" in refusal(serve.data)
     assert serve.get("/readyz") == {"status": "ready"}
 
 
@@ -93,14 +97,7 @@ def test_nothing_is_left_running_when_serve_ends_and_its_job_outlives_it(serve: 
 
 
 def test_serve_says_so_where_no_renderer_comes_up(tmp_path: Path) -> None:
-    command = [*CHILD, "serve", "--port", "0", "--data", str(tmp_path)]
-    pipe, environment = subprocess.PIPE, os.environ | {"EGL_DEVICE_ID": "99"}
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) as serve:
-        assert serve.wait(240) == 1
-        assert serve.stdout is not None
-        assert serve.stderr is not None
-        assert serve.stdout.read() == ""
-        words = serve.stderr.read()
+    words = refusal(tmp_path / "data", EGL_DEVICE_ID="99")
     assert "No OpenGL context can be created" in words
     assert "The renderer worker does not start (it died 3 times)" in words
     assert "Traceback" not in words

@@ -6,7 +6,7 @@ import secrets
 import shutil
 import subprocess
 import tempfile
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import psycopg
@@ -44,18 +44,8 @@ class Postgres:
 
     def start(self) -> None:
         options = f"-p {self.port} -k {self.folder} -c listen_addresses=127.0.0.1 {OPTIONS}"
-        self._do(
-            "pg_ctl",
-            "start",
-            "--wait",
-            "--timeout=180",
-            "-D",
-            self._data,
-            "-l",
-            str(self.folder / "log"),
-            "-o",
-            options,
-        )
+        log = str(self.folder / "log")
+        self._do("pg_ctl", "start", "--wait", "--timeout=180", "-D", self._data, "-l", log, "-o", options)
 
     def stop(self) -> None:
         """Stop at once and cut connections, like a crash."""
@@ -69,12 +59,8 @@ class Postgres:
         return f"postgresql://trompe@127.0.0.1:{self.port}/{name}"
 
     def close(self) -> None:
-        subprocess.run(
-            [self._programs / "pg_ctl", "stop", "--mode=immediate", "-D", self._data],
-            user=self._user,
-            capture_output=True,
-            check=False,
-        )
+        with suppress(subprocess.CalledProcessError):  # it is stopped already
+            self.stop()
         shutil.rmtree(self.folder, ignore_errors=True)
         self._open.close()
 

@@ -4,7 +4,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from typing import Final, Self
 
 from tests.served import FAKE, Child, Queue, wait_until
@@ -70,11 +70,9 @@ class Service(Queue):
     @contextmanager
     def worker(self, *, renderers: list[str] | None = None, **environment: str) -> Iterator[WorkerProcess]:
         """A running worker."""
-        running = WorkerProcess(self.settings, renderers or ["--renderer", f"127.0.0.1:{self.renderer}"], **environment)
-        try:
+        words = renderers or ["--renderer", f"127.0.0.1:{self.renderer}"]
+        with closing(WorkerProcess(self.settings, words, **environment)) as running:
             yield running.start()
-        finally:
-            running.close()
 
     def end_silence(self) -> None:
         """Let the lease of a dead or frozen dispatcher be over now, not after its silence."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,17 +54,14 @@ class Soaked(Served):
         for kind, pids in self.processes().items():
             held = [_held(pid) for pid in pids]
             row |= {f"{kind} {unit}": sum(each[unit] for each in held) for unit in ("MiB", "handles", "threads")}
-        for name, sizes in (("passing", self.passing()), ("lasting", self._lasting())):
+        lasting = _sizes(self.home, without=[self.home / place for place in PASSING])
+        for name, sizes in (("passing", self.passing()), ("lasting", lasting)):
             row |= {f"{name} MiB": sum(sizes) / MIB, f"{name} files": len(sizes)}
         return row
 
     def passing(self) -> list[int]:
         """Sizes of the files deleted by retention."""
         return [size for place in PASSING for size in _sizes(self.home / place)]
-
-    def _lasting(self) -> list[int]:
-        """Sizes of the other files."""
-        return _sizes(self.home, without=[self.home / place for place in PASSING])
 
 
 class Watch:
@@ -161,8 +158,3 @@ def _sizes(folder: Path, *, without: Sequence[Path] = ()) -> list[int]:
             with suppress(FileNotFoundError):
                 sizes.append(os.stat(os.path.join(place, name)).st_size)
     return sizes
-
-
-def summary(found: Sequence[Trend], counts: dict[str, Any]) -> str:
-    """Counts of the actions and all trends, a line each."""
-    return "\n".join([str(counts), *map(str, found)])

@@ -120,14 +120,13 @@ def test_a_name_that_could_leave_the_folder_is_refused(folder: Folder, tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_url_with_one_slash_is_no_folder() -> None:
-    with pytest.raises(ServiceError, match=r"'s3:/bucket' is no URL: write 's3://bucket'"):
-        open_folder("s3:/bucket")
-
-
-def test_a_store_that_nobody_knows_is_refused_with_a_remedy() -> None:
-    with pytest.raises(ServiceError, match="cannot be opened"):
-        open_folder("nonsense://bucket")
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [("s3:/bucket", "'s3:/bucket' is no URL: write 's3://bucket'"), ("nonsense://bucket", "cannot be opened")],
+)
+def test_a_url_of_no_store_is_refused_with_a_remedy(url: str, reason: str) -> None:
+    with pytest.raises(ServiceError, match=reason):
+        open_folder(url)
 
 
 def test_a_store_that_cannot_be_reached_is_told_in_words(monkeypatch: pytest.MonkeyPatch) -> None:

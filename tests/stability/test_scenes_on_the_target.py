@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -166,9 +167,7 @@ def blended(obj: Object3D, **opacity: float) -> Object3D:
 
 
 def glazed() -> Object3D:
-    front, back = quads((0.1, 0.04, 128), (0.12, -0.02, 64))
-    obj = object_of(front, back, reverse(back, noise(16, 16)))
-    return blended(with_alpha(obj, "m0.png", holes(128)), m0=0.8)
+    return blended(cut_out(), m0=0.8)
 
 
 def vase() -> Object3D:
@@ -226,10 +225,7 @@ def test_a_calibration_warns_of_parts_in_one_plane_that_only_rounding_orders(
     seen = target.render(obj.with_textures(unlit), views, size=SIZE)
     inside = seen[(seen != MAGENTA).any(axis=-1)].max(axis=1) > 100
     assert 0.05 < inside.mean() < 0.95  # both are visible, each in places
-
-    def ask(painted: Object3D, views: Sequence[View]) -> Image8:
-        return target.render(painted, views, size=SIZE)
-
+    ask = partial(target.render, size=SIZE)
     clean = ask(obj, views)
     calibration = calibrate(obj, views, clean, ask, wanted="auto", generator=np.random.default_rng(0))
     poor = max(build_surrogate(calibration, obj, views, clean).clean_errors()) > POOR_VIEW
