@@ -127,7 +127,12 @@ def trompe(*words: object) -> testing.Result:
     return testing.CliRunner().invoke(main, [str(word) for word in words])
 
 
-def zipped(source: Path) -> bytes:
+def stored_id(data: bytes) -> str:
+    """The double's id of an upload."""
+    return hashlib.sha256(data).hexdigest()[:12]
+
+
+def zipped(source: str | Path) -> bytes:
     """What is sent for an object of several files."""
     upload = object_source(source)
     assert isinstance(upload, Upload)
@@ -346,9 +351,8 @@ class Handler(BaseHTTPRequestHandler):
             known = {"state": job.state.value}
             if isinstance(job.spec, JobSpec):
                 known |= {"object": job.spec.object, "classifier": job.spec.victim.classifier}
-            return all(query.get(name) in (None, [value]) for name, value in known.items()) and (
-                labels.items() <= job.labels.items()
-            )
+            asked = all(query.get(name) in (None, [value]) for name, value in known.items())
+            return asked and labels.items() <= job.labels.items()
 
         found = [job for job in reversed(self.fake.jobs.values()) if wanted(job)]
         start = int(query.get("cursor", ["0"])[0])
@@ -412,9 +416,8 @@ class Handler(BaseHTTPRequestHandler):
         return file.get_filename(), file.get_payload(decode=True), form
 
     def store(self, kind: str, filename: str, data: bytes, form: dict[str, str]) -> None:
-        stored_id = hashlib.sha256(data).hexdigest()[:12]
         self.fake.uploads[kind] = (filename, data, form)
-        named = {"id": stored_id, "name": form.get("name", Path(filename).stem), "shipped": False}
+        named = {"id": stored_id(data), "name": form.get("name", Path(filename).stem), "shipped": False}
         if kind == "objects":
             self.fake.objects.append(MUG.model_copy(update=named))
             return self.answer(self.fake.objects[-1], 201)
@@ -422,7 +425,7 @@ class Handler(BaseHTTPRequestHandler):
             classes = json.loads(form["classes"]) if "classes" in form else None
             self.fake.classifiers.append(TINY.model_copy(update=named | {"classes": classes}))
             return self.answer(self.fake.classifiers[-1], 201)
-        self.fake.backgrounds.append(BackgroundInfo(id=stored_id, name=filename))
+        self.fake.backgrounds.append(BackgroundInfo(id=stored_id(data), name=filename))
         return self.answer(self.fake.backgrounds[-1], 201)
 
     def stream(self, job_id: str) -> None:

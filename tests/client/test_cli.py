@@ -1,6 +1,5 @@
 """The command line: what it prints, writes and exits with."""
 
-import hashlib
 import io
 import json
 import re
@@ -17,13 +16,14 @@ from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
+from unittest.mock import Mock
 
 import click
 import pytest
 from click.testing import Result
 from rich.console import Console
 
-from tests.client.conftest import NOW, SPEC, FakeServer, trompe, zipped
+from tests.client.conftest import NOW, SPEC, FakeServer, stored_id, trompe, zipped
 from trompe_client import BadRequest, Client, JobHandle
 from trompe_client._report import result_report, spent
 from trompe_client.cli import connection
@@ -32,12 +32,6 @@ from trompe_client.cli.options import flag_of
 from trompe_server.pages.present import command
 from trompe_shared.api import OPTIONS, PARTS, JobSpec, JobState, Option, SearchOptions, in_flags
 from trompe_shared.api.jobs import CONDITIONS, option
-
-
-def stored_id(data: bytes) -> str:
-    """The fake server's id of an upload."""
-    return hashlib.sha256(data).hexdigest()[:12]
-
 
 Attack = Callable[..., Result]
 
@@ -53,11 +47,8 @@ def test_attack_prints_the_table_and_names_the_files_it_wrote(attack_mug: Attack
     out = tmp_path / "out"
     done = attack_mug("--judge", "tiny")
     assert done.exit_code == 0, done.output
-    rows = {
-        cells[1]: cells[2:6]
-        for line in done.stdout.splitlines()
-        if len(cells := [c.strip() for c in line.split("│")]) > 5
-    }
+    table = [[cell.strip() for cell in line.split("│")] for line in done.stdout.splitlines()]
+    rows = {cells[1]: cells[2:6] for cells in table if len(cells) > 5}
     figures = ["0.90 [0.80, 0.95]", "0.30 [0.20, 0.43]", "0.67 [0.55, 0.78]"]
     assert rows == {
         "surrogate (own views)": ["60 (50 distinct)", *figures],
@@ -134,12 +125,10 @@ def words_of(keyword: str, value: object) -> list[str]:
     flag = OPTIONS[keyword].flag
     if isinstance(value, bool):
         return [flag]
+    if keyword == "masks":
+        return [flag, "a.png=mask.png"]
     if isinstance(value, dict):
-        return (
-            [flag, "a.png=mask.png"]
-            if keyword == "masks"
-            else [str(word) for name, ends in value.items() for word in (flag, name, *ends)]
-        )
+        return [str(word) for name, ends in value.items() for word in (flag, name, *ends)]
     rows = value if isinstance(value, list) else [value]
     return [str(word) for row in rows for word in (flag, *(row if isinstance(row, tuple) else [row]))]
 
@@ -159,9 +148,8 @@ def test_every_option_is_a_flag_a_keyword_and_a_word_of_the_printed_command(
     assert done.exit_code == 0, done.output
     spec = server.jobs["job-1"].attack
     assert spec == JobSpec.of("mug", **given)
-    assert (
-        client.attack("mug", **given | ({"masks": {"a.png": mask}} if keyword == "masks" else {})).status.spec == spec
-    )
+    files = {"masks": {"a.png": mask}} if keyword == "masks" else {}
+    assert client.attack("mug", **given | files).status.spec == spec
     printed = shlex.split(command(spec, object="mug", classifier=spec.victim.classifier))
     if keyword != "masks":  # their pictures are on the server
         assert trompe(*printed[1:-2], "--server", server.url, "--detach").exit_code == 0
@@ -356,10 +344,8 @@ def test_a_result_and_a_job_name_flags_too(attack_mug: Attack, server: FakeServe
     done = attack_mug()
     assert "n.a.: none was recognised: check --distance\n" in done.stdout
     assert "warning: leave out --grid\n" in done.stdout
-    assert (
-        "note      none was recognised: check --distance"
-        in trompe("jobs", "show", "job-1", "--server", server.url).stdout
-    )
+    shown = trompe("jobs", "show", "job-1", "--server", server.url).stdout
+    assert "note      none was recognised: check --distance" in shown
     assert client.job("job-1").status.note == server.note
 
 
@@ -405,9 +391,8 @@ def test_all_time_from_start_to_the_files_on_disk_is_accounted_for(
 ) -> None:
     handle = client.submit(SPEC).wait(timeout=20)
     times = {name: NOW + timedelta(seconds=at) for name, at in {"started": 2, "finished": 14}.items()}
-    result = handle.result().model_copy(
-        update={"seconds": {"open": 1.0, "attack": 9.0}}
-    )  # and 2 s before it was opened
+    seconds = {"open": 1.0, "attack": 9.0}  # and 2 s before it was opened
+    result = handle.result().model_copy(update={"seconds": seconds})
     told = spent(result, handle.status.model_copy(update=times), start_up=start_up, wall=wall)
     assert told == parts
     assert list(told) == list(parts)
@@ -453,21 +438,16 @@ def test_ctrl_c_in_a_terminal_ends_the_command_and_not_the_job(
 
 
 @pytest.fixture
-def ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(self: JobHandle, *_args: object, **_options: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(JobHandle, "wait", interrupted)
-
-
-@pytest.fixture
 def our_own(server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> None:
     """The fake server in place of the one that a command starts for itself."""
     monkeypatch.setattr(connection, "embedded_server", lambda: nullcontext(server.url))
 
 
-@pytest.mark.usefixtures("ctrl_c", "our_own")
-def test_ctrl_c_cancels_the_job_on_a_server_of_our_own(server: FakeServer, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("our_own")
+def test_ctrl_c_cancels_the_job_on_a_server_of_our_own(
+    server: FakeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(JobHandle, "wait", Mock(side_effect=KeyboardInterrupt))
     assert trompe("attack", "mug", "--label", 0, "--out", tmp_path).exit_code == 130
     assert server.jobs["job-1"].state is JobState.cancelled
 

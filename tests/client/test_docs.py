@@ -67,12 +67,10 @@ def test_the_page_on_the_sdk_names_every_error() -> None:
 
 def test_readme_and_start_page_give_the_figures_of_the_same_job() -> None:
     (row,) = csv.DictReader((DOCS / "bench" / "teapot.csv").read_text().splitlines())
-    shares = [round(100 * float(row[f"held_out_a_{when}"])) for when in ("before", "after")]
+    before, after = (round(100 * float(row[f"held_out_a_{when}"])) for when in ("before", "after"))
     gallery = json.loads(files("trompe_server.pages").joinpath("gallery.json").read_text())
-    assert [gallery["before"], gallery["after"]] == [f"{share}%" for share in shares]
-    said = "recognises it in {} % of {} unseen views before, {} % after".format(
-        shares[0], row["held_out_views"], shares[1]
-    )
+    assert (gallery["before"], gallery["after"]) == (f"{before}%", f"{after}%")
+    said = f"recognises it in {before} % of {row['held_out_views']} unseen views before, {after} % after"
     assert said in (DOCS.parent / "README.md").read_text()
 
 

@@ -32,15 +32,10 @@ def loaded(code: str) -> set[str]:
 
 
 COMMANDS = (["--help"], ["attack", "--help"], ["jobs", "--help"], ["completion", "bash"])
+RUN_COMMANDS = [f"main({words}, standalone_mode=False)" for words in COMMANDS]
 LOADS = [
     pytest.param("import trompe_client", HEAVY | LATER, id="the SDK"),
-    pytest.param(
-        "\n".join(
-            ["from trompe_client.cli import main", *(f"main({words}, standalone_mode=False)" for words in COMMANDS)]
-        ),
-        HEAVY,
-        id="the command line",
-    ),
+    pytest.param("\n".join(["from trompe_client.cli import main", *RUN_COMMANDS]), HEAVY, id="the command line"),
     pytest.param(
         "import trompe_client.cli.group as g; g.main.get_command(None, 'nothing')",
         HEAVY | {"httpx", "rich"},

@@ -125,8 +125,6 @@ def test_a_server_that_says_nothing_is_given_up_but_may_read_an_upload_for_long(
         assert request.extensions["timeout"] == dict(zip(("connect", "read", "write", "pool"), wanted, strict=True))
         raise httpx.ReadTimeout("nothing", request=request)
 
-    with (
-        Client(server.url, timeout=patience, transport=httpx.MockTransport(silence)) as client,
-        pytest.raises(ServerUnreachable, match="ReadTimeout"),
-    ):
+    client = Client(server.url, timeout=patience, transport=httpx.MockTransport(silence))
+    with client, pytest.raises(ServerUnreachable, match="ReadTimeout"):
         send(client, tmp_path / "net.onnx")

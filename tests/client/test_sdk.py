@@ -154,10 +154,8 @@ def test_a_problem_document_becomes_a_typed_error(status: int, error: type[APIEr
     assert ("for example in TROMPE_TOKEN" in str(caught.value)) == (status == 401)
     fields = [{"field": "epsilon", "message": "too large"}, {"field": "tau", "message": "too small"}]
     body = json.dumps({"title": "Wrong", "status": status, "errors": fields}).encode()
-    with (
-        answering(status, body) as client,
-        pytest.raises(error, match=r"Wrong\. epsilon: too large\. tau: too small\."),
-    ):
+    told = r"Wrong\. epsilon: too large\. tau: too small\."
+    with answering(status, body) as client, pytest.raises(error, match=told):
         list(client.jobs(state="no state of ours"))
 
 

@@ -23,11 +23,8 @@ def job(client: Client, server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> 
 
 def asked(server: FakeServer) -> list[tuple[str | None, str | None]]:
     """What the downloads asked for: (Range, If-None-Match)."""
-    return [
-        (headers.get("Range"), headers.get("If-None-Match"))
-        for _, path, headers in server.requests
-        if "/artifacts/" in path
-    ]
+    asking = [headers for _, path, headers in server.requests if "/artifacts/" in path]
+    return [(headers.get("Range"), headers.get("If-None-Match")) for headers in asking]
 
 
 def test_a_file_that_breaks_off_goes_on_where_it_was(job: JobHandle, server: FakeServer, tmp_path: Path) -> None:

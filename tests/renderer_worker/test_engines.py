@@ -109,24 +109,19 @@ def test_a_texture_is_upright_not_mirrored_and_repeats(shown: SailenvTarget) -> 
     assert (image[0] == BEHIND).all()
 
 
-@pytest.mark.parametrize(
-    ("size", "radius"), [pytest.param((90, 120), 0.1), pytest.param((130, 70), 2e-4), pytest.param((90, 120), 1e5)]
-)
+@pytest.mark.parametrize(("size", "radius"), [((90, 120), 0.1), ((130, 70), 2e-4), ((90, 120), 1e5)])
 def test_the_outline_of_a_sphere_of_any_size_is_where_the_field_of_view_puts_it(
     size: tuple[int, int], radius: float, shown: SailenvTarget
 ) -> None:
-    distance = 4.2 * radius
+    distance, row, column = 4.2 * radius, size[0] // 2, size[1] // 2
     image = picture(shown, sphere(radius), Camera(distance, 30, 20), size=size, background=(0, 0, 0))
-    covered = image[..., 1] / np.median(
-        image[size[0] // 2 - 9 : size[0] // 2 + 9, size[1] // 2 - 9 : size[1] // 2 + 9, 1]
-    )
+    covered = image[..., 1] > 0.5 * np.median(image[row - 9 : row + 9, column - 9 : column + 9, 1])
     expected = size[0] / 2 / np.tan(np.radians(FIELD_OF_VIEW / 2)) * radius / np.sqrt(distance**2 - radius**2)
-    rows, columns = (np.clip(covered, 0, 1) > 0.5).any(axis=1), (np.clip(covered, 0, 1) > 0.5).any(axis=0)
-    for line, side in ((rows, size[0]), (columns, size[1])):
+    for line, side in ((covered.any(axis=1), size[0]), (covered.any(axis=0), size[1])):
         first, last = np.flatnonzero(line)[[0, -1]]
         assert first == pytest.approx(side / 2 - expected, abs=1.0)
         assert last + 1 == pytest.approx(side / 2 + expected, abs=1.0)
-    assert np.sqrt((covered > 0.5).sum() / np.pi) == pytest.approx(expected, abs=0.5)
+    assert np.sqrt(covered.sum() / np.pi) == pytest.approx(expected, abs=0.5)
 
 
 def test_light_comes_from_its_side_with_its_colour(shown: SailenvTarget) -> None:
@@ -269,10 +264,8 @@ def test_an_engine_of_ones_own_has_its_name_its_options_and_the_noise() -> None:
 def test_the_documented_engine_runs(tmp_path: Path) -> None:
     ((_, code),) = blocks("engines.md", "python")
     (tmp_path / "points.py").write_text(code)
-    with (
-        started("--engine", "points:Points", "--set", "size=3", folder=tmp_path) as worker,
-        closing(SailenvTarget(*worker.address)) as target,
-    ):
+    worker = started("--engine", "points:Points", "--set", "size=3", folder=tmp_path)
+    with worker as running, closing(SailenvTarget(*running.address)) as target:
         image = picture(target, boxes(((0.05, 0.04, 0), (0.02, 0.02, 0.02))), Camera(0.3, 0, 0))
         assert str(target.engine) == "points:Points 1 (size=3)"
     rows, columns = np.nonzero((image != BEHIND).any(axis=-1))
@@ -352,12 +345,9 @@ def test_an_engine_without_a_usable_identity_is_refused(kind: type[NoInfo], reas
 
 
 def test_a_picture_of_the_wrong_kind_is_refused() -> None:
+    worker = started("--engine", OWN, "--set", "wrong=yes")
     refused = pytest.raises(RendererError, match=r"Noisy gave float32 \(60, 80, 3\); expected uint8")
-    with (
-        started("--engine", OWN, "--set", "wrong=yes") as worker,
-        closing(SailenvTarget(*worker.address)) as target,
-        refused,
-    ):
+    with worker as running, closing(SailenvTarget(*running.address)) as target, refused:
         picture(target, boxes(), Camera(0.3, 0, 0))
 
 

@@ -159,10 +159,8 @@ def test_a_worker_with_another_engine_is_left_out(
             assert pool.engine.settings == SHARP_SETTINGS
             assert (pool.render(painted(1), VIEWS, size=SIZE) != expected(1)).any()
         pool = RendererPool([other, nobody()], engine=OURS)
-        with (
-            closing(pool),
-            pytest.raises(RendererLostError, match=rf"No renderer with pyrender.*engine is .*{SHARP_SETTINGS}"),
-        ):
+        told = rf"No renderer with pyrender.*engine is .*{SHARP_SETTINGS}"
+        with closing(pool), pytest.raises(RendererLostError, match=told):
             pool.render(painted(1), VIEWS, size=SIZE)
 
 

@@ -261,9 +261,8 @@ class Faults:
             jobs = self._site.store.page(state=JobState.running, limit=20).jobs
         except Exception as error:
             return f"unknown ({type(error).__name__})"
-        return (
-            ", ".join(f"{job.attack.search.seed} ({job.progress.phase}) by {job.worker}" for job in jobs) or "nothing"
-        )
+        told = [f"{job.attack.search.seed} ({job.progress.phase}) by {job.worker}" for job in jobs]
+        return ", ".join(told) or "nothing"
 
     @contextmanager
     def every(self, pause: float, fault: Callable[[], None]) -> Iterator[None]:
@@ -332,9 +331,8 @@ class Submission:
         """The jobs as reported by the API."""
         with self._site.client() as client:
             handles = list(client.jobs(labels={"run": "chaos"}))
-            assert sorted(handle.id for handle in handles) == sorted(self._ids), (
-                "there are more or fewer than submitted"
-            )
+            found = sorted(handle.id for handle in handles)
+            assert found == sorted(self._ids), "there are more or fewer than submitted"
             jobs = {handle.status.attack.search.seed: handle.status for handle in handles}
             digests = {handle.status.attack.search.seed: self._digests(handle) for handle in handles}
         events = {number: self._site.store.events(job.id) for number, job in jobs.items()}  # a client stops early

@@ -91,12 +91,9 @@ class Executed(Queue):
     @contextmanager
     def dispatching(self) -> Iterator[Dispatcher]:
         """Dispatch during the block."""
+        claims, limits = Claims(self.store.engine), self.settings
         dispatcher = Dispatcher(
-            Claims(self.store.engine),
-            self.open,
-            name=NAME,
-            silence=self.settings.silence,
-            stall_timeout=self.settings.stall_timeout,
+            claims, self.open, name=NAME, silence=limits.silence, stall_timeout=limits.stall_timeout
         )
         with dispatcher.running():
             yield dispatcher

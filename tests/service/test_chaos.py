@@ -79,9 +79,7 @@ def check(run: Run, undisturbed: Digests, faults: Faults) -> None:
     assert not any(histories.values()), f"{ {k: v for k, v in histories.items() if v} }\n{faults.story()}"
     assert run.jobs.keys() == undisturbed.keys()
     for number, expected in undisturbed.items():
-        other = {
-            name for name in {*expected, *run.digests[number]} if expected.get(name) != run.digests[number].get(name)
-        }
+        other = {name for name, _ in expected.items() ^ run.digests[number].items()}
         assert not other, f"job {number} (real: {is_real(number)}) made other {sorted(other)}\n{faults.story()}"
 
 

@@ -46,10 +46,7 @@ def found(obj: Object3D, views: Sequence[View], ask: Ask) -> tuple[SamplingModel
 
 @pytest.fixture(scope="module")
 def anisotropic() -> Iterator[Ask]:
-    with (
-        started("--set", "anisotropy=16") as running,
-        closing(SailenvTarget(*running.address, timeout=240)) as target,
-    ):
+    with started("--set", "anisotropy=16") as running, closing(SailenvTarget(*running.address, timeout=240)) as target:
         yield lambda obj, views: target.render(obj, views, size=SIZE)
 
 
