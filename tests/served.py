@@ -78,6 +78,24 @@ def wait_until(
     return value
 
 
+@contextmanager
+def repeating(action: Callable[[], None], *, pause: float) -> Iterator[None]:
+    """Do ``action`` in a thread every ``pause`` seconds during the block."""
+    stop = threading.Event()
+
+    def repeat() -> None:
+        while not stop.wait(pause):
+            action()
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
 class Queue:
     """The API's side of a queue of fake jobs: their record and their folders."""
 

@@ -8,7 +8,6 @@ import os
 import random
 import socket
 import struct
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.served import wait_until
+from tests.served import repeating, wait_until
 from tests.wire import Wire, boxes
 from tests.worker_process import Worker
 from trompe_renderer.world.model import content_key
@@ -167,7 +166,7 @@ def fuzz(address: tuple[str, int], first: int, last: int) -> None:
 
 
 class Witness:
-    """An agent that renders during the test and compares each picture with its first."""
+    """An agent whose every ``look`` is a picture compared with its first."""
 
     def __init__(self, agent: Wire) -> None:
         self._agent = agent
@@ -175,24 +174,12 @@ class Witness:
         agent.look(Camera(0.3, 0, 0))
         self._first = agent.picture()
         self.frames, self.wrong, self.slowest = 0, 0, 0.0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch)
 
-    def __enter__(self) -> "Witness":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def _watch(self) -> None:
-        while not self._stop.is_set():
-            started = time.monotonic()
-            self.wrong += not (self._agent.picture() == self._first).all()
-            self.slowest = max(self.slowest, time.monotonic() - started)
-            self.frames += 1
-            time.sleep(0.005)
+    def look(self) -> None:
+        started = time.monotonic()
+        self.wrong += not (self._agent.picture() == self._first).all()
+        self.slowest = max(self.slowest, time.monotonic() - started)
+        self.frames += 1
 
 
 @pytest.mark.parametrize(
@@ -210,9 +197,10 @@ def test_no_input_crashes_hangs_or_fills_a_worker_or_disturbs_another_agent(inpu
     worker = own_worker
     fuzz(worker.address, 0, 100)  # warms caches up
     memory, before = worker.memory, worker.open
-    with closing(Wire(worker.address)) as agent, Witness(agent) as witness:
-        bounds = [100 + inputs * k // FUZZERS for k in range(FUZZERS + 1)]
-        with ThreadPoolExecutor(FUZZERS) as threads:
+    bounds = [100 + inputs * k // FUZZERS for k in range(FUZZERS + 1)]
+    with closing(Wire(worker.address)) as agent:
+        witness = Witness(agent)
+        with repeating(witness.look, pause=0.005), ThreadPoolExecutor(FUZZERS) as threads:
             list(threads.map(partial(fuzz, worker.address), bounds[:-1], bounds[1:]))
     assert witness.frames > 10
     assert witness.wrong == 0

@@ -5,6 +5,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -41,16 +42,11 @@ def read(models: ModelCache, archive: bytes) -> HashedModel:
 
 
 @pytest.fixture
-def parsed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """An entry for each object that is parsed."""
-    entries: list[int] = []
-
-    def counted(files: dict[str, bytes]) -> Object3D:
-        entries.append(1)
-        return object_from_files(files)
-
+def parsed(monkeypatch: pytest.MonkeyPatch) -> Mock:
+    """Is called for each object that is parsed."""
+    counted = Mock(wraps=object_from_files)
     monkeypatch.setattr(upload, "object_from_files", counted)
-    return entries
+    return counted
 
 
 @settings(max_examples=20)
@@ -68,13 +64,13 @@ def test_however_it_comes_the_same_content_is_the_same_model(sizes: dict[str, tu
     assert (whole.key == first.key) == (not textures)
 
 
-def test_an_archive_that_differs_in_an_albedo_alone_is_not_parsed_again(parsed: list[int]) -> None:
+def test_an_archive_that_differs_in_an_albedo_alone_is_not_parsed_again(parsed: Mock) -> None:
     models, box = cache(), boxes()
     read(models, box.to_zip())
     read(models, box.with_textures({"front_albedo.png": noise(1, 8, 8)}).to_zip())
     with pytest.raises(ObjectError, match="front_albedo"):
         read(models, pack_zip({**box.files, "front_albedo.png": b"no picture"}))
-    assert len(parsed) == 1
+    assert parsed.call_count == 1
 
 
 def test_an_archive_that_differs_in_the_alpha_of_an_albedo_has_its_own() -> None:
@@ -84,16 +80,12 @@ def test_an_archive_that_differs_in_the_alpha_of_an_albedo_has_its_own() -> None
 
 
 def test_alphas_are_decoded_once_however_often_an_object_is_painted(monkeypatch: pytest.MonkeyPatch) -> None:
-    decoded: list[bytes] = []
-
-    def counted(data: bytes, *, blended: bool) -> None:
-        decoded.append(data)
-
-    monkeypatch.setattr("trompe_renderer.world.model.opacity_of", counted)
+    decoded = Mock(return_value=None)
+    monkeypatch.setattr("trompe_renderer.world.model.opacity_of", decoded)
     model = model_of(boxes())
     keys = {repainted(model, {"front_albedo.png": noise(seed, 4, 4)}).key for seed in range(3)}
     assert len(keys) == 3
-    assert len(decoded) == len(model.obj.textures)
+    assert decoded.call_count == len(model.obj.textures)
 
 
 def test_any_other_difference_makes_another_shape() -> None:
@@ -121,12 +113,12 @@ def test_only_albedo_textures_with_texels_can_be_painted(textures: dict[str, Any
         repainted(model_of(boxes(maps={"normal": noise(1, 4, 4)})), textures)
 
 
-def test_a_cache_forgets_the_model_used_longest_ago(parsed: list[int]) -> None:
+def test_a_cache_forgets_the_model_used_longest_ago(parsed: Mock) -> None:
     models = cache(cached_models=3)
     archives = [boxes(((0, 0, 0), (0.1 + k / 100, 0.06, 0.04))).to_zip() for k in range(4)]
     for number, count in ((0, 1), (1, 2), (2, 3), (0, 3), (3, 4), (0, 4), (1, 5)):
         read(models, archives[number])
-        assert len(parsed) == count
+        assert parsed.call_count == count
 
 
 def test_a_cache_keeps_the_last_models_within_a_number_of_bytes() -> None:

@@ -5,8 +5,9 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -45,13 +46,11 @@ def nobody() -> Iterator[Nobody]:
 @pytest.fixture(scope="module")
 def expected(worker: Address) -> Expected:
     """Images by one undisturbed worker of the box painted with a seed."""
-    shown: dict[int, np.ndarray] = {}
 
+    @cache
     def images(seed: int) -> np.ndarray:
-        if seed not in shown:
-            with closing(SailenvTarget(*worker)) as target:
-                shown[seed] = target.render(painted(seed), VIEWS, size=SIZE)
-        return shown[seed]
+        with closing(SailenvTarget(*worker)) as target:
+            return target.render(painted(seed), VIEWS, size=SIZE)
 
     return images
 
@@ -133,12 +132,9 @@ def test_a_worker_that_comes_back_is_used_again(own_worker: Worker, expected: Ex
 def test_an_interrupted_request_ends_at_once_and_the_pool_goes_on(
     worker: Address, second_worker: Address, expected: Expected
 ) -> None:
-    def interrupt() -> None:
-        raise KeyboardInterrupt
-
     with closing(Pool([worker, second_worker])) as pool:
         with pytest.raises(KeyboardInterrupt):
-            pool.render(painted(1), VIEWS, size=SIZE, on_frame=interrupt)
+            pool.render(painted(1), VIEWS, size=SIZE, on_frame=Mock(side_effect=KeyboardInterrupt))
         assert not any(thread.name.startswith("render at") for thread in threading.enumerate())
         assert (pool.render(painted(2), VIEWS, size=SIZE) == expected(2)).all()
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.served import reserved_port, wait_until
+from tests.served import repeating, reserved_port, wait_until
 from tests.wire import ORIGIN, Wire, boxes
 from tests.worker_process import Worker
 from trompe_renderer.engines.render_thread import FairQueue, RenderThread
@@ -58,20 +58,10 @@ def test_a_request_that_arrives_byte_by_byte_is_cut_off_in_time(pair: Pair) -> N
     link = link_of(pair, request_timeout=0.3)
     pair[0].sendall(b"!")
     link.wait()
-    stop = threading.Event()
-
-    def drip() -> None:
-        while not stop.wait(0.05):
-            pair[0].sendall(b".")
-
-    thread = threading.Thread(target=drip)
-    thread.start()
     started = time.monotonic()
-    with pytest.raises(TimeoutError):
+    with repeating(lambda: pair[0].sendall(b"."), pause=0.05), pytest.raises(TimeoutError):
         link.read(1000)
     assert time.monotonic() - started < 30  # all of it would take 50
-    stop.set()
-    thread.join()
 
 
 def test_an_agent_that_takes_no_reply_is_given_up(pair: Pair) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -32,11 +33,11 @@ def renderer(request: pytest.FixtureRequest) -> Iterator[TargetRenderer]:
 
 
 def test_images_have_the_size_asked_for_one_for_each_view_and_are_the_same_again(renderer: TargetRenderer) -> None:
-    called: list[None] = []
-    images = renderer.render(boxes(), VIEWS, size=SIZE, on_frame=lambda: called.append(None))
+    called = Mock()
+    images = renderer.render(boxes(), VIEWS, size=SIZE, on_frame=called)
     assert images.shape == (4, *SIZE, 3)
     assert images.dtype == np.uint8
-    assert len(called) == 4
+    assert called.call_count == 4
     assert (renderer.render(boxes(), VIEWS, size=SIZE) == images).all()
     assert renderer.render(boxes(), [], size=SIZE).shape == (0, *SIZE, 3)
 
@@ -151,12 +152,9 @@ def test_a_broken_object_is_refused_with_the_renderers_reason(target: SailenvTar
 
 
 def test_a_target_goes_on_after_it_was_interrupted_or_closed(target: SailenvTarget) -> None:
-    def interrupt() -> None:
-        raise KeyboardInterrupt
-
     expected = target.render(boxes(), VIEWS, size=SIZE)
     with pytest.raises(KeyboardInterrupt):
-        target.render(boxes(), VIEWS, size=SIZE, on_frame=interrupt)
+        target.render(boxes(), VIEWS, size=SIZE, on_frame=Mock(side_effect=KeyboardInterrupt))
     assert (target.render(boxes(), VIEWS, size=SIZE) == expected).all()
     target.close()
     assert (target.render(boxes(), VIEWS, size=SIZE) == expected).all()

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
+from unittest.mock import DEFAULT, Mock
 
 import numpy as np
 import pytest
@@ -249,10 +250,7 @@ def test_each_view_is_sent_after_the_one_before_is_drained(
 def test_an_internal_error_is_answered_in_full_like_a_refusal(
     broken: Wire, monkeypatch: pytest.MonkeyPatch, command: str, values: dict[str, Any], answer: Any
 ) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise MemoryError("none left")
-
-    monkeypatch.setattr(Session, command, fail)
+    monkeypatch.setattr(Session, command, Mock(side_effect=MemoryError("none left")))
     if command == "load_scenario":
         assert broken.load(values["scenario"]) == answer
     elif answer is None:
@@ -288,24 +286,12 @@ def test_a_large_frame_waits_until_there_is_memory_for_it_and_a_small_one_does_n
         agent.views(ALL_VIEWS)  # the reservation has ended
 
 
-class _Exhausted:
-    """A listening socket without a file descriptor for the first agent."""
-
-    def __init__(self, listener: socket.socket) -> None:
-        self._listener, self._failed = listener, False
-        self.fileno, self.getsockname, self.close = listener.fileno, listener.getsockname, listener.close
-
-    def accept(self) -> Any:
-        if not self._failed:
-            self._failed = True
-            raise OSError(24, "Too many open files")
-        return self._listener.accept()
-
-
 def test_an_agent_that_cannot_be_accepted_does_not_end_the_worker(
     wire: Connect, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with running_server(_Exhausted(socket.create_server(("127.0.0.1", 0)))) as server:
+    listener = Mock(wraps=socket.create_server(("127.0.0.1", 0)))
+    listener.accept.side_effect = [OSError(24, "Too many open files"), DEFAULT]  # the first time, and then as usual
+    with running_server(listener) as server:
         assert wire(server.address).ask("get_position") == (0, 0, 0)
     assert "cannot be accepted: [Errno 24]" in caplog.text
 

@@ -11,14 +11,14 @@ import subprocess
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
 
-from tests.served import CHILD, FAKE, ancestry, command_line, command_of, process_table, reserved_port, wait_until
+from tests.served import CHILD, FAKE, command_line, command_of, descendants, repeating, reserved_port, wait_until
 from tests.service.ray_nodes import ACCESS, RayNodes
 from trompe_client import Client, Retries
 from trompe_client._job import JobHandle
@@ -157,13 +157,12 @@ class Site:
 
     def processes(self) -> dict[str, list[int]]:
         """Ids of our living processes, by kind."""
-        table = process_table()
         roots = {kept.process.pid for kept in self._kept if kept.process is not None}
         roots |= {self.nodes.process.pid} if self.nodes is not None else set()
         found: dict[str, list[int]] = {kind: [] for kind in KINDS.values()}
-        for pid in sorted(table):
+        for pid in sorted(roots.union(*map(descendants, roots))):
             kind = kind_of(pid)
-            if kind is not None and roots & set(ancestry(pid, table)):
+            if kind is not None:
                 found[kind].append(pid)
         return found
 
@@ -264,25 +263,16 @@ class Faults:
         told = [f"{job.attack.search.seed} ({job.progress.phase}) by {job.worker}" for job in jobs]
         return ", ".join(told) or "nothing"
 
-    @contextmanager
-    def every(self, pause: float, fault: Callable[[], None]) -> Iterator[None]:
+    def every(self, pause: float, fault: Callable[[], None]) -> AbstractContextManager[None]:
         """Inject ``fault`` every ``pause`` seconds during the block."""
-        stop = threading.Event()
 
-        def repeat() -> None:
-            while not stop.wait(pause):
-                try:
-                    fault()
-                except Exception as error:
-                    self.tell(f"FAILED: {type(error).__name__}: {error}")
+        def inject() -> None:
+            try:
+                fault()
+            except Exception as error:
+                self.tell(f"FAILED: {type(error).__name__}: {error}")
 
-        thread = threading.Thread(target=repeat, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            thread.join()
+        return repeating(inject, pause=pause)
 
 
 @dataclass(frozen=True)

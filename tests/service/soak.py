@@ -2,19 +2,18 @@
 
 import csv
 import os
-import threading
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import theilslopes
 
-from tests.served import Served, ancestry, process_table
+from tests.served import Served, ancestry, process_table, repeating
 from tests.service.chaos import KINDS, kind_of
 
 MIB: Final = 2**20
@@ -64,34 +63,21 @@ class Soaked(Served):
         return [size for place in PASSING for size in _sizes(self.home / place)]
 
 
-class Watch:
-    """Samples ``service`` every ``every`` seconds during the block, and writes the samples to ``file``."""
+@contextmanager
+def watching(service: Soaked, file: Path, *, every: float) -> Iterator[list[Row]]:
+    """The samples of ``service`` every ``every`` seconds during the block, which are written to ``file`` too."""
+    started, rows = time.monotonic(), list[Row]()
 
-    def __init__(self, service: Soaked, file: Path, *, every: float) -> None:
-        self._service, self._file, self._every = service, file, every
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._look, daemon=True)
-        self.rows: list[Row] = []
+    def look() -> None:
+        rows.append({"seconds": time.monotonic() - started} | service.sample())
+        writer = csv.DictWriter(table, list(rows[0]))
+        if len(rows) == 1:
+            writer.writeheader()
+        writer.writerow({name: round(value, 1) for name, value in rows[-1].items()})
+        table.flush()
 
-    def _look(self) -> None:
-        started = time.monotonic()
-        with self._file.open("w", newline="") as file:
-            while not self._stopping.is_set():
-                self.rows.append({"seconds": time.monotonic() - started} | self._service.sample())
-                writer = csv.DictWriter(file, list(self.rows[0]))
-                if len(self.rows) == 1:
-                    writer.writeheader()
-                writer.writerow({name: round(value, 1) for name, value in self.rows[-1].items()})
-                file.flush()
-                self._stopping.wait(self._every)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self._stopping.set()
-        self._thread.join()
+    with file.open("w", newline="") as table, repeating(look, pause=every):
+        yield rows
 
 
 @dataclass(frozen=True)

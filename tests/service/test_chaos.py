@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -43,17 +44,15 @@ def _quiet(caplog: pytest.LogCaptureFixture) -> None:
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Digests]:
     """Digests of the first ``count`` jobs without faults."""
-    known: dict[int, Digests] = {}
 
+    @cache
     def digests(count: int) -> Digests:
-        if count not in known:
-            folder = tmp_path_factory.mktemp("undisturbed")
-            url = f"sqlite:///{folder / 'trompe.sqlite'}"
-            with Site(folder, url, scattered=False, silence=60, phase_seconds=0) as site:
-                submission = Submission(site, count, pause=0)
-                submission.wait(seconds=PATIENCE, story=site.log)
-                known[count] = submission.run().digests
-        return known[count]
+        folder = tmp_path_factory.mktemp("undisturbed")
+        url = f"sqlite:///{folder / 'trompe.sqlite'}"
+        with Site(folder, url, scattered=False, silence=60, phase_seconds=0) as site:
+            submission = Submission(site, count, pause=0)
+            submission.wait(seconds=PATIENCE, story=site.log)
+            return submission.run().digests
 
     return digests
 

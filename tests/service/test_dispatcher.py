@@ -5,6 +5,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -96,15 +97,12 @@ def test_an_executor_that_is_lost_is_opened_again_and_the_jobs_go_on(executed: E
         opened.append(executed.open())
         return opened[-1]
 
-    def lost(timeout: float) -> list[object]:
-        raise ServiceError("The cluster was lost.")
-
     job = executed.submit("gate")
     claims = Claims(executed.store.engine)
     ours = Dispatcher(claims, open_executor, name="ours", silence=60, stall_timeout=60)
     with ours.running():
         wait_until(lambda: executed.in_gate(job))
-        opened[0].ended = lost  # type: ignore[method-assign, assignment]
+        opened[0].ended = Mock(side_effect=ServiceError("The cluster was lost."))  # type: ignore[method-assign]
         wait_until(lambda: len(opened) == 3 and ours.fault is None)
         wait_until(lambda: executed.state(job).attempts == 2 and executed.in_gate(job))
         executed.open_gate(job)

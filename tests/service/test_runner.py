@@ -9,6 +9,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
+from unittest.mock import Mock
 
 import pytest
 from prometheus_client import REGISTRY
@@ -130,36 +131,22 @@ def test_progress_that_cannot_be_written_stops_nothing(store: JobStore) -> None:
 def test_a_phase_that_finds_damage_has_the_one_before_run_again(
     store: JobStore, caplog: pytest.LogCaptureFixture
 ) -> None:
-    broken = {"c": 1, "b": 1}
-
-    def needy(name: str) -> Phase:
-        def phase(_: OnProgress) -> None:
-            if broken.get(name):
-                broken[name] -= 1
-                raise DamagedFileError("a checksum is wrong")
-
-        return phase
-
-    pipeline = Scripted(a=nothing, b=needy("b"), c=needy("c"))
+    needy = [DamagedFileError("a checksum is wrong"), None, None]
+    pipeline = Scripted(a=nothing, b=Mock(side_effect=needy), c=Mock(side_effect=needy))
     assert run(store, pipeline) is JobState.succeeded
     assert pipeline.ran == ["a", "b", "a", "b", "c", "b", "c"]
     assert caplog.text.count("repeats the previous phase: a checksum is wrong") == 2
 
 
 def test_damage_that_does_not_go_away_fails_the_job_with_its_words(store: JobStore) -> None:
-    def hopeless(_: OnProgress) -> None:
-        raise DamagedFileError("the disk is broken")
-
+    hopeless = Mock(side_effect=DamagedFileError("the disk is broken"))
     assert run(store, Scripted(a=nothing, b=hopeless)) is JobState.failed
     (job,) = store.page().jobs
     assert job.error == "the disk is broken"
 
 
 def test_a_full_disk_is_told_in_words(store: JobStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     pipeline = Scripted(a=lambda _: LocalArtifacts(tmp_path / "job").write("state.npz", b"0"))
     assert run(store, pipeline) is JobState.failed
     (job,) = store.page().jobs

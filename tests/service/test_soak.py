@@ -20,7 +20,7 @@ import pytest
 
 from tests.security.test_hostile_uploads import ARCHIVES, obj_files
 from tests.served import wait_until
-from tests.service.soak import LEAST_SAMPLES, Soaked, Watch, trend, trends
+from tests.service.soak import LEAST_SAMPLES, Soaked, trend, trends, watching
 from tests.small_models import large_png, zipped
 from trompe_client import BadRequest, Client, JobCancelled
 from trompe_client._job import JobHandle
@@ -145,7 +145,7 @@ def test_in_hours_of_mixed_use_memory_handles_threads_and_disk_stay_flat(
     with Soaked(tmp_path, kept=kept) as service, Client(service.url) as client:
         user, before = User(client, tmp_path / "user"), service.processes()
         begun, warm = time.monotonic(), duration / 4
-        with Watch(service, file, every=min(30.0, duration / 180)) as watch:
+        with watching(service, file, every=min(30.0, duration / 180)) as rows:
             for action in user.actions():
                 known = len(user.seen)
                 action()
@@ -158,7 +158,7 @@ def test_in_hours_of_mixed_use_memory_handles_threads_and_disk_stay_flat(
         wait_until(lambda: not service.passing(), seconds=2 * kept + 60, story=lambda: "retention leaves files behind")
         assert list(client.jobs()) == []
         assert service.processes() == before, f"a process was started again\n{service.log.read_text()[-4000:]}"
-    found = trends(watch.rows, warm=warm)
+    found = trends(rows, warm=warm)
     story = "\n".join([str(dict(user.counts)), *map(str, found)])
     logger.info("%.0f minutes\n%s", MINUTES, story)
     assert "Traceback" not in service.log.read_text()

@@ -7,9 +7,10 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -65,13 +66,6 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Folder:
             return open_folder(f"memory://{secrets.token_hex(4)}/folder")
         case _:
             return open_folder(f"{request.getfixturevalue('bucket')}/{secrets.token_hex(4)}")
-
-
-def raising(error: Exception) -> Callable[..., Any]:
-    def fail(*_: Any, **__: Any) -> None:
-        raise error
-
-    return fail
 
 
 def test_a_file_is_read_as_it_was_written_last(folder: Folder, tmp_path: Path) -> None:
@@ -130,9 +124,8 @@ def test_a_url_of_no_store_is_refused_with_a_remedy(url: str, reason: str) -> No
 
 
 def test_a_store_that_cannot_be_reached_is_told_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = open_folder("memory://gone")
-
-    monkeypatch.setattr(type(folder.system), "cat_file", raising(ConnectionError("nobody there")))  # type: ignore[union-attr]
+    folder, away = open_folder("memory://gone"), Mock(side_effect=ConnectionError("nobody there"))
+    monkeypatch.setattr(type(folder.system), "cat_file", away)  # type: ignore[union-attr]
     with pytest.raises(ServiceError, match=r"is not available.*TROMPE_STORE"):
         folder.read("a")
 
@@ -146,7 +139,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(
 ) -> None:
     folder = LocalArtifacts(tmp_path / "full")
     folder.write("a.bin", b"old")
-    monkeypatch.setattr(os, "fsync", raising(fault))
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=fault))
     with pytest.raises(expected, match="no space left"):
         folder.write("a.bin", b"new")
     assert folder.read("a.bin") == b"old"
@@ -282,7 +275,7 @@ def test_a_job_whose_files_cannot_be_deleted_stays_until_they_can(
     assert job_artifacts(files, job).names() == ["result.json"]
     claims_of(store).finish(claim(store), DONE)
     with monkeypatch.context() as patch:
-        patch.setattr(type(files.system), "rm", raising(ConnectionError("nobody there")))  # type: ignore[union-attr]
+        patch.setattr(type(files.system), "rm", Mock(side_effect=ConnectionError("nobody there")))  # type: ignore[union-attr]
         with pytest.raises(ServiceError, match="not available"):
             delete_job(store, files, job)
         assert store.get(job).state is JobState.succeeded
@@ -295,7 +288,7 @@ def test_a_job_whose_files_cannot_be_deleted_stays_until_they_can(
 def test_a_local_folder_that_cannot_be_deleted_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = open_folder(tmp_path / "job")
     folder.write("a", b"1")
-    monkeypatch.setattr(shutil, "rmtree", raising(PermissionError("read-only")))
+    monkeypatch.setattr(shutil, "rmtree", Mock(side_effect=PermissionError("read-only")))
     with pytest.raises(ServiceError, match="cannot be deleted"):
         folder.delete_all()
 
