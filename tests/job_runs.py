@@ -128,7 +128,6 @@ class Recorder(FakeTarget):
 
     @property
     def images(self) -> int:
-        """Number of images so far."""
         return sum(len(views) for _, views in self.asked)
 
     def render(self, obj: Object3D, views: Sequence[View], **options: Any) -> NDArray[np.uint8]:

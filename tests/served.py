@@ -181,7 +181,6 @@ class Served(Queue, Child):
         return self
 
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
-        """End it and return its exit status."""
         self.http.close()
         status = self.end(number)
         self.close()

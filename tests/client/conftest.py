@@ -225,13 +225,11 @@ class FakeServer:
         self.jobs[job_id] = self.jobs[job_id].model_copy(update=update)
 
     def cancel(self, job_id: str) -> None:
-        """The job's story ends here."""
         first = self.history[job_id][0]
         self.history[job_id] = [first, first.model_copy(update={"id": 2, "state": JobState.cancelled})]
         self.reach(job_id, self.history[job_id][-1])
 
     def finish_all(self) -> None:
-        """All jobs end."""
         for job_id, job in self.jobs.items():
             if not job.state.final:
                 self.reach(job_id, self.history[job_id][-1])
@@ -244,7 +242,6 @@ class FakeServer:
         return b"<html>" if name.endswith(".html") else self.result(job_id).model_dump_json().encode()
 
     def name_of(self, job_id: str) -> str:
-        """Name of a job's object."""
         reference = self.jobs[job_id].attack.object
         return [one.name for one in self.objects if reference in {one.id, one.name}][-1]
 

@@ -43,7 +43,6 @@ def docker(*arguments: str, timeout: float = 240, check: bool = True, **options:
 
 
 def answers(*arguments: str) -> bool:
-    """Whether ``docker`` can do this."""
     try:
         docker(*arguments, timeout=600)
     except (AssertionError, OSError, subprocess.TimeoutExpired):
@@ -61,7 +60,6 @@ class Stack:
     _token: str = ""
 
     def compose(self, *arguments: str, timeout: float = 900) -> str:
-        """Run ``docker compose``; what it prints."""
         files = [word for file in self.files for word in ("--file", str(file))]
         command = ["compose", "--project-directory", str(ROOT), "--project-name", self.project, *files, *arguments]
         return docker(*command, timeout=timeout, env=os.environ | self.environment)
@@ -91,20 +89,16 @@ class Stack:
         return self._token
 
     def image(self, name: str) -> str:
-        """An image of ours, by the name of its target."""
         return f"trompe-{name}:{VERSION}"
 
     def inspect(self, container: str) -> dict[str, Any]:
-        """What the engine knows of a container."""
         found: dict[str, Any] = json.loads(docker("inspect", container))[0]
         return found
 
     def run_in(self, container: str, *command: str, check: bool = True) -> str:
-        """What a command in a container prints."""
         return docker("exec", container, *command, check=check)
 
     def renewed(self, **environment: str) -> "Stack":
-        """The same project with other variables."""
         return Stack(self.files, self.environment | environment, self.project, self._token)
 
 

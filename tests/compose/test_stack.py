@@ -58,7 +58,6 @@ def outcome(job: JobHandle, folder: Path) -> Outcome:
 
 
 def in_the_attack(job: JobHandle) -> bool:
-    """Whether the job is in the middle of its attack."""
     status = job.refresh()
     assert not status.state.final, status
     return status.progress.phase == "attack" and status.progress.fraction > 0.45
@@ -156,12 +155,10 @@ CONNECT: Final = "import socket, sys; socket.create_connection((sys.argv[1], int
 
 
 def reaches(stack: Stack, container: str, host: str, port: int) -> bool:
-    """Whether a connection can be made from inside a container."""
     return "yes" in stack.run_in(container, "sh", "-c", f"python -c '{CONNECT}' {host} {port} && echo yes", check=False)
 
 
 def address(stack: Stack, container: str, network: str) -> str:
-    """The address of a container in one of its networks."""
     found = stack.inspect(container)["NetworkSettings"]["Networks"]
     return str(next(each["IPAddress"] for name, each in found.items() if name.endswith(f"_{network}")))
 

@@ -52,7 +52,6 @@ def request(number: int) -> JobRequest:
 
 
 def is_real(number: int) -> bool:
-    """Whether the job with this number is a real attack."""
     return request(number).search.steps > 1
 
 
@@ -79,7 +78,6 @@ class Kept:
             self._stopping.wait(RESTART)
 
     def close(self) -> None:
-        """End it."""
         self._stopping.set()
         if self.process is not None:
             self.process.terminate()
@@ -196,7 +194,6 @@ class Site:
         self.close()
 
     def close(self) -> None:
-        """End all processes."""
         with ThreadPoolExecutor(len(self._kept)) as threads:
             list(threads.map(Kept.close, self._kept))
         self.store.close()
@@ -213,7 +210,6 @@ class Faults:
         self.counts: Counter[str] = Counter()
 
     def tell(self, words: str) -> None:
-        """Log an event."""
         self._told.append(f"{time.monotonic() - self._started:7.1f} s  {words}")
         logger.info(self._told[-1])
 
@@ -222,7 +218,6 @@ class Faults:
         return "\n".join([*self._told, self._site.log()])
 
     def kill(self) -> None:
-        """Kill a random process."""
         kind = self._random.choice([*SHARES, "node"] if self._site.nodes is not None else SHARES)
         place = self._random.random()
         if kind == "node" and self._site.kill_node(place):

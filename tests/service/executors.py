@@ -83,14 +83,12 @@ class Executed(Queue):
         self.setup = Setup(self.settings, RendererAddresses((("127.0.0.1", renderer),)))
 
     def open(self) -> Executor:
-        """Start the executor."""
         if not self._fake:
             return open_executor(self.settings, self.setup.renderers, mark=NAME)
         return FakeExecutor(self.setup, [Needs(), Needs(), Needs(gpu=1)])
 
     @contextmanager
     def dispatching(self) -> Iterator[Dispatcher]:
-        """Dispatch during the block."""
         claims, limits = Claims(self.store.engine), self.settings
         dispatcher = Dispatcher(
             claims, self.open, name=NAME, silence=limits.silence, stall_timeout=limits.stall_timeout

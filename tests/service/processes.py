@@ -41,8 +41,6 @@ def _greet(server: socket.socket) -> None:
 
 
 class WorkerProcess(Child):
-    """A ``trompe worker`` of ``settings``."""
-
     def __init__(self, settings: Settings, renderers: list[str], **environment: str) -> None:
         own = {
             "TROMPE_DATA": str(settings.data),
@@ -69,7 +67,6 @@ class Service(Queue):
 
     @contextmanager
     def worker(self, *, renderers: list[str] | None = None, **environment: str) -> Iterator[WorkerProcess]:
-        """A running worker."""
         words = renderers or ["--renderer", f"127.0.0.1:{self.renderer}"]
         with closing(WorkerProcess(self.settings, words, **environment)) as running:
             yield running.start()

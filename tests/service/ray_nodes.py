@@ -43,7 +43,6 @@ class RayNodes:
         return self.nodes[-1]
 
     def kill(self, node: str) -> None:
-        """Kill a node with all its processes."""
         self.nodes.remove(node)
         self._ask(kill=node)
 

@@ -91,7 +91,6 @@ class Trend:
 
     @property
     def flat(self) -> bool:
-        """Whether it did not grow."""
         return self.grew <= self.allowed
 
     def __str__(self) -> str:

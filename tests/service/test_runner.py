@@ -55,7 +55,6 @@ def runner_of(claims: Claims, job: Scripted, **options: Any) -> JobRunner:
 
 
 def run(store: JobStore, scripted: Scripted, *, claims: Claims | None = None, **options: Any) -> JobState | None:
-    """Submit a job and run it."""
     job = create(store)
     state = runner_of(claims or claims_of(store), scripted, **options).run(claim(store))
     assert state is None or store.get(job).state is state

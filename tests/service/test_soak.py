@@ -38,7 +38,6 @@ POOL = {"pool": 12, "views_per_step": 6, "held_out": 4, "steps": 10}
 
 
 def hostile_files() -> dict[str, bytes]:
-    """Files to be refused, by name."""
     return {
         "bomb.zip": ARCHIVES["a zip bomb"][0](),
         "picture.zip": zipped(obj_files(t__png=large_png(20_000, 20_000))),
@@ -65,7 +64,6 @@ class User:
         return [self._folder / name for name in files]
 
     def actions(self) -> Iterator[Callable[[], None]]:
-        """An endless cycle of actions."""
         return itertools.cycle(
             [
                 lambda: self.attack("grid", GRID),
@@ -94,7 +92,6 @@ class User:
         self.counts[kind] += 1
 
     def attack_a_glb(self) -> None:
-        """Upload the next shipped object as GLB, attack it, and fetch everything."""
         chosen = self._next()
         (file,) = self._saved({f"{chosen.name}.glb": write_glb(load_object(chosen.read()))})
         self._fetch(self._submit(file, chosen.label, GRID).wait(600))
@@ -110,13 +107,11 @@ class User:
         shutil.rmtree(folder)
 
     def upload_something_hostile(self) -> None:
-        """Upload a hostile file."""
         with pytest.raises(BadRequest):
             self._client.upload_object(next(self._hostile))
         self.counts["refused"] += 1
 
     def cancel_a_long_one(self) -> None:
-        """Cancel a job in the middle of its attack."""
         chosen = self._next()
         job = self._submit(chosen.name, chosen.label, GRID | {"steps": 10_000})
         while not job.refresh().progress.step:
@@ -128,7 +123,6 @@ class User:
         self.counts["cancelled"] += 1
 
     def delete_one(self) -> None:
-        """Run a job and delete it."""
         self._submit("mug", "mug", GRID).wait(600).delete()
         self.counts["deleted"] += 1
 
