@@ -5,6 +5,7 @@ Like a graphics card it refuses tensors of other devices, so a tensor on the wro
 
 from collections.abc import Callable
 from functools import cache
+from types import SimpleNamespace
 from typing import Any, Final
 
 import pytest
@@ -88,33 +89,17 @@ def _check_together(name: str, tensors: list[Tensor], some_here: bool) -> None:
         raise RuntimeError(f"{name}: tensors on several devices: {[(str(t.device), tuple(t.shape)) for t in tensors]}")
 
 
-class _Module:
-    """A device's module, as torch expects it."""
-
-    def is_initialized(self) -> bool:
-        return True
-
-    def is_available(self) -> bool:
-        return True
-
-    def current_device(self) -> int:
-        return 0
-
-    def device_count(self) -> int:
-        return 1
-
-    def _is_in_bad_fork(self) -> bool:
-        return False
-
-    def manual_seed_all(self, seed: int) -> None:
-        """The random state is empty."""
-
-    def get_rng_state(self, device: Any = None) -> Tensor:
-        return torch.empty(0, dtype=torch.uint8)
-
-    def set_rng_state(self, state: Tensor, device: Any = None) -> None:
-        """The random state is empty."""
-
+MODULE: Final = SimpleNamespace(
+    is_initialized=lambda: True,
+    is_available=lambda: True,
+    current_device=lambda: 0,
+    device_count=lambda: 1,
+    _is_in_bad_fork=lambda: False,
+    manual_seed_all=lambda seed: None,
+    get_rng_state=lambda device=None: torch.empty(0, dtype=torch.uint8),
+    set_rng_state=lambda state, device=None: None,
+)
+"""The device's module, as torch expects it; its random state is empty."""
 
 POSSIBLE: Final = (
     hasattr(backend_registration, "_setup_privateuseone_for_python_backend") and not torch.cuda.is_available()
@@ -128,7 +113,7 @@ def register() -> Library | None:
     """Register the device. Call before the first gradient of the process, when torch counts its devices."""
     if not POSSIBLE:
         return None
-    backend_registration._setup_privateuseone_for_python_backend(NAME, backend_module=_Module())
+    backend_registration._setup_privateuseone_for_python_backend(NAME, backend_module=MODULE)
     library = Library("_", "IMPL")  # type: ignore[no-untyped-call]
     library.fallback(lambda func, *args, **kwargs: _compute(func, args, kwargs), "PrivateUse1")  # type: ignore[no-untyped-call]
     return library

@@ -66,6 +66,12 @@ def boxes(
     return object_from_files(files | {f"{name}.png": encode_png(image) for name, image in (maps or {}).items()})
 
 
+def speckled(*seed: int) -> Object3D:
+    """A box with a random texture on each side."""
+    random, box = np.random.default_rng(seed), boxes()
+    return box.with_textures({name: random.integers(0, 256, (16, 16, 3), dtype=np.uint8) for name in box.textures})
+
+
 def linear(picture: NDArray[np.float64]) -> NDArray[np.float64]:
     """Linear light of sRGB levels from 0 to 255."""
     level = picture / 255

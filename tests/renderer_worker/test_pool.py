@@ -13,13 +13,12 @@ import numpy as np
 import pytest
 
 from tests.served import reserved_port
-from tests.wire import boxes
+from tests.wire import boxes, speckled
 from tests.worker_process import SHARP, SHARP_SETTINGS, Worker, started
 from trompe_server.renderers import RendererPool, SailenvTarget, TargetRenderer
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, RendererLostError
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import Object3D
 
 SIZE = (40, 56)
 VIEWS = [View(Camera(0.3, 9 * k, k), Light(5 * k, 40, 0.5, 0.3)) for k in range(24)]
@@ -31,11 +30,6 @@ Pool = partial(RendererPool, patience=120.0)
 """For workers that answer, or refuse at once: a busy machine may hold them up for longer than a user would wait."""
 
 
-def painted(seed: int) -> Object3D:
-    random, box = np.random.default_rng(seed), boxes()
-    return box.with_textures({name: random.integers(0, 256, (16, 16, 3), dtype=np.uint8) for name in box.textures})
-
-
 @pytest.fixture
 def nobody() -> Iterator[Nobody]:
     """Makes addresses where nothing listens."""
@@ -45,12 +39,12 @@ def nobody() -> Iterator[Nobody]:
 
 @pytest.fixture(scope="module")
 def expected(worker: Address) -> Expected:
-    """Images by one undisturbed worker of the box painted with a seed."""
+    """Images by one undisturbed worker of the box speckled with a seed."""
 
     @cache
     def images(seed: int) -> np.ndarray:
         with closing(SailenvTarget(*worker)) as target:
-            return target.render(painted(seed), VIEWS, size=SIZE)
+            return target.render(speckled(seed), VIEWS, size=SIZE)
 
     return images
 
@@ -69,9 +63,9 @@ def test_a_worker_lost_in_the_middle_costs_no_view_and_no_picture_is_wrong(
             own_worker.process.send_signal(number)
 
     with closing(RendererPool([own_worker.address, worker], suspicion=0.3, patience=10.0)) as pool:
-        pool.render(painted(1), VIEWS, size=SIZE)
-        images = pool.render(painted(2), VIEWS, size=SIZE, on_frame=on_frame)
-        again = pool.render(painted(3), VIEWS, size=SIZE)
+        pool.render(speckled(1), VIEWS, size=SIZE)
+        images = pool.render(speckled(2), VIEWS, size=SIZE, on_frame=on_frame)
+        again = pool.render(speckled(3), VIEWS, size=SIZE)
     assert shown == len(VIEWS)
     assert (images == expected(2)).all()
     assert (again == expected(3)).all()
@@ -85,7 +79,7 @@ def test_many_requests_at_a_time_each_get_their_own_texture_while_a_worker_dies(
 
     def ask(seed: int) -> None:
         for _ in range(3):
-            images = pool.render(painted(seed), VIEWS, size=SIZE, on_frame=begun.set)
+            images = pool.render(speckled(seed), VIEWS, size=SIZE, on_frame=begun.set)
             assert (images == wanted[seed]).all()
 
     with closing(Pool([own_worker.address, worker])) as pool, ThreadPoolExecutor(len(wanted)) as threads:
@@ -101,7 +95,7 @@ def test_dead_addresses_are_passed_over_and_a_pool_of_these_alone_says_how_to_st
 ) -> None:
     with closing(Pool([nobody(), worker, nobody()])) as pool:
         for seed in (1, 2):
-            assert (pool.render(painted(seed), VIEWS, size=SIZE) == expected(seed)).all()
+            assert (pool.render(speckled(seed), VIEWS, size=SIZE) == expected(seed)).all()
     pool = RendererPool([nobody(), nobody()])
     with closing(pool), pytest.raises(RendererLostError, match="trompe render --host"):
         pool.render(boxes(), VIEWS, size=SIZE)
@@ -115,18 +109,18 @@ def test_a_refusal_is_final_and_takes_no_worker_out_of_the_pool(
     too_far = [View(Camera(1e9, 0, 0))] * 10
     with closing(Pool([worker, second_worker])) as pool:
         with pytest.raises(RendererError, match="position") as refusal:
-            pool.render(painted(1), [*VIEWS, *too_far], size=SIZE)
+            pool.render(speckled(1), [*VIEWS, *too_far], size=SIZE)
         assert not isinstance(refusal.value, RendererLostError)
-        assert (pool.render(painted(1), VIEWS, size=SIZE) == expected(1)).all()
+        assert (pool.render(speckled(1), VIEWS, size=SIZE) == expected(1)).all()
 
 
 def test_a_worker_that_comes_back_is_used_again(own_worker: Worker, expected: Expected, nobody: Nobody) -> None:
     with closing(RendererPool([own_worker.address, nobody()], suspicion=0.3, patience=10.0, rest=0.1)) as pool:
         own_worker.process.send_signal(signal.SIGSTOP)
         with pytest.raises(RendererLostError):
-            pool.render(painted(1), VIEWS, size=SIZE)
+            pool.render(speckled(1), VIEWS, size=SIZE)
         own_worker.process.send_signal(signal.SIGCONT)
-        assert (pool.render(painted(1), VIEWS, size=SIZE) == expected(1)).all()
+        assert (pool.render(speckled(1), VIEWS, size=SIZE) == expected(1)).all()
 
 
 def test_an_interrupted_request_ends_at_once_and_the_pool_goes_on(
@@ -134,9 +128,9 @@ def test_an_interrupted_request_ends_at_once_and_the_pool_goes_on(
 ) -> None:
     with closing(Pool([worker, second_worker])) as pool:
         with pytest.raises(KeyboardInterrupt):
-            pool.render(painted(1), VIEWS, size=SIZE, on_frame=Mock(side_effect=KeyboardInterrupt))
+            pool.render(speckled(1), VIEWS, size=SIZE, on_frame=Mock(side_effect=KeyboardInterrupt))
         assert not any(thread.name.startswith("render at") for thread in threading.enumerate())
-        assert (pool.render(painted(2), VIEWS, size=SIZE) == expected(2)).all()
+        assert (pool.render(speckled(2), VIEWS, size=SIZE) == expected(2)).all()
 
 
 # Engines
@@ -149,22 +143,22 @@ def test_a_worker_with_another_engine_is_left_out(
         other = running.address
         for addresses in ([worker, other], [other, worker]):
             with closing(Pool(addresses, engine=OURS)) as pool:
-                assert (pool.render(painted(1), VIEWS, size=SIZE) == expected(1)).all()
+                assert (pool.render(speckled(1), VIEWS, size=SIZE) == expected(1)).all()
         assert f"{other[1]}: its engine is {OURS} ({SHARP_SETTINGS}), but {OURS} was asked for" in caplog.text
         with closing(Pool([nobody(), other, worker])) as pool:
             assert pool.engine.settings == SHARP_SETTINGS
-            assert (pool.render(painted(1), VIEWS, size=SIZE) != expected(1)).any()
+            assert (pool.render(speckled(1), VIEWS, size=SIZE) != expected(1)).any()
         pool = RendererPool([other, nobody()], engine=OURS)
         told = rf"No renderer with pyrender.*engine is .*{SHARP_SETTINGS}"
         with closing(pool), pytest.raises(RendererLostError, match=told):
-            pool.render(painted(1), VIEWS, size=SIZE)
+            pool.render(speckled(1), VIEWS, size=SIZE)
 
 
 def test_a_worker_with_another_engine_after_its_restart_is_left_out(worker: Address, expected: Expected) -> None:
     """Its first pictures are right; the restarted one would give others."""
 
     def shown(target: TargetRenderer) -> np.ndarray:
-        return target.render(painted(1), VIEWS[:4], size=SIZE)
+        return target.render(speckled(1), VIEWS[:4], size=SIZE)
 
     with reserved_port() as port, ExitStack() as stack:
         with started("--port", str(port)) as mine:

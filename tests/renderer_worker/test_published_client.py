@@ -1,8 +1,6 @@
 """SAILenv's published client works with the worker as with Unity."""
 
-import importlib
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,10 +18,7 @@ from trompe_shared.shipped import shipped_objects
 @pytest.fixture
 def connect(worker: tuple[str, int]) -> Iterator[Callable[..., Any]]:
     """Registers agents of the published client and deletes them in the end."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # the client imports typing.io
-        module = pytest.importorskip("sailenv", reason="pip install sailenv==0.5b0 (Python 3.12 at most)")
-        module = importlib.import_module("sailenv.agent")
+    module = pytest.importorskip("sailenv.agent", reason="pip install sailenv==0.5b0 (Python 3.12 at most)")
     agents: list[Any] = []
 
     def register(**options: Any) -> Any:

@@ -14,11 +14,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from tests.wire import Wire, boxes
+from tests.wire import Wire, boxes, speckled
 from tests.worker_process import Worker
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.geometry import Camera, Light, View
-from trompe_shared.object3d import Object3D
 
 AGENTS = 8
 SIZE = (64, 64)
@@ -26,12 +25,6 @@ VIEWS = [View(Camera(0.3, 30 * k, 5 * k), Light(20 * k, 40, 0.5, 0.3)) for k in 
 SLOW = [pytest.mark.slow, pytest.mark.timeout(7200)]
 
 log = logging.getLogger(__name__)
-
-
-def marked(box: Object3D, agent: int, turn: int) -> Object3D:
-    """``box`` with textures of its own for each agent and turn."""
-    random = np.random.default_rng([agent, turn])
-    return box.with_textures({name: random.integers(0, 256, (32, 32, 3), dtype=np.uint8) for name in box.textures})
 
 
 @pytest.mark.parametrize(
@@ -45,7 +38,7 @@ def test_agents_at_work_at_once_get_their_own_pictures_and_none_waits_for_long(
     seconds: float, own_worker: Worker, record_property: Callable[[str, object], None]
 ) -> None:
     worker, turns = own_worker, 3
-    objects = [[marked(boxes(), agent, turn) for turn in range(turns)] for agent in range(AGENTS)]
+    objects = [[speckled(agent, turn) for turn in range(turns)] for agent in range(AGENTS)]
     with closing(SailenvTarget(*worker.address)) as target:
         expected = [[target.render(obj, VIEWS, size=SIZE) for obj in mine] for mine in objects]
     waits: list[list[float]] = [[] for _ in range(AGENTS)]

@@ -2,8 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -46,9 +45,6 @@ class Box:
     rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
-    def placed(self) -> dict[str, Any]:
-        return {"position": self.position, "rotation": self.rotation, "scale": self.scale}
-
     def matrix(self) -> Array:
         matrix = np.eye(4)
         matrix[:3, :3] = euler_to_matrix(np.array(self.rotation)) * np.array(self.scale)
@@ -80,7 +76,7 @@ def test_a_pixel_shows_the_object_at_its_centre_and_its_depth_along_the_cameras_
     empty: Wire, camera: Camera
 ) -> None:
     empty.ask("change_scene", scene="object_view/scene")
-    empty.spawn(boxes(), **TURNED.placed())
+    empty.spawn(boxes(), **vars(TURNED))
     empty.look(camera)
     views, depth = empty.labels(), depth_of(camera, TURNED)
     expected = np.isfinite(depth)
@@ -97,7 +93,7 @@ class Moment:
     """Where camera and box are in one frame."""
 
     camera: Camera
-    box: Box = field(default_factory=lambda: TURNED)
+    box: Box = TURNED
 
 
 @pytest.mark.parametrize(
@@ -116,7 +112,7 @@ class Moment:
     ],
 )
 def test_flow_is_the_motion_of_the_surface_point_at_a_pixel(empty: Wire, first: Moment, second: Moment) -> None:
-    number = int(empty.spawn(boxes(), **first.box.placed()))
+    number = int(empty.spawn(boxes(), **vars(first.box)))
     empty.look(first.camera)
     empty.views(1)
     empty.look(second.camera)
@@ -173,7 +169,7 @@ def test_a_point_that_was_behind_the_camera_has_no_flow(empty: Wire) -> None:
 
 def test_every_instance_has_its_own_colour_and_the_nearer_one_is_seen(empty: Wire) -> None:
     near, far = Box((0.05, 0, 0.1)), Box((0, 0, -0.1))
-    numbers = [int(empty.spawn(boxes(), **box.placed())) for box in (near, far)]
+    numbers = [int(empty.spawn(boxes(), **vars(box))) for box in (near, far)]
     camera = Camera(0.5, 0, 0)
     empty.look(camera)
     depths = np.stack([depth_of(camera, box) for box in (near, far)])
