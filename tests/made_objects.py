@@ -42,12 +42,8 @@ class Scene:
     def accessor(self, values: NDArray[Any], **more: Any) -> int:
         kinds = {"f": 5126, "H": 5123, "B": 5121, "I": 5125, "h": 5122}
         width = 1 if values.ndim == 1 else values.shape[1]
-        entry = {
-            "componentType": kinds[values.dtype.char],
-            "count": len(values),
-            "bufferView": self.view(values.tobytes()),
-        }
-        return self.add("accessors", entry | {"type": ("SCALAR", "VEC2", "VEC3", "VEC4")[width - 1]} | more)
+        kind = {"componentType": kinds[values.dtype.char], "type": ("SCALAR", "VEC2", "VEC3", "VEC4")[width - 1]}
+        return self.add("accessors", kind | {"count": len(values), "bufferView": self.view(values.tobytes())} | more)
 
     def image(self, picture: Pixels) -> int:
         return self.add("images", {"bufferView": self.view(encode_png(picture)), "mimeType": "image/png"})
@@ -81,9 +77,9 @@ class Scene:
         if uvs is not None:
             found["TEXCOORD_0"] = self.accessor(uvs)
         primitive: Json = {"attributes": found | attributes, "indices": self.accessor(corners)}
-        return self.add(
-            "meshes", {"primitives": [primitive if material is None else primitive | {"material": material}]}
-        )
+        if material is not None:
+            primitive["material"] = material
+        return self.add("meshes", {"primitives": [primitive]})
 
     def to_glb(self) -> bytes:
         document = self.document | {"buffers": [{"byteLength": len(self.data)}]}
@@ -136,20 +132,12 @@ def lantern(*, opacity: float = 0.4) -> bytes:
     solid, hole = np.full((64, 64), 255, np.uint8), np.full((64, 64), 255, np.uint8)
     hole[16:48, 16:48] = 40
     both: Json = {"doubleSided": True}
+    blended = both | {"alphaMode": "BLEND", "factor": [1.0, 1.0, 1.0, opacity]}
+    masked = both | {"alphaMode": "MASK", "alphaCutoff": 0.3}
     for name, mesh, picture, options in (
         ("candle", box((-0.04, -0.09, -0.04), (0.04, 0.06, 0.04)), flat(CANDLE, solid // 9), {}),
-        (
-            "glass",
-            box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1)),
-            flat(GLASS, solid),
-            {"alphaMode": "BLEND", "factor": [1.0, 1.0, 1.0, opacity], **both},
-        ),
-        (
-            "lattice",
-            sheet((-0.1, 0.1, 0.0), (0.1, 0.3, 0.0)),
-            flat(LATTICE, hole),
-            {"alphaMode": "MASK", "alphaCutoff": 0.3, **both},
-        ),
+        ("glass", box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1)), flat(GLASS, solid), blended),
+        ("lattice", sheet((-0.1, 0.1, 0.0), (0.1, 0.3, 0.0)), flat(LATTICE, hole), masked),
         ("flag", sheet((0.1, -0.05, 0.0), (0.2, 0.05, 0.0)), flat(FLAG, solid), both),
     ):
         number = scene.mesh(*mesh, scene.material(scene.texture(picture), name=name, **options))

@@ -14,6 +14,7 @@ from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 from urllib.parse import parse_qs, unquote, urlsplit
 
 import pytest
@@ -449,17 +450,11 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(f"{len(text):x}\r\n{text}\r\n".encode())
 
 
-class Http(ThreadingHTTPServer):
-    """Clients may hang up at any time: a trace of that would come up in the output of whichever test runs by then."""
-
-    def handle_error(self, request: object, client_address: object) -> None:
-        """Say nothing."""
-
-
 @pytest.fixture
 def server() -> Iterator[FakeServer]:
     fake = FakeServer()
-    http = Http(("127.0.0.1", 0), type("BoundHandler", (Handler,), {"fake": fake}))
+    http: Any = ThreadingHTTPServer(("127.0.0.1", 0), type("BoundHandler", (Handler,), {"fake": fake}))
+    http.handle_error = Mock()  # clients may hang up at any time: whichever test runs by then would print a trace
     thread = threading.Thread(target=http.serve_forever, kwargs={"poll_interval": 0.02})
     thread.start()
     fake.url = f"http://127.0.0.1:{http.server_port}"

@@ -205,10 +205,7 @@ def test_what_is_wrong_says_so_with_the_ids(client: Any) -> None:
         client.attack("no such object", label=0)
 
 
-PAIRS = [pytest.param(Client, AsyncClient, id="client"), pytest.param(JobHandle, AsyncJobHandle, id="job")]
-
-
-@pytest.mark.parametrize(("blocking", "asynchronous"), PAIRS)
+@pytest.mark.parametrize(("blocking", "asynchronous"), [(Client, AsyncClient), (JobHandle, AsyncJobHandle)])
 def test_both_clients_have_the_same_methods_with_the_same_arguments(blocking: type, asynchronous: type) -> None:
     def arguments(kind: type) -> dict[str, list[str]]:
         members = inspect.getmembers(kind, inspect.isfunction)
