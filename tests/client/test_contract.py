@@ -224,32 +224,23 @@ def test_the_quickstart_starts_the_service_that_these_tests_start() -> None:
     assert (first, second) == ("pip install 'trompe[server]'\n", "trompe serve\n")
 
 
-def run(command: list[str], folder: Path, server: str) -> str:
-    """What a program prints that is run in ``folder`` as a reader would, with ``server`` in the environment."""
-    environment = readers_environment(TROMPE_SERVER=server)
-    done = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=240
-    )
+PYTHON, BASH = [sys.executable, "-W", "error", "-c"], ["bash", "-euo", "pipefail", "-c"]
+
+
+@pytest.mark.parametrize(
+    ("heading", "program", "said"),
+    [
+        ("Python", PYTHON, r"\Arecognised in \d+% of the views before, in \d+% after\n\Z"),
+        pytest.param("Command line", BASH, r"target \(own views\)", marks=pytest.mark.thorough),
+        pytest.param("curl", BASH, "event: progress", marks=pytest.mark.thorough),
+    ],
+)
+def test_the_quickstart_runs(heading: str, program: list[str], said: str, service: str, tmp_path: Path) -> None:
+    environment = readers_environment(TROMPE_SERVER=service)
+    options: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 240}
+    done = subprocess.run([*program, QUICKSTART[heading]], cwd=tmp_path, env=environment, **options)
     assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_the_quickstart_in_python_runs(service: str, tmp_path: Path) -> None:
-    said = run([sys.executable, "-W", "error", "-c", QUICKSTART["Python"]], tmp_path, service)
-    assert re.fullmatch(r"recognised in \d+% of the views before, in \d+% after\n", said)
-    assert (tmp_path / "out-python" / "mug-adversarial.zip").is_file()
-
-
-@pytest.mark.thorough
-def test_the_quickstart_on_the_command_line_runs(service: str, tmp_path: Path) -> None:
-    said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["Command line"]], tmp_path, service)
-    assert "target (own views)" in said
-    assert (tmp_path / "out-cli" / "mug-adversarial.zip").is_file()
-
-
-@pytest.mark.thorough
-def test_the_quickstart_with_curl_runs(service: str, tmp_path: Path) -> None:
-    said = run(["bash", "-euo", "pipefail", "-c", QUICKSTART["curl"]], tmp_path, service)
-    assert "event: progress" in said
-    assert (tmp_path / "out-curl" / "mug-adversarial.zip").read_bytes()[:2] == b"PK"
-    assert '"texels_altered"' in (tmp_path / "out-curl" / "result.json").read_text()
+    assert re.search(said, done.stdout)
+    (out,) = tmp_path.glob("out-*")
+    assert (out / "mug-adversarial.zip").read_bytes()[:2] == b"PK"
+    assert '"texels_altered"' in (out / "result.json").read_text()

@@ -162,16 +162,12 @@ def test_a_problem_document_becomes_a_typed_error(status: int, error: type[APIEr
 def test_a_token_may_end_with_its_line_and_a_wrong_one_is_told_without_being_shown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked = list[httpx.Request]()
-
-    def answer(request: httpx.Request) -> httpx.Response:
-        asked.append(request)
-        return httpx.Response(200, content=b"[]")
-
+    answer = Mock(return_value=httpx.Response(200, content=b"[]"))
     monkeypatch.setenv("TROMPE_TOKEN", "trompe_1\n")
     with Client(transport=httpx.MockTransport(answer)) as client:
         client.objects()
-    assert asked[0].headers["Authorization"] == "Bearer trompe_1"
+    (request,) = answer.call_args.args
+    assert request.headers["Authorization"] == "Bearer trompe_1"
     for wrong in ("trömpe", "trompe\n_2"):
         with pytest.raises(SpecError, match="token has characters") as caught:
             Client(token=wrong)

@@ -1,13 +1,14 @@
 """The API while PostgreSQL is away: 503 at once, and nothing lost when it is back."""
 
 import asyncio
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
+from tests.served import wait_until
 from tests.server.api.conftest import Api, running
 from trompe_server.api import following, guard
 from trompe_server.settings import Settings
@@ -28,21 +29,16 @@ def api(postgres: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
 def test_a_database_that_stops_is_answered_with_503_until_it_is_back(
     api: Api, postgres: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    look, followed = following._look, threading.Event()
-
-    def noticed(*arguments: Any) -> Any:
-        followed.set()
-        return look(*arguments)
-
-    monkeypatch.setattr(following, "_look", noticed)
-    asyncio.run(_stop_and_start(api, postgres, followed))
+    look = Mock(wraps=following._look)
+    monkeypatch.setattr(following, "_look", look)
+    asyncio.run(_stop_and_start(api, postgres, look))
 
 
-async def _stop_and_start(api: Api, postgres: Any, followed: threading.Event) -> None:
+async def _stop_and_start(api: Api, postgres: Any, look: Mock) -> None:
     async with api.connect() as client:
         job = (await client.post("/v1/jobs", json=JOB)).json()["id"]
         stream = asyncio.create_task(client.get(f"/v1/jobs/{job}/events"))
-        assert await asyncio.to_thread(followed.wait, 120)
+        await asyncio.to_thread(wait_until, lambda: look.called)
         await asyncio.to_thread(postgres.stop)
         for method, path in [("GET", "/v1/jobs"), ("GET", "/readyz"), ("GET", "/metrics"), ("POST", "/v1/jobs")] * 2:
             answer = await asyncio.wait_for(client.request(method, path, json=JOB), 60)
