@@ -1,6 +1,5 @@
 """Code blocks of the pages in docs/, and their reader."""
 
-import json
 import os
 import re
 import sysconfig
@@ -23,9 +22,3 @@ def blocks(page: str, language: str) -> list[tuple[str, str]]:
 def readers_environment(**variables: str) -> dict[str, str]:
     """The environment of a reader who has the commands of this installation."""
     return os.environ | variables | {"PATH": f"{sysconfig.get_path('scripts')}:{os.environ['PATH']}"}
-
-
-def cells(notebook: str) -> list[str]:
-    """The code cells of a notebook."""
-    read = json.loads((DOCS / notebook).read_text())
-    return ["".join(cell["source"]) for cell in read["cells"] if cell["cell_type"] == "code"]

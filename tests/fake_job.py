@@ -1,8 +1,9 @@
 """A job without an attack, for tests of everything around it. Workers run it with ``TROMPE_PIPELINE``.
 
-The label of the job selects its behaviour. It logs the start and end of each phase to ``trace.txt`` in the folder of
-the job, if that is local, and its process to ``process``. Each phase derives its file from the file of the phase
-before, so the result shows whether all phases ran, in order, on the right input.
+The label of the job selects its behaviour; each phase takes ``TROMPE_FAKE_SECONDS`` (0). It logs the start and end of
+each phase to ``trace.txt`` in the folder of the job, if that is local, and its process to ``process``. Each phase
+derives its file from the file of the phase before, so the result shows whether all phases ran, in order, on the right
+input.
 """
 
 import hashlib
@@ -21,8 +22,6 @@ from trompe_shared.api import JobSpec, JobState, Progress
 from trompe_shared.errors import ObjectError, RendererError
 
 PHASES: Final = ["prepare", "attack-000", "attack-001", "judge"]
-PHASE_SECONDS: Final = "TROMPE_FAKE_SECONDS"
-"""Environment variable: seconds of each phase. Default: 0."""
 
 
 class FakeJob:
@@ -59,7 +58,7 @@ class FakeJob:
         return found
 
     def _take_time(self, phase: str, on_progress: OnProgress) -> None:
-        end = time.monotonic() + float(os.environ.get(PHASE_SECONDS, "0"))
+        end = time.monotonic() + float(os.environ.get("TROMPE_FAKE_SECONDS", "0"))
         while time.monotonic() < end:
             on_progress(self._progress(phase))
             time.sleep(0.02)
