@@ -234,6 +234,7 @@ PYTHON, BASH = [sys.executable, "-W", "error", "-c"], ["bash", "-euo", "pipefail
         pytest.param("Command line", BASH, r"target \(own views\)", marks=pytest.mark.thorough),
         pytest.param("curl", BASH, "event: progress", marks=pytest.mark.thorough),
     ],
+    ids=["Python", "command line", "curl"],
 )
 def test_the_quickstart_runs(heading: str, program: list[str], said: str, service: str, tmp_path: Path) -> None:
     environment = readers_environment(TROMPE_SERVER=service)

@@ -33,7 +33,7 @@ def agree(one: Any, other: Any) -> bool:
     """Whether the drop of each ``Accuracy`` is within the interval of the other."""
     lows, highs = zip(one.a_drop_interval, other.a_drop_interval, strict=True)
     drops = one.a_drop, other.a_drop
-    return max(lows) <= min(drops) and max(drops) <= min(highs)
+    return bool(max(lows) <= min(drops) <= max(drops) <= min(highs))
 
 
 @pytest.mark.thorough
