@@ -76,9 +76,7 @@ def test_a_camera_rolled_to_the_left_shows_a_point_above_on_its_right() -> None:
         pytest.param((90, 0, 90), (1, 0, 0), (0, 0, 1), id="z comes before x"),
     ],
 )
-def test_euler_angles_turn_as_unitys_do(
-    euler: tuple[int, ...], vector: tuple[int, ...], turned: tuple[int, ...]
-) -> None:
+def test_euler_angles_turn_as_unitys(euler: tuple[int, ...], vector: tuple[int, ...], turned: tuple[int, ...]) -> None:
     assert np.allclose(euler_to_matrix(np.array(euler)) @ vector, turned, atol=1e-12)
 
 

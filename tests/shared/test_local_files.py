@@ -64,9 +64,8 @@ def test_a_model_without_pictures_beside_it_is_sent_as_it_is(tmp_path: Path, suf
 
 def test_no_file_outside_of_the_models_folder_is_packed(tmp_path: Path) -> None:
     uris = ["../key.png", str(tmp_path / "key.png"), "link.png", "linked/key.png", "own.png"]
-    written(
-        tmp_path, {"key.png": "", "m/m.gltf": json.dumps({"images": [{"uri": uri} for uri in uris]}), "m/own.png": ""}
-    )
+    document = json.dumps({"images": [{"uri": uri} for uri in uris]})
+    written(tmp_path, {"key.png": "", "m/m.gltf": document, "m/own.png": ""})
     (tmp_path / "m/link.png").symlink_to(tmp_path / "key.png")
     (tmp_path / "m/linked").symlink_to(tmp_path)
     assert packed(tmp_path / "m/m.gltf") == {"m.gltf", "own.png"}

@@ -17,7 +17,7 @@ from PIL import Image
 from tests.small_models import large_png, zipped
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import pack_zip
-from trompe_shared.object3d import decode_rgb, encode_png, load_object, object_from_files, unpack
+from trompe_shared.object3d import Object3D, decode_rgb, encode_png, load_object, object_from_files, unpack
 from trompe_shared.wavefront import parse_mtl, parse_obj
 
 MESH = """# a triangle
@@ -47,8 +47,15 @@ def with_files(**changes: bytes | None) -> dict[str, bytes]:
     return {name: data for name, data in {**FILES, **changed}.items() if data is not None}
 
 
-def refusal(source: bytes | Path | Mapping[str, bytes]) -> str:
-    """The message with which an object is refused."""
+def of_mtl(mtl: bytes, **pictures: bytes) -> Object3D:
+    """The good object with its materials in an MTL alone, and with other pictures."""
+    return object_from_files(with_files(thing_mat_def__json=None, thing__mtl=mtl, **pictures))
+
+
+Source = bytes | Path | Mapping[str, bytes]
+
+
+def refusal(source: Source) -> str:
     with pytest.raises(ObjectError) as raised:
         object_from_files(source) if isinstance(source, Mapping) else load_object(source)
     return str(raised.value)
@@ -84,9 +91,8 @@ def test_a_zip_a_folder_and_the_obj_itself_are_the_same_object(tmp_path: Path) -
     in_a_folder = zipped({f"things/my thing/{name}": data for name, data in FILES.items()})
     littered = zipped(FILES | {"__MACOSX/._thing.obj": b"finder", "empty/": b""})
     sources: list[bytes | str | Path] = [folder, str(folder), archive, in_a_folder, littered]
-    assert {(obj.name, frozenset(obj.files.items())) for obj in map(load_object, sources)} == {
-        ("thing", frozenset(FILES.items()))
-    }
+    found = {(obj.name, frozenset(obj.files.items())) for obj in map(load_object, sources)}
+    assert found == {("thing", frozenset(FILES.items()))}
     (folder / "other.obj").write_bytes(b"")
     assert load_object(folder / "thing.obj").files == with_files(readme__txt=None)
     (folder / "subfolder/paint.png").write_bytes(b"")
@@ -98,23 +104,17 @@ LIBRARY = b"newmtl paint\nmap_Kd paint.png\n"
 OTHER = b"newmtl paint\nmap_Kd other.png\n"
 
 
-@pytest.mark.parametrize(
-    ("line", "mtls"),
-    [
-        pytest.param("mtllib thing.mtl", {"thing.mtl": LIBRARY, "table.mtl": OTHER}, id="one"),
-        pytest.param(
-            "# mtllib table.mtl\nmtllib ./a/Thing.mtl", {"table.mtl": OTHER, "thing.mtl": LIBRARY}, id="folder"
-        ),
-        pytest.param(
-            "mtllib my thing.mtl b.mtl", {"b.mtl": OTHER, "my thing.mtl": LIBRARY, "c.mtl": OTHER}, id="several"
-        ),
-        pytest.param("mtllib b.mtl\nmtllib a.mtl", {"a.mtl": OTHER, "b.mtl": LIBRARY}, id="the first counts"),
-        pytest.param("mtllib gone.mtl", {"thing.mtl": LIBRARY, "table.mtl": b"newmtl x"}, id="none is there"),
-        pytest.param(
-            "", {"thing.mtl": LIBRARY, "table_mat_def.json": b'{"x": {"albedo": "x.png"}}'}, id="foreign mat_def"
-        ),
-    ],
-)
+NAMED = {
+    "one": ("mtllib thing.mtl", {"thing.mtl": LIBRARY, "table.mtl": OTHER}),
+    "folder": ("# mtllib table.mtl\nmtllib ./a/Thing.mtl", {"table.mtl": OTHER, "thing.mtl": LIBRARY}),
+    "several": ("mtllib my thing.mtl b.mtl", {"b.mtl": OTHER, "my thing.mtl": LIBRARY, "c.mtl": OTHER}),
+    "the first counts": ("mtllib b.mtl\nmtllib a.mtl", {"a.mtl": OTHER, "b.mtl": LIBRARY}),
+    "none is there": ("mtllib gone.mtl", {"thing.mtl": LIBRARY, "table.mtl": b"newmtl x"}),
+    "foreign mat_def": ("", {"thing.mtl": LIBRARY, "table_mat_def.json": b'{"x": {"albedo": "x.png"}}'}),
+}
+
+
+@pytest.mark.parametrize(("line", "mtls"), NAMED.values(), ids=NAMED)
 def test_a_mesh_has_the_materials_that_it_names(line: str, mtls: dict[str, bytes]) -> None:
     mesh = MESH.replace("mtllib thing.mtl", line).encode()
     files = with_files(thing_mat_def__json=None, thing__obj=mesh) | mtls
@@ -138,20 +138,15 @@ def test_materials_in_latin_1_stay_apart() -> None:
         pytest.param("map_Kn", (128, 128, 255), "n.png", id="map_Kn"),
     ],
 )
-def test_a_grey_bump_map_has_heights_and_is_no_normal_map(
-    key: str, colour: tuple[int, ...], normal: str | None
-) -> None:
+def test_a_grey_bump_map_is_no_normal_map(key: str, colour: tuple[int, ...], normal: str | None) -> None:
     picture = encode_png(np.full((2, 2, 3), colour, np.uint8))
-    obj = object_from_files(
-        with_files(thing_mat_def__json=None, thing__mtl=LIBRARY + f"{key} n.png".encode(), n__png=picture)
-    )
+    obj = of_mtl(LIBRARY + f"{key} n.png".encode(), n__png=picture)
     assert obj.materials["paint"].normal == normal
     assert obj.files["n.png"] == picture
 
 
 def test_a_bump_map_that_is_the_albedo_is_no_normal_map() -> None:
-    files = with_files(thing_mat_def__json=None, thing__mtl=LIBRARY + b"map_bump paint.png")
-    assert object_from_files(files).materials["paint"].normal is None
+    assert of_mtl(LIBRARY + b"map_bump paint.png").materials["paint"].normal is None
 
 
 @pytest.mark.parametrize(
@@ -171,9 +166,7 @@ def test_an_mtl_replaces_a_missing_material_definition() -> None:
         "# blender\nnewmtl other\nmap_Kd other.png\nnewmtl paint\nKd 1 1 1\n"
         "map_Kd C:\\my textures\\paint.png\nbump -bm 1.0 ../maps/bumps.png\n"
     )
-    obj = object_from_files(
-        with_files(thing_mat_def__json=None, thing__mtl=mtl.encode(), bumps__png=FILES["paint.png"])
-    )
+    obj = of_mtl(mtl.encode(), bumps__png=FILES["paint.png"])
     assert (obj.materials["paint"].albedo, obj.materials["paint"].normal) == ("paint.png", "bumps.png")
     assert list(obj.materials) == ["paint"]
     assert parse_mtl(mtl)["other"] == {"albedo": "other.png"}
@@ -190,10 +183,8 @@ def test_several_materials_become_parts_in_the_order_of_their_first_use() -> Non
         )
     )
     assert [(part.material, len(part.faces)) for part in obj.parts] == [("paint", 2), ("glaze", 1)]
-    assert {name: image.shape for name, image in obj.textures.items()} == {
-        "paint.png": (4, 6, 3),
-        "glaze.png": (2, 2, 3),
-    }
+    shapes = {name: image.shape for name, image in obj.textures.items()}
+    assert shapes == {"paint.png": (4, 6, 3), "glaze.png": (2, 2, 3)}
     assert obj.n_texels == 28
 
 
@@ -369,7 +360,15 @@ def faulty_mesh(line: str) -> dict[str, bytes]:
     return with_files(thing__obj=(MESH + line + "\n").encode())
 
 
-REFUSED = {
+def scrambled() -> bytes:
+    """A zip with other bytes in the middle of a deflated member."""
+    files = {"thing.obj": bytes(np.random.default_rng(0).integers(0, 40, 5000, dtype=np.uint8))}
+    data = bytearray(zipped(files))
+    data[300:600] = b"\xff" * 300
+    return bytes(data)
+
+
+REFUSED: dict[str, tuple[Source, list[str]]] = {
     "no mesh": (with_files(thing__obj=None), ["exactly one .obj", "readme.txt"]),
     "nothing at all": ({}, ["exactly one .obj"]),
     "two meshes": (with_files(other__obj=b""), ["exactly one .obj", "other.obj", "thing.obj"]),
@@ -406,14 +405,18 @@ REFUSED = {
     "a vertex that is not a number": (faulty_mesh("v nan 0 0"), ["thing.obj", "'v'", "not finite"]),
     "an infinite uv": (faulty_mesh("vt 0 inf"), ["thing.obj", "'vt'", "not finite"]),
     "a vertex beyond single precision": (faulty_mesh("v 1e50 0 0"), ["thing.obj", "'v'", "not finite"]),
+    "nothing": (b"", ["not a zip", "Zip the folder"]),
+    "an obj": (MESH.encode(), ["not a zip", "Zip the folder"]),
+    "scrambled": (scrambled(), ["damaged or encrypted", "Zip the folder"]),
+    "two folders": (zipped(FILES | {"more/x.png": b""}), ["flat", "one folder"]),
+    "no such file": (Path("nowhere.zip"), ["nowhere.zip"]),
+    "a folder without a mesh": (Path(__file__).parent, ["exactly one .obj"]),
 }
 
 
-@pytest.mark.parametrize(("files", "words"), REFUSED.values(), ids=REFUSED)
-def test_an_inconsistent_object_is_refused_with_the_place_and_the_remedy(
-    files: dict[str, bytes], words: list[str]
-) -> None:
-    message = refusal(files)
+@pytest.mark.parametrize(("source", "words"), REFUSED.values(), ids=REFUSED)
+def test_an_inconsistent_object_is_refused_with_place_and_remedy(source: Source, words: list[str]) -> None:
+    message = refusal(source)
     assert [word for word in words if word not in message] == []
 
 
@@ -425,9 +428,7 @@ def test_lines_may_end_in_any_way_and_are_counted_with_the_empty_ones(end: str) 
         parse_obj(f"v 0 0 0{end}" + end * 70_000 + f"v 1 0 0{end}# nothing{end}f 9{end}", "thing.obj")
 
 
-def test_a_mesh_of_empty_lines_takes_no_more_memory_than_its_text_and_too_many_lines_are_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_empty_lines_take_no_more_memory_than_text_and_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     text = "\n" * 2**23
     tracemalloc.start()
     with pytest.raises(ObjectError, match="no faces"):
@@ -439,37 +440,11 @@ def test_a_mesh_of_empty_lines_takes_no_more_memory_than_its_text_and_too_many_l
         parse_obj("#\n" * 101, "thing.obj")
 
 
-def scrambled() -> bytes:
-    """A zip with other bytes in the middle of a deflated member."""
-    files = {"thing.obj": bytes(np.random.default_rng(0).integers(0, 40, 5000, dtype=np.uint8))}
-    data = bytearray(zipped(files))
-    data[300:600] = b"\xff" * 300
-    return bytes(data)
-
-
-@pytest.mark.parametrize(
-    ("archive", "words"),
-    [
-        pytest.param(b"", ["not a zip", "Zip the folder"], id="nothing"),
-        pytest.param(MESH.encode(), ["not a zip", "Zip the folder"], id="an obj"),
-        pytest.param(scrambled(), ["damaged or encrypted", "Zip the folder"], id="scrambled"),
-        pytest.param(zipped(FILES | {"more/x.png": b""}), ["flat", "one folder"], id="two folders"),
-        pytest.param(Path("nowhere.zip"), ["nowhere.zip"], id="no such file"),
-        pytest.param(Path(__file__).parent, ["exactly one .obj"], id="a folder without a mesh"),
-    ],
-)
-def test_archives_that_hold_no_object_are_refused(archive: bytes | Path, words: list[str]) -> None:
-    message = refusal(archive)
-    assert [word for word in words if word not in message] == []
-
-
-@pytest.mark.parametrize(
-    ("side", "word"), [(8193, "8192"), (12_000, "8192"), (30_000, "8192"), (0, "paint.png")], ids=str
-)
-def test_an_image_that_is_too_large_or_empty_is_refused_undecoded(side: int, word: str) -> None:
+@pytest.mark.parametrize("side", [8193, 12_000, 30_000, 0])
+def test_an_image_that_is_too_large_or_empty_is_refused_undecoded(side: int) -> None:
     message = refusal(with_files(paint__png=large_png(side, side)))
     assert "paint.png" in message
-    assert word in message
+    assert ("8192" in message) == (side > 0)
 
 
 def test_names_in_utf_8_are_read_whether_the_zip_says_so_or_not() -> None:

@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from random import Random
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,7 +90,7 @@ def test_accuracy_needs_the_same_views_and_at_least_one() -> None:
         accuracy(logits([True])[:0], None, LABEL)
 
 
-def interval(pairs: list[tuple[bool, bool]]) -> tuple[float, float] | None:
+def interval(pairs: list[tuple[bool, bool]]) -> Any:
     before, after = zip(*pairs, strict=True)
     return drop_interval(logits(list(before)), logits(list(after)), LABEL)
 
@@ -128,15 +129,12 @@ def test_views_seen_twice_count_once_in_the_intervals() -> None:
 @pytest.mark.parametrize("views", [10, 60, 200])
 def test_an_attack_that_fooled_every_view_seen_is_not_certain_to_fool_all(views: int) -> None:
     found = interval([FOOLED] * views)
-    assert found is not None
     assert found[1] == 1.0
     assert 1 - found[0] == pytest.approx(wilson_interval(0, views)[1], rel=0.5)
 
 
 def test_few_recognised_views_give_a_wide_interval() -> None:
     few, many = (interval([FOOLED] * n + [BOTH] * n + [NEVER] * (100 - 2 * n)) for n in (3, 50))
-    assert few is not None
-    assert many is not None
     assert few[0] < 0 < many[0] < 0.5 < many[1] < few[1]
 
 
@@ -151,8 +149,6 @@ def test_the_interval_holds_the_true_drop_about_as_often_as_it_says() -> None:
 def test_the_interval_respects_that_a_view_is_the_same_before_and_after() -> None:
     paired = interval([BOTH] * 50 + [NEVER] * 50)
     shuffled = interval([BOTH] * 25 + [FOOLED] * 25 + [HELPED] * 25 + [NEVER] * 25)
-    assert paired is not None
-    assert shuffled is not None
     assert paired[1] - paired[0] < (shuffled[1] - shuffled[0]) / 3
 
 
@@ -194,9 +190,7 @@ def test_view_predictions_name_camera_light_and_both_verdicts() -> None:
     assert (found.distance, found.azimuth, found.elevation) == (0.5, 30.0, 40.0)
     assert (found.light_azimuth, found.light_elevation) == (5.0, 60.0)
     assert (found.before, found.after) == (1, 0)
-    assert (
-        found.before_confidence == found.before_true_confidence == pytest.approx(np.exp(2) / (np.exp([0, 2, 1]).sum()))
-    )
+    assert found.before_confidence == found.before_true_confidence == pytest.approx(np.exp(2) / np.exp([0, 2, 1]).sum())
     assert found.after_confidence == pytest.approx(np.exp(3) / np.exp([3, 2, 1]).sum())
     assert found.after_true_confidence == pytest.approx(np.exp(2) / np.exp([3, 2, 1]).sum())
 

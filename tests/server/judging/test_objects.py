@@ -80,6 +80,10 @@ def moved(part: Part) -> Part:
     return replace(part, vertices=part.vertices + np.float32(0.002) * (part.vertices[:, 1:2] > 0.02).astype(np.float32))
 
 
+def repeating(obj: Object3D, times: float) -> Object3D:
+    return with_parts(obj, lambda part: replace(part, uvs=part.uvs * np.float32(times)))
+
+
 def lighter(obj: Object3D, *, map_of: str) -> Object3D:
     """The object with a plain picture in place of one of its maps."""
     (material,) = obj.materials.values()
@@ -92,16 +96,8 @@ CHANGES = {
     "another object": (shipped("ball"), "object", "2368 triangles, the second 1728"),
     "moved": (with_parts(MUG, moved), "geometry", r"839 of 2368 triangles .* by up to 3\.46 mm"),
     "from behind": (with_parts(MUG, backs), "geometry", "changed: 2368 of 2368 .* face the other way"),
-    "another layout": (
-        with_parts(MUG, lambda part: replace(part, uvs=part.uvs / np.float32(2))),
-        "uv",
-        "2368 of 2368 triangles",
-    ),
-    "a texture twice": (
-        with_parts(MUG, lambda part: replace(part, uvs=part.uvs * np.float32(2))),
-        "uv",
-        r"2\d\d\d of 2368 triangles",
-    ),
+    "another layout": (repeating(MUG, 0.5), "uv", "2368 of 2368 triangles"),
+    "a texture twice": (repeating(MUG, 2.0), "uv", r"2\d\d\d of 2368 triangles"),
     "other normals": (with_parts(MUG, lambda part: replace(part, normals=-part.normals)), "geometry", "shaded"),
     "another normal map": (lighter(MUG, map_of="normal"), "material", "The normal map of the material 'mug_ceramic'"),
     "other metal": (lighter(MUG, map_of="metallic"), "material", "metal and smoothness"),
@@ -176,6 +172,5 @@ def test_triangles_in_one_place_are_told_apart_by_their_materials() -> None:
     for after in (covered, replace(covered, parts=covered.parts[::-1])):
         pair = ObjectPair(covered, after)
         assert pair.findings() == []
-        assert {
-            each.texture: each.max_levels for each in texture_changes(*pair.textures, epsilon=None)
-        } == dict.fromkeys(covered.textures, 0)
+        largest = {each.texture: each.max_levels for each in texture_changes(*pair.textures, epsilon=None)}
+        assert largest == dict.fromkeys(covered.textures, 0)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -22,8 +23,6 @@ from trompe_shared.shipped import shipped_objects
 
 
 class Net(torch.nn.Module):
-    """The mean of each channel."""
-
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         return images.mean(dim=(2, 3))
 
@@ -99,27 +98,17 @@ def test_a_classifier_file_is_described_by_a_process_of_its_own_once(tmp_path: P
     file = tmp_path / "net.pt2"
     batch = ({0: torch.export.Dim.DYNAMIC},)
     torch.export.save(torch.export.export(Net(), (torch.zeros(2, 3, 8, 12),), dynamic_shapes=batch), file)
-    inspected: list[str] = []
-
-    def inspect(path: str) -> dict[str, object]:
-        inspected.append(path)
-        return inspect_classifier(path)
-
+    data, inspect = file.read_bytes(), Mock(side_effect=inspect_classifier)
     library = Library(tmp_path / "library", inspect=inspect)
-    with file.open("rb") as content:
-        info = library.add_classifier(content, "net.pt2", classes=["r", "g", "b"], name="colours")
+    info = library.add_classifier(io.BytesIO(data), "net.pt2", classes=["r", "g", "b"], name="colours")
     assert (info.name, info.white_box, info.image_size, info.n_classes) == ("colours", True, (8, 12), 3)
     assert info.classes == ["r", "g", "b"]
-    assert Path(library.classifier_path("colours")).read_bytes() == file.read_bytes()
-    with file.open("rb") as content:
-        again = library.add_classifier(content, "net.pt2")
+    assert Path(library.classifier_path("colours")).read_bytes() == data
+    again = library.add_classifier(io.BytesIO(data), "net.pt2")
     assert again == info.model_copy(update={"name": "net"})
-    assert len(inspected) == 1
-    with (
-        file.open("rb") as content,
-        pytest.raises(ClassifierError, match=r"2 class names for .* of 3.*net.classes.json"),
-    ):
-        library.add_classifier(content, "net.pt2", classes=["r", "g"])
+    assert inspect.call_count == 1
+    with pytest.raises(ClassifierError, match=r"2 class names for .* of 3.*net.classes.json"):
+        library.add_classifier(io.BytesIO(data), "net.pt2", classes=["r", "g"])
 
 
 def test_the_shipped_classifier_is_described_as_it_is(tmp_path: Path) -> None:
@@ -138,16 +127,11 @@ def test_the_api_process_never_imports_torch_and_alembic_only_to_migrate() -> No
 
 
 def test_jobs_name_networks_of_the_operators_list_only(tmp_path: Path) -> None:
-    asked: list[str] = []
-
-    def inspect(reference: str) -> dict[str, object]:
-        asked.append(reference)
-        return {"white_box": True, "image_size": [8, 8], "n_classes": 2, "classes": None}
-
+    inspect = Mock(return_value={"white_box": True, "image_size": [8, 8], "n_classes": 2, "classes": None})
     library = Library(tmp_path, inspect=inspect, networks=("timm:vit_*", "torchvision:resnet50"))
     for reference in ("timm:vit_tiny", "torchvision:resnet50", "timm:vit_tiny"):
         assert library.classifier(reference).id == reference
-    assert asked == ["timm:vit_tiny", "torchvision:resnet50"]
+    assert [call.args for call in inspect.call_args_list] == [("timm:vit_tiny",), ("torchvision:resnet50",)]
     assert library.classifier_path("timm:vit_tiny") == "timm:vit_tiny"
     for refused in ("timm:resnet50", "hf:org/model", "torchvision:resnet50x"):
         with pytest.raises(ClassifierError, match=rf"does not allow the network '{refused}'; it allows timm:vit_\*, "):

@@ -97,11 +97,6 @@ def test_the_same_arguments_give_the_same_bytes_and_only_the_first_name_of_a_cla
     assert both.tobytes() == first.tobytes() == again.tobytes()
 
 
-def test_a_contact_sheet_needs_at_least_one_view() -> None:
-    with pytest.raises(ValueError, match="at least one"):
-        contact_sheet([], title="t", facts="")
-
-
 def test_a_sheet_of_views_of_which_none_was_recognised_shows_representative_ones() -> None:
     verdicts = [Verdict("mug", 0.5, False)] * 30
     sheet = views_sheet((images(30), images(30)), (verdicts, verdicts), [Camera(1, 0, 0)] * 30, title="t")
@@ -234,9 +229,8 @@ def test_saliency_is_outlined_where_it_reaches_tau_and_only_there() -> None:
 def test_saliency_is_painted_over_the_image_only_where_there_is_some() -> None:
     maps = np.zeros((1, 32, 32), np.float32)
     maps[0, :, 16:] = 1
-    pixels = {
-        tuple(int(c) for c in p) for p in np.array(saliency_sheet(images(1), maps, tau=None, title="")).reshape(-1, 3)
-    }
+    sheet = np.array(saliency_sheet(images(1), maps, tau=None, title=""))
+    pixels = set(map(tuple, sheet.reshape(-1, 3).tolist()))
     assert tuple(round(c * 0.6) for c in BLUE) in pixels
     assert tuple(int(c) for c in heat_colours(np.array(1.0))) in pixels
 
@@ -307,9 +301,8 @@ def test_textures_that_nothing_depends_on_are_only_dimmed() -> None:
     nothing = {name: score * 0 for name, score in scores().items()}
     for texture in heat_textures(textures(), nothing).values():
         assert (texture == [round(0.6 * c) for c in BLUE]).all()
-    assert saliency_texture_sheet(textures(), nothing, title="t").size == (
-        saliency_texture_sheet(textures(), scores(), title="t").size
-    )
+    dimmed, hot = (saliency_texture_sheet(textures(), each, title="t") for each in (nothing, scores()))
+    assert dimmed.size == hot.size
 
 
 def test_a_texture_and_its_heat_stand_side_by_side_in_the_order_of_names() -> None:
@@ -362,6 +355,8 @@ def test_rare_classes_are_counted_together() -> None:
     assert bars(sheet, AFTER) == [round(BARS / 20)] * TOP + [round(BARS * (20 - TOP) / 20)]
 
 
-def test_predictions_need_a_view() -> None:
+def test_pictures_of_views_need_a_view() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        contact_sheet([], title="t", facts="")
     with pytest.raises(ValueError, match="at least one view"):
         prediction_histogram({}, {}, labels=["mug"], title="t")

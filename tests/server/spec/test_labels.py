@@ -56,9 +56,8 @@ def test_one_label_or_several_are_distinct_classes_in_their_order() -> None:
     assert resolve_labels(["wall clock", 0], CLASSES, len(CLASSES), "net") == (3, 0)
     assert resolve_labels(np.int64(2), CLASSES, len(CLASSES), "net") == (2,)
     assert resolve_labels(torch.tensor(2), CLASSES, len(CLASSES), "net") == (2,)
-    with pytest.raises(
-        SpecError, match="'toilet paper' and 'toilet tissue' are the same class, 1: name each `label` once"
-    ):
+    twice = "'toilet paper' and 'toilet tissue' are the same class, 1: name each `label` once"
+    with pytest.raises(SpecError, match=twice):
         resolve_labels(["toilet paper", 3, "toilet tissue"], CLASSES, len(CLASSES), "net")
     with pytest.raises(SpecError, match="6 of the classifier's 6 classes count as the object"):
         resolve_labels(range(6), CLASSES, len(CLASSES), "net")
