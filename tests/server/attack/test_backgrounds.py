@@ -1,7 +1,7 @@
 """Other backgrounds behind the views than in the probes."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,20 +12,15 @@ from tests.attack_runs import SIZE, SMALL, SQUARE, surrogate_of
 from trompe_server.attack import Backgrounds
 from trompe_server.attack.backgrounds import MIN_WEIGHT
 from trompe_server.surrogate import Surrogate, textures_of
-from trompe_shared.geometry import Camera, Light, View
+from trompe_shared.geometry import Camera, View
 
 PHOTO = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
-CHOICE: list[tuple[int, int, int] | str] = [(0, 0, 0), (255, 255, 255), "photo"]
+CHOICE: list[dict[str, Any]] = [{"background": (0, 0, 0)}, {"background": (255, 255, 255)}, {"backdrop": "photo"}]
 
 
 def in_front_of(choice: Sequence[int]) -> list[View]:
     """Views from all around, the k-th in front of ``CHOICE[choice[k]]``."""
-    views = [View(Camera(0.4, 15.0 * k, 10.0), Light()) for k in range(len(choice))]
-    behind = [CHOICE[k] for k in choice]
-    return [
-        replace(view, backdrop=name) if isinstance(name, str) else replace(view, background=name)
-        for view, name in zip(views, behind, strict=True)
-    ]
+    return [View(Camera(0.4, 15.0 * k, 10.0), **CHOICE[own]) for k, own in enumerate(choice)]
 
 
 def before(own: Sequence[int]) -> Surrogate:
@@ -39,9 +34,7 @@ def backgrounds(own: Sequence[int]) -> Backgrounds:
 
 @given(seed=st.integers(0, 99), step=st.integers(0, 99), own=st.lists(st.integers(0, 2), min_size=3, max_size=13))
 @SMALL
-def test_views_look_as_if_they_had_been_measured_in_front_of_what_was_drawn(
-    seed: int, step: int, own: list[int]
-) -> None:
+def test_views_look_as_if_measured_in_front_of_what_was_drawn(seed: int, step: int, own: list[int]) -> None:
     moved = backgrounds(own).behind(before(own), seed=seed, step=step)
     there = before(backgrounds(own).drawn(seed=seed, step=step).tolist())
     for batch in range(len(there.batches)):
@@ -50,16 +43,11 @@ def test_views_look_as_if_they_had_been_measured_in_front_of_what_was_drawn(
 
 
 def test_seed_and_step_decide_what_is_drawn() -> None:
-    own = backgrounds([0] * 12)
-
-    def drawn(seed: int, step: int) -> list[int]:
-        found: list[int] = own.drawn(seed=seed, step=step).tolist()
-        return found
-
-    assert drawn(1, 2) == drawn(1, 2)
-    assert drawn(1, 2) != drawn(1, 3)
-    assert drawn(1, 2) != drawn(2, 2)
-    assert set(drawn(1, 2)) == {0, 1, 2}
+    draws = ((1, 2), (1, 2), (1, 3), (2, 2))
+    once, again, later, other = (backgrounds([0] * 12).drawn(seed=seed, step=step).tolist() for seed, step in draws)
+    assert once == again
+    assert once not in (later, other)
+    assert set(once) == {0, 1, 2}
 
 
 def test_backgrounds_are_drawn_by_how_often_the_object_is_recognised_there() -> None:

@@ -17,13 +17,15 @@ from trompe_shared.errors import SpecError
 CLASSES = 5
 LOGITS = st.lists(st.lists(st.floats(-50, 50, width=32), min_size=5, max_size=5), min_size=1, max_size=6)
 LOSSES = ("margin", "cross_entropy")
-GOALS = [
-    pytest.param({}, id="untargeted"),
-    pytest.param({"target": 3}, id="targeted"),
-    pytest.param({"top_k": 3}, id="top-3"),
-    pytest.param({"label": (0, 2)}, id="several classes"),
-    pytest.param({"label": (0, 2), "top_k": 3}, id="several classes, top-3"),
-]
+KINDS: dict[str, dict[str, Any]] = {
+    "untargeted": {},
+    "targeted": {"target": 3},
+    "top-3": {"top_k": 3},
+    "several classes": {"label": (0, 2)},
+    "several classes, top-3": {"label": (0, 2), "top_k": 3},
+}
+GOALS = {f"{loss}, {kind}": Goal(**{"label": 0, "loss": loss} | KINDS[kind]) for loss in LOSSES for kind in KINDS}
+every_goal = pytest.mark.parametrize("goal", GOALS.values(), ids=GOALS)
 SETS = st.permutations(range(5)).flatmap(lambda order: st.integers(1, 4).map(lambda n: tuple(order[:n])))
 """Some of the five classes, but not all."""
 
@@ -55,9 +57,7 @@ def test_each_class_of_a_set_counts_as_the_object(rows: list[list[float]], label
 
 @given(LOGITS, st.integers(0, 4), st.sampled_from(LOSSES))
 @settings(max_examples=100)
-def test_a_set_of_one_class_gives_the_bytes_of_the_textbook_formula(
-    rows: list[list[float]], label: int, loss: Any
-) -> None:
+def test_a_set_of_one_class_gives_the_bytes_of_the_formula(rows: list[list[float]], label: int, loss: Any) -> None:
     leaf, same = (torch.tensor(rows).requires_grad_() for _ in range(2))
     losses = Goal((label,), loss=loss).losses(leaf, clamped=False)
     others = same.clone()
@@ -77,10 +77,9 @@ def test_cross_entropy_is_that_of_the_class_one_leaves_or_minus_that_of_the_targ
     torch.testing.assert_close(Goal(1, target=0, loss="cross_entropy").losses(logits), log_shares[:, 0])
 
 
-@pytest.mark.parametrize("options", GOALS)
-@pytest.mark.parametrize("loss", LOSSES)
-def test_a_small_step_along_the_gradient_raises_the_loss(loss: Any, options: dict[str, Any]) -> None:
-    goal, logits = Goal(**{"label": 0, "loss": loss} | options), torch.tensor([[4.0, 1.0, 2.5, -1.0, 0.0]])
+@every_goal
+def test_a_small_step_along_the_gradient_raises_the_loss(goal: Goal) -> None:
+    logits = torch.tensor([[4.0, 1.0, 2.5, -1.0, 0.0]])
     leaf = logits.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(goal.losses(leaf).sum(), leaf)
     assert goal.losses(logits + 1e-3 * gradient.sign()) > goal.losses(logits)
@@ -96,21 +95,14 @@ EXTREME = [
 
 
 @pytest.mark.parametrize("size", [1.0, 1e4, 1e30])
-@pytest.mark.parametrize("options", GOALS)
-@pytest.mark.parametrize("loss", LOSSES)
-def test_saturated_and_equal_logits_give_finite_losses_and_gradients(
-    loss: Any, options: dict[str, Any], size: float
-) -> None:
-    check_finite(Goal(**{"label": 0, "loss": loss} | options), torch.tensor(EXTREME) * size)
+@every_goal
+def test_saturated_and_equal_logits_give_finite_losses_and_gradients(goal: Goal, size: float) -> None:
+    check_finite(goal, torch.tensor(EXTREME) * size)
 
 
-@pytest.mark.parametrize("options", GOALS)
-@pytest.mark.parametrize("loss", LOSSES)
+@every_goal
 @pytest.mark.parametrize("odd", [torch.inf, -torch.inf, torch.nan])
-def test_logits_that_are_not_finite_give_finite_losses_and_gradients(
-    odd: float, loss: Any, options: dict[str, Any]
-) -> None:
-    goal = Goal(**{"label": 0, "loss": loss} | options)
+def test_logits_that_are_not_finite_give_finite_losses_and_gradients(goal: Goal, odd: float) -> None:
     for count in range(1, CLASSES + 1):
         logits = torch.tensor(EXTREME)
         logits[:, :count] = odd
@@ -140,9 +132,7 @@ def test_only_a_margin_that_is_safe_settles_a_view_and_its_gradient_is_zero() ->
     ("options", "message"),
     [
         pytest.param({"target": 2}, "the object's own class", id="the target is the true class"),
-        pytest.param(
-            {"label": (1, 4), "target": 4}, "the object's own class", id="the target is one of the true classes"
-        ),
+        pytest.param({"label": (1, 4), "target": 4}, "the object's own class", id="the target is one of several"),
         pytest.param({"top_k": 0}, "at least 1", id="no best class"),
         pytest.param({"target": 1, "top_k": 2}, "use one of the two", id="towards one class and away from many"),
         pytest.param({"loss": "hinge"}, "margin, cross_entropy", id="an unknown loss"),

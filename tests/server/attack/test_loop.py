@@ -262,9 +262,8 @@ def losses(surrogate: Surrogate, **options: Any) -> list[float]:
 def test_each_step_draws_other_views(many_views: Surrogate) -> None:
     texels = many_views.texels(textures_of(SQUARE))
     with torch.no_grad():
-        logits = [
-            fake_classifier().logits(many_views.render(texels, batch)) for batch in range(len(many_views.batches))
-        ]
+        images = [many_views.render(texels, batch) for batch in range(len(many_views.batches))]
+        logits = [fake_classifier().logits(each) for each in images]
     first = losses(many_views, views_per_step=5)[0]
     assert any(first == pytest.approx(float(Goal(LABEL).losses(some).mean()), abs=1e-4) for some in logits)
     assert first != pytest.approx(losses(many_views)[0], abs=1e-6)
@@ -417,15 +416,16 @@ def test_only_active_views_are_evaluated() -> None:
 # The safe margin, and the end of a search
 
 
-def fooled_run(**options: Any) -> AttackState:
-    """A search on a classifier that is fooled from the beginning."""
-    return run(classifier=fooled_classifier(), **{"budget": Budget(0.1, 0.1)} | options)
+def fooled_run(**options: Any) -> tuple[AttackState, list[Step]]:
+    """A search on a classifier that is fooled from the beginning, and its steps."""
+    seen: list[Step] = []
+    asked: dict[str, Any] = {"budget": Budget(0.1, 0.1)} | options
+    return run(classifier=fooled_classifier(), on_step=seen.append, **asked), seen
 
 
 @pytest.mark.parametrize("optimiser", ["pgd", "nesterov"])
 def test_safely_won_views_are_skipped_for_two_steps_and_nothing_moves(optimiser: str) -> None:
-    seen: list[Step] = []
-    state = fooled_run(steps=5, optimiser=optimiser, on_step=seen.append)
+    state, seen = fooled_run(steps=5, optimiser=optimiser)
     assert [step.evaluations for step in seen] == [12, 12, 12, 24, 24]
     assert [step.fooled for step in seen] == [1.0] * 5
     assert [step.loss for step in seen] == pytest.approx([SAFE_MARGIN * RISE**step.step for step in seen])
@@ -433,8 +433,7 @@ def test_safely_won_views_are_skipped_for_two_steps_and_nothing_moves(optimiser:
 
 
 def test_a_search_ends_once_all_views_are_safely_won() -> None:
-    seen: list[Step] = []
-    state = fooled_run(steps=40, on_step=seen.append)
+    state, seen = fooled_run(steps=40)
     assert len(seen) == int(np.log(SAFE_ENOUGH / SAFE_MARGIN) / np.log(RISE)) + 1
     assert [step.least_left for step in seen] == list(range(len(seen)))[::-1]
     assert state.step == 40
@@ -442,8 +441,7 @@ def test_a_search_ends_once_all_views_are_safely_won() -> None:
 
 
 def test_a_goal_with_an_unreachable_margin_runs_all_steps() -> None:
-    seen: list[Step] = []
-    state = fooled_run(steps=40, goal=Goal(LABEL, safe=1000.0), on_step=seen.append)
+    state, seen = fooled_run(steps=40, goal=Goal(LABEL, safe=1000.0))
     assert [step.step for step in seen] == list(range(40))
     assert all(90 < step.loss < 110 and step.fooled == 1 for step in seen)
     assert [step.least_left for step in seen] == list(range(40))[::-1]

@@ -26,9 +26,7 @@ def test_every_optimiser_raises_the_loss(optimiser: str) -> None:
 @every_optimiser
 @given(epsilon=st.floats(1 / 255, 1), share=st.floats(0.05, 1), seed=st.integers(0, 99))
 @SMALL
-def test_every_optimiser_keeps_the_budget_to_the_last_bit_once_saved(
-    optimiser: str, epsilon: float, share: float, seed: int
-) -> None:
+def test_every_optimiser_keeps_the_budget_once_saved(optimiser: str, epsilon: float, share: float, seed: int) -> None:
     budget = Budget(epsilon, share * epsilon)
     begin = random_state(budget, seed)
     state = run(steps=3, state=begin, budget=budget, seed=seed, optimiser=optimiser)

@@ -112,9 +112,8 @@ def test_a_texel_ranks_by_the_saliency_of_its_pixels() -> None:
 def test_the_scores_of_views_add_up() -> None:
     generator = torch.Generator().manual_seed(0)
     maps = [torch.rand(SURROGATE.n_views, *SIZE, generator=generator) for _ in range(2)]
-    one, other, both = (
-        rank_texels(SURROGATE, textures_of(SQUARE), some)["m0.png"] for some in (*maps, maps[0] + maps[1])
-    )
+    maps.append(maps[0] + maps[1])
+    one, other, both = (rank_texels(SURROGATE, textures_of(SQUARE), some)["m0.png"] for some in maps)
     torch.testing.assert_close(one + other, both, atol=1e-4, rtol=1e-4)
 
 

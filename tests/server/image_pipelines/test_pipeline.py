@@ -185,11 +185,8 @@ SIDES = st.integers(4, 40)
 
 @given(side=SIDES, zoom=st.floats(0.5, 2), shift=st.floats(-0.2, 0.2), mirrored=st.booleans(), sigma=st.floats(0, 3))
 def test_an_even_image_stays_even(side: int, zoom: float, shift: float, mirrored: bool, sigma: float) -> None:
-    for axis in (
-        placed(side, zoom=zoom, shift=shift, mirrored=mirrored),
-        blurred(side, sigma),
-        resized(side, side // 2),
-    ):
+    matrices = (placed(side, zoom=zoom, shift=shift, mirrored=mirrored), blurred(side, sigma), resized(side, side // 2))
+    for axis in matrices:
         torch.testing.assert_close(axis.sum(1), torch.ones(side))
 
 
@@ -223,9 +220,8 @@ def test_a_zoom_magnifies_about_the_middle() -> None:
     row = torch.linspace(-1, 1, 41)
     inner = slice(12, -12)
     torch.testing.assert_close((placed(41, zoom=2) @ row)[inner], row[inner] / 2)
-    torch.testing.assert_close(
-        (placed(41, zoom=0.8) @ row)[inner], row[inner] / 0.8, rtol=0, atol=0.005
-    )  # a tent between two pixels
+    # a tent between two pixels
+    torch.testing.assert_close((placed(41, zoom=0.8) @ row)[inner], row[inner] / 0.8, rtol=0, atol=0.005)
 
 
 def test_a_reduction_averages_what_it_cannot_show() -> None:
