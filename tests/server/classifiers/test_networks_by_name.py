@@ -16,9 +16,10 @@ import torch
 from PIL import Image
 from torch import Tensor, nn
 
+from tests.server.classifiers.test_contract import white_box
 from trompe_server import attack_object
 from trompe_server.attack import Budget, ViewDistribution
-from trompe_server.classifiers import NetworkClassifier, classifier_file, load_classifier
+from trompe_server.classifiers import classifier_file, load_classifier
 from trompe_server.classifiers.fold import Formatted
 from trompe_server.classifiers.registry import ZOOS
 from trompe_server.classifiers.timm_networks import load_timm
@@ -44,16 +45,6 @@ IMAGENET: Final = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 """Mean and standard deviation."""
 
 
-def random_images(side: int, count: int = 1) -> Tensor:
-    return torch.rand((count, 3, side, side), generator=torch.Generator().manual_seed(1))
-
-
-def of_normalised(network: Callable[[Tensor], Tensor], images: Tensor, mean: Any, std: Any) -> Tensor:
-    """What a network says of images in [0, 1] that it wants normalised."""
-    with torch.no_grad():
-        return network((images - torch.tensor(mean).reshape(3, 1, 1)) / torch.tensor(std).reshape(3, 1, 1))
-
-
 @pytest.fixture
 def models() -> Any:
     """torchvision's networks. Where torchvision was built for another torch its compiled operators are missing; no
@@ -67,6 +58,16 @@ def models() -> Any:
             schema = "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor"
             torch.library.define(f"torchvision::{name}", schema)
         return importlib.import_module("torchvision.models")
+
+
+def random_images(side: int, count: int = 1) -> Tensor:
+    return torch.rand((count, 3, side, side), generator=torch.Generator().manual_seed(1))
+
+
+def of_normalised(network: Callable[[Tensor], Tensor], images: Tensor, mean: Any, std: Any) -> Tensor:
+    """What a network says of images in [0, 1] that it wants normalised."""
+    with torch.no_grad():
+        return network((images - torch.tensor(mean).reshape(3, 1, 1)) / torch.tensor(std).reshape(3, 1, 1))
 
 
 @pytest.fixture
@@ -89,10 +90,8 @@ def real(models: Any, name: str, **options: Any) -> nn.Module:
     return network
 
 
-def white_box(reference: str, **options: Any) -> NetworkClassifier:
-    classifier = load_classifier(reference, **options)
-    assert isinstance(classifier, NetworkClassifier)
-    return classifier
+def saved(network: nn.Module, path: Path) -> None:
+    torch.save(network.state_dict(), path)
 
 
 @pytest.fixture
@@ -148,7 +147,7 @@ def test_a_torchvision_network_has_its_own_size_classes_and_normalisation(
     name: str, options: dict[str, Any], size: int, models: Any, cache: Path
 ) -> None:
     network = real(models, name, **options)
-    torch.save(network.state_dict(), cache / FILES[name])
+    saved(network, cache / FILES[name])
     classifier = white_box(f"torchvision:{name}")
     assert (classifier.name, classifier.image_size, classifier.n_classes) == (name, (size, size), 1000)
     assert classifier.classes is not None
@@ -163,7 +162,7 @@ def test_a_torchvision_network_has_its_own_size_classes_and_normalisation(
 
 def test_weights_are_found_in_torchs_cache(models: Any, cache: Path) -> None:
     network = real(models, "squeezenet1_1")
-    torch.save(network.state_dict(), cache / FILES["squeezenet1_1"])
+    saved(network, cache / FILES["squeezenet1_1"])
     for classifier in (white_box("squeezenet1_1"), white_box("torchvision:squeezenet1_1", name="mine")):
         images = random_images(224)
         expected = of_normalised(network, images, *IMAGENET)
@@ -295,8 +294,7 @@ def test_a_vision_transformer_by_name_is_attacked_end_to_end(
     stored: Callable[..., nn.Module], mug: Object3D, target: SailenvTarget
 ) -> None:
     stored("vit_tiny_patch16_224")
-    network = load_classifier("timm:vit_tiny_patch16_224")
-    assert isinstance(network, NetworkClassifier)
+    network = white_box("timm:vit_tiny_patch16_224")
     views = ViewDistribution(distance=0.3, elevation=(10, 50)).sample(3, generator=np.random.default_rng(0))
     label = int(network.predict(target.render(mug, views[:1], size=network.image_size)).argmax())
     attacked = attack_object(
@@ -372,9 +370,7 @@ def test_class_names_of_transformers_are_those_of_the_logits(
     ],
 )
 @pytest.mark.usefixtures("models")
-def test_pixels_become_the_input_that_transformers_makes(
-    processor: str, settings: dict[str, Any], hub: Callable[[str], Path]
-) -> None:
+def test_pixels_become_transformers_input(processor: str, settings: dict[str, Any], hub: Callable[[str], Path]) -> None:
     folder = hub("org/model")
     network = vision_transformer(folder)
     theirs = getattr(pytest.importorskip("transformers"), f"{processor}ImageProcessor")
@@ -399,9 +395,8 @@ def test_a_repository_without_a_trained_head_is_refused(hub: Callable[[str], Pat
     folder = hub("org/model")
     vision_transformer(folder).vit.save_pretrained(folder)
     (folder / "preprocessor_config.json").write_text('{"size": 32, "do_normalize": false}')
-    with pytest.raises(
-        ClassifierError, match=r"not trained to classify images: its file lacks classifier.bias, classi"
-    ):
+    lacking = r"not trained to classify images: its file lacks classifier.bias, classi"
+    with pytest.raises(ClassifierError, match=lacking):
         load_classifier("hf:org/model")
 
 
@@ -413,9 +408,7 @@ def test_a_repository_without_a_trained_head_is_refused(hub: Callable[[str], Pat
         pytest.param('{"size": 32}', "config.json of 'org/model' names no image_mean or no image_std", id="no mean"),
     ],
 )
-def test_settings_of_images_that_cannot_be_read_are_refused(
-    settings: str, message: str, hub: Callable[[str], Path]
-) -> None:
+def test_unreadable_settings_of_images_are_refused(settings: str, message: str, hub: Callable[[str], Path]) -> None:
     folder = hub("org/model")
     vision_transformer(folder)
     (folder / "preprocessor_config.json").write_text(settings)
@@ -430,7 +423,7 @@ def test_a_network_of_robustbench_contains_its_normalisation(models: Any) -> Non
     file = classifier_file("robustbench:Salman2020Do_R18")
     os.makedirs(file.parent)
     network = models.resnet18().eval()
-    torch.save(network.state_dict(), file)
+    saved(network, file)
     classifier, images = white_box("robustbench:Salman2020Do_R18"), random_images(224)
     assert (classifier.image_size, classifier.n_classes) == ((224, 224), 1000)
     assert classifier.classes is not None

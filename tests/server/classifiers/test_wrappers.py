@@ -9,8 +9,6 @@ from tests.fakes import fake_classifier
 from trompe_server.classifiers import WhiteBoxClassifier, as_ensemble, resized
 from trompe_shared.errors import ClassifierError
 
-GENERATOR = torch.Generator().manual_seed(0)
-IMAGES = torch.rand(3, 3, 32, 32, generator=GENERATOR)
 NAMES = tuple("abcdefghij")
 FAKE = fake_classifier(classes=NAMES)
 
