@@ -78,22 +78,17 @@ def written(folder: Path, **file: Any) -> Path:
 def assets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder like that of the paper's objects: some of its objects and three classifiers."""
     folder = tmp_path / "assets"
-    table = {}
-    for number, name in enumerate(
-        ("candle", "pot", "plunger", "table_living_room", "remote_controller", "toilet_paper")
-    ):
-        (folder / "objects" / name).mkdir(parents=True)
-        (folder / "objects" / name / f"{name}.obj").write_text(f"o {name}")
-        row = {"imagenet_class": 470 + number, "distance": 0.5, "elevation_range": [-10, 40], "background": "black"}
-        table[name] = row
-    (folder / "objects" / "objects.json").write_text(json.dumps(table))
-    (folder / "classifiers").mkdir()
-    networks = ("mobilenet_v2.pt2", "mobilenet_edgetpu_075.pt2", "squeezenet1_1.pt2")
-    for name in (*networks, "mobilenet_v1.onnx", "mobilenet_v3_large_min.onnx"):
-        (folder / "classifiers" / name).write_bytes(name.encode())
-    (folder / "backgrounds").mkdir()
-    for name in ("room", "toilet"):
-        (folder / "backgrounds" / f"{name}.png").write_bytes(name.encode())
+    names = ("candle", "pot", "plunger", "table_living_room", "remote_controller", "toilet_paper")
+    looks = {"distance": 0.5, "elevation_range": [-10, 40], "background": "black"}
+    table = {name: looks | {"imagenet_class": 470 + number} for number, name in enumerate(names)}
+    files = {"objects/objects.json": json.dumps(table)} | {f"objects/{name}/{name}.obj": f"o {name}" for name in names}
+    white = ("mobilenet_v2.pt2", "mobilenet_edgetpu_075.pt2", "squeezenet1_1.pt2")
+    for network in (*white, "mobilenet_v1.onnx", "mobilenet_v3_large_min.onnx"):
+        files[f"classifiers/{network}"] = network
+    files |= {f"backgrounds/{name}.png": name for name in ("room", "toilet")}
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
     monkeypatch.setenv("TROMPE_ASSETS", str(folder))
     return folder
 
@@ -126,9 +121,7 @@ def test_every_combination_is_one_job_with_a_key_of_its_own(
     )
     assert len(plan.rows) == 2 * len(epsilons) * len(taus) * max(cases, 1) * seeds
     assert len(plan.jobs()) == len(plan.rows)
-    asked = {
-        (r.object, *(r.attack.options.get(name) for name in ("epsilon", "tau", "steps", "seed"))) for r in plan.rows
-    }
+    asked = {(row.object, *map(row.attack.options.get, ("epsilon", "tau", "steps", "seed"))) for row in plan.rows}
     assert len(asked) == len(plan.rows)
 
 
@@ -151,9 +144,7 @@ class LaterRequest(JobRequest):
         return LaterRequest.model_validate(self.model_dump(exclude={"labels", "priority"}))
 
 
-def test_keys_stay_when_a_later_version_adds_an_option_until_somebody_asks_for_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_keys_stay_when_a_version_adds_an_option_until_somebody_asks_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = {
         "base": {"steps": 7, "ranges": {"roll": [-5, 5]}},
         "grid": {"epsilon": [0.02, 0.1], "image_pipeline": ["none"]},
@@ -245,9 +236,8 @@ def test_files_are_named_by_their_bytes_and_then_by_what_the_server_called_them(
 def test_configurations_name_files_without_folder_and_suffix_and_other_networks_in_full(assets: Path) -> None:
     networks = ["timm:resnet50.a1_in1k", "hf:someone/net.onnx", "$TROMPE_ASSETS/classifiers/mobilenet_v2.pt2"]
     plan = planned(grid={"classifier": networks})
-    assert [row.place.configuration for row in plan.rows] == [
-        f"classifier {name}" for name in (*networks[:2], "mobilenet_v2")
-    ]
+    named = [f"classifier {name}" for name in (*networks[:2], "mobilenet_v2")]
+    assert [row.place.configuration for row in plan.rows] == named
 
 
 @pytest.mark.parametrize("name", shipped_experiments())
@@ -295,22 +285,14 @@ def test_a_job_that_contradicts_itself_is_told_before_anything_is_asked() -> Non
         planned(grid={"alpha": [0.5]})
 
 
-@pytest.mark.parametrize(
-    ("mistake", "words"),
-    [
-        pytest.param(
-            {"grid": {"classifier": ["tiny", "net.onnx"]}}, "judgement of mug needs one `classifier`", id="networks"
-        ),
-        pytest.param(
-            {"objects": {"stored": {"label": 0}}},
-            "needs the file of stored for its noise: give it as `file`",
-            id="name",
-        ),
-        pytest.param(
-            {"base": {"background": "room.png"}}, "judgement of mug: .*'room.png' is not a colour", id="background"
-        ),
-    ],
-)
+UNFIT: dict[str, tuple[dict[str, Any], str]] = {
+    "networks": ({"grid": {"classifier": ["tiny", "net.onnx"]}}, "judgement of mug needs one `classifier`"),
+    "name": ({"objects": {"stored": {"label": 0}}}, "needs the file of stored for its noise: give it as `file`"),
+    "background": ({"base": {"background": "room.png"}}, "judgement of mug: .*'room.png' is not a colour"),
+}
+
+
+@pytest.mark.parametrize(("mistake", "words"), UNFIT.values(), ids=UNFIT)
 def test_what_can_never_be_judged_is_told_before_any_job(mistake: dict[str, Any], words: str, tmp_path: Path) -> None:
     for file in ("net.onnx", "room.png"):
         (tmp_path / file).write_bytes(b"file")
@@ -325,9 +307,8 @@ def test_a_judgement_may_be_of_several_budgets_and_of_one_network_by_object() ->
 
 
 def test_what_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(
-        SpecError, match="one of baselines, baselines_real, engines, few_texels, paper, path_tracers, perceptual, quick"
-    ):
+    shipped = "one of baselines, baselines_real, engines, few_texels, paper, path_tracers, perceptual, quick"
+    with pytest.raises(SpecError, match=shipped):
         load_experiment("nothing")
     (tmp_path / "bad.yaml").write_text("name: [")
     with pytest.raises(SpecError, match="is not YAML"):

@@ -60,11 +60,8 @@ def row(**columns: Any) -> ResultRow:
 
 
 def prediction(key: str, moment: str, count: int, *, true: bool) -> PredictionRow:
-    name = "candle" if true else "pot, flowerpot"
-    index = 0 if true else 1
-    return PredictionRow(
-        key=key, views="target", moment=moment, class_index=index, name=name, true_class=true, count=count
-    )
+    k, name = (0, "candle") if true else (1, "pot, flowerpot")
+    return PredictionRow(key=key, views="target", moment=moment, class_index=k, name=name, true_class=true, count=count)
 
 
 def test_drops_through_changes_of_the_images_are_compared_with_the_undisturbed_ones(tmp_path: Path) -> None:
@@ -108,11 +105,8 @@ def test_what_all_configurations_of_a_series_share_is_left_out_of_their_names() 
         row(series="preset x held_out", configuration=f"preset {name}, held_out 100") for name in ("fast", "best")
     ] + [row(series="optimiser x steps", configuration="optimiser fgsm, steps 1")]
     named = [each.configuration for each in configurations(rows)]
-    assert named == [
-        ("preset", "preset fast"),
-        ("preset", "preset best"),
-        ("optimiser x steps", "optimiser fgsm, steps 1"),
-    ]
+    presets = [("preset", f"preset {name}") for name in ("fast", "best")]
+    assert named == [*presets, ("optimiser x steps", "optimiser fgsm, steps 1")]
 
 
 def test_series_that_would_have_one_title_keep_what_tells_them_apart() -> None:
@@ -315,9 +309,7 @@ def test_the_grid_at_a_glance_averages_what_was_recognised_and_sets_the_papers_m
     ]
 
 
-def test_jobs_that_not_every_surrogate_has_are_in_no_comparison_and_one_surrogate_alone_is_in_the_other_figures(
-    tmp_path: Path,
-) -> None:
+def test_jobs_that_some_surrogate_lacks_are_not_compared_and_other_figures_show_one_surrogate(tmp_path: Path) -> None:
     alone = row(key="alone", object="pot", surrogate="diffuse", epsilon=0.1)
     assert surrogates_markdown([*surrogate_rows(), alone]) == surrogates_markdown(surrogate_rows())
     data = read_data(written(tmp_path / "some", [*surrogate_rows(), alone]))
@@ -351,41 +343,35 @@ def written(folder: Path, rows: Sequence[ResultRow]) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    ("rows", "names"),
-    [
-        pytest.param(grid_rows(), ["table_one", "scatter", "histograms"], id="grid"),
-        pytest.param(series_rows(), ["speed_accuracy", "evaluations_accuracy"], id="series"),
-        pytest.param(stability_rows(), ["stability"], id="cases"),
-        pytest.param(engine_rows(), ["engines"], id="engines"),
-        pytest.param(surrogate_rows(), ["table_one", "scatter", "surrogates", "histograms"], id="surrogates"),
-        pytest.param(
-            [row(object="mug", surrogate="diffuse"), row(object="lamp", surrogate="curve")],
-            ["table_one", "histograms"],
-            id="surrogates on different objects",
-        ),
-        pytest.param(
-            [row(surrogate="diffuse", state="failed", target_a_drop=None)]
-            + [row(surrogate="curve", tau=tau) for tau in (None, 0.1, 0.2)],
-            [],
-            id="no result of the first surrogate",
-        ),
-        pytest.param(
-            [row(series=str(n > 1), configuration=f"steps {n}", object=f"object {n}", alpha=n / 9) for n in range(4)]
-            + [row(series="True", configuration="steps 3", object="object 3", alpha=0.5)],
-            [],
-            id="series on different objects",
-        ),
-        pytest.param(
-            [*grid_rows(), row(key="small", series="small", epsilon=0.01, alpha=0.004, configuration="epsilon 0.01")],
-            ["table_one", "scatter", "histograms"],
-            id="grid in two series",
-        ),
-    ],
-)
-def test_a_report_holds_what_fits_its_rows_and_needs_nothing_else(
-    rows: list[ResultRow], names: list[str], tmp_path: Path
-) -> None:
+REPORTS: dict[str, tuple[list[ResultRow], list[str]]] = {
+    "grid": (grid_rows(), ["table_one", "scatter", "histograms"]),
+    "series": (series_rows(), ["speed_accuracy", "evaluations_accuracy"]),
+    "cases": (stability_rows(), ["stability"]),
+    "engines": (engine_rows(), ["engines"]),
+    "surrogates": (surrogate_rows(), ["table_one", "scatter", "surrogates", "histograms"]),
+    "surrogates on different objects": (
+        [row(object="mug", surrogate="diffuse"), row(object="lamp", surrogate="curve")],
+        ["table_one", "histograms"],
+    ),
+    "no result of the first surrogate": (
+        [row(surrogate="diffuse", state="failed", target_a_drop=None)]
+        + [row(surrogate="curve", tau=tau) for tau in (None, 0.1, 0.2)],
+        [],
+    ),
+    "series on different objects": (
+        [row(series=str(n > 1), configuration=f"steps {n}", object=f"object {n}", alpha=n / 9) for n in range(4)]
+        + [row(series="True", configuration="steps 3", object="object 3", alpha=0.5)],
+        [],
+    ),
+    "grid in two series": (
+        [*grid_rows(), row(key="small", series="small", epsilon=0.01, alpha=0.004, configuration="epsilon 0.01")],
+        ["table_one", "scatter", "histograms"],
+    ),
+}
+
+
+@pytest.mark.parametrize(("rows", "names"), REPORTS.values(), ids=REPORTS)
+def test_a_report_fits_its_rows_and_needs_nothing_else(rows: list[ResultRow], names: list[str], tmp_path: Path) -> None:
     folder = written(tmp_path / "some", rows)
     assert list(figures_of(read_data(folder))) == names
     page = write_report(folder).read_text("utf-8")
@@ -409,9 +395,7 @@ def test_a_report_holds_what_fits_its_rows_and_needs_nothing_else(
         (between_chart, "image_pipeline"),
     ],
 )
-def test_charts_of_more_series_than_colours_begin_again(
-    chart: Callable[[Sequence[ResultRow]], Drawing], column: str
-) -> None:
+def test_charts_with_too_few_colours_begin_again(chart: Callable[[Sequence[ResultRow]], Drawing], column: str) -> None:
     assert chart([row(**{column: str(k / 10)}) for k in range(1, 10)]).panels
 
 
@@ -451,10 +435,8 @@ def test_histograms_show_one_row_of_each_object_and_need_predictions() -> None:
 
 def test_classes_of_one_name_have_bars_of_their_own() -> None:
     said = [
-        PredictionRow(
-            key="k", views="target", moment=moment, class_index=k, name="crane", true_class=k == 9, count=count
-        )
-        for moment, k, count in (("before", 9, 60), ("after", 9, 6), ("after", 134, 54))
+        PredictionRow(key="k", views="target", moment=when, class_index=k, name="crane", true_class=k == 9, count=count)
+        for when, k, count in (("before", 9, 60), ("after", 9, 6), ("after", 134, 54))
     ]
     (panel,) = prediction_histograms([row()], said).panels
     assert [label.get_text() for label in panel.get_yticklabels()] == ["crane (true class)", "crane"]

@@ -64,9 +64,7 @@ def test_each_disturbance_of_the_suite_changes_the_pictures_in_the_same_way_in_e
         assert (picture == seen(case.renderer)).all(), words
 
 
-def test_a_disturbed_worker_says_what_it_is_and_its_noise_is_another_in_every_picture(
-    mug: Object3D, target: SailenvTarget
-) -> None:
+def test_a_disturbed_worker_says_so_and_every_picture_has_its_own_noise(mug: Object3D, target: SailenvTarget) -> None:
     with disturbed_renderer(grain=8) as noisy:
         assert noisy.engine.settings == "grain=8.0"
         first, second = (noisy.render(mug, VIEWS[:1], size=SIZE) for _ in range(2))
@@ -136,18 +134,14 @@ def test_words_of_no_case_are_refused_with_the_cases() -> None:
         stability_plan(objects=["mug"], seeds=1, only="nonsense")
 
 
-@pytest.fixture
-def fake_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "disturbed_renderer", lambda **_: nullcontext(FakeTarget()))
-
-
 def suite(folder: Path, only: str) -> tuple[tuple[ResultRow, ...], Silent]:
     show = Silent()
     plan = stability_plan(objects=["mug"], seeds=1, only=only, options=SMALL)
     return run_experiment(plan, DisturbedService(FakeTarget()), folder, show=show), show
 
 
-def test_the_suite_runs_what_is_missing_and_keeps_the_order_of_its_cases(tmp_path: Path, fake_disturbed: None) -> None:
+def test_the_suite_runs_what_is_missing_in_order_of_its_cases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service, "disturbed_renderer", lambda **_: nullcontext(FakeTarget()))
     rows, show = suite(tmp_path, "JPEG, quality 75")
     assert [row.case for row in rows] == ["JPEG, quality 75", "unforeseen: JPEG, quality 75"] == show.cases
     assert rows[0].experiment == "stability_targets"
@@ -173,9 +167,7 @@ def test_an_unforeseen_disturbance_changes_the_judgement_of_the_undisturbed_jobs
         assert not getattr(unforeseen, name), name
 
 
-def test_a_case_may_have_a_renderer_and_a_network_of_its_own_and_may_fail(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_case_may_have_its_own_renderer_and_network_and_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Broken(FakeTarget):
         def render(self, *_: object, **__: object) -> np.ndarray:
             raise ObjectError("broken")

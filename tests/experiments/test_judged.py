@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -131,13 +132,8 @@ def test_a_judgement_without_figures_says_why_and_the_others_go_on(
 ) -> None:
     finding = {"kind": "network", "text": "No figures of 'tiny'."}
     empty = Manifest.model_validate(EXAMPLE | {"cells": [], "findings": [*EXAMPLE["findings"], finding]})
-    judge = JudgingService.judge
-
-    def once(service: JudgingService, *args: Any, **options: Any) -> Manifest:
-        found = judge(service, *args, **options)
-        return empty if len(service.judged) == 1 else found
-
-    monkeypatch.setattr(JudgingService, "judge", once)
+    others = [Manifest.model_validate(EXAMPLE)] * 7
+    monkeypatch.setattr(JudgingService, "judge", Mock(side_effect=[empty, *others]))
     told = list[str]()
     rows = judged(plan, JudgingService(), tmp_path, told.append)
     assert told[1] == f"mug, {NOTHING}: No figures of 'tiny'."

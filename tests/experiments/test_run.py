@@ -199,9 +199,7 @@ def test_each_job_is_submitted_and_its_row_written(service: FakeService, tmp_pat
     assert not any(row.failed for row in rows)
 
 
-def test_what_the_server_has_done_before_is_fetched_before_anything_is_waited_for(
-    service: FakeService, tmp_path: Path
-) -> None:
+def test_what_the_server_has_done_is_fetched_before_any_wait(service: FakeService, tmp_path: Path) -> None:
     ran(plan_of(grid={"epsilon": [0.05]}), service, tmp_path / "before")
     service.by_key = {key: service.job(job.id) for key, job in service.by_key.items()}
     service.goes_away_after = service.looks
@@ -211,9 +209,7 @@ def test_what_the_server_has_done_before_is_fetched_before_anything_is_waited_fo
     assert [(row.object, row.epsilon) for row in rows] == [("mug", 0.05), ("chair", 0.05)]
 
 
-def test_a_job_is_fetched_when_it_is_done_however_many_submitted_before_it_still_wait(
-    service: FakeService, tmp_path: Path
-) -> None:
+def test_a_job_is_fetched_when_it_is_done_however_many_before_it_wait(service: FakeService, tmp_path: Path) -> None:
     plan = plan_of(objects={"mug": {}}, grid={"epsilon": [k / 100 for k in range(1, 3 * run.POLLED + 1)]})
     service.waiting = {f"job-{number}" for number in range(1, len(plan.rows))}  # all but the last
     service.goes_away_after = 10 * len(plan.rows)
@@ -249,9 +245,7 @@ def test_predictions_and_the_named_artifacts_are_kept(service: FakeService, tmp_
     ]
 
 
-def test_another_run_submits_what_is_new_or_was_kept_by_another_version_and_no_more(
-    service: FakeService, tmp_path: Path
-) -> None:
+def test_another_run_submits_only_what_is_new_or_kept_by_another_version(service: FakeService, tmp_path: Path) -> None:
     ran(plan_of(), service, tmp_path)
     before = (tmp_path / RESULTS).read_bytes()
     other = FakeService()
@@ -389,17 +383,12 @@ def test_experiments_that_share_nothing_are_not_compared(service: FakeService, t
     assert compared(tmp_path / "a", tmp_path / "a")
 
 
-def test_folders_are_shown_and_compared_even_without_the_columns_of_later_versions(
-    service: FakeService, tmp_path: Path
-) -> None:
+def test_folders_are_shown_and_compared_without_columns_of_later_versions(service: FakeService, tmp_path: Path) -> None:
     new, old = tmp_path / "new", tmp_path / "old"
     ran(plan_of(), service, new)
     old.mkdir()
-    with (
-        (new / RESULTS).open(newline="") as source,
-        (old / RESULTS).open("w", newline="", encoding="utf-8-sig") as copy,
-    ):
-        rows = csv.DictReader(source)
+    with (new / RESULTS).open(newline="") as table, (old / RESULTS).open("w", newline="", encoding="utf-8-sig") as copy:
+        rows = csv.DictReader(table)
         columns = [name for name in rows.fieldnames or [] if name not in {"image_pipeline", "target", "views_per_step"}]
         writer = csv.DictWriter(copy, columns, extrasaction="ignore")
         writer.writeheader()
@@ -433,9 +422,7 @@ def test_a_table_of_another_kind_is_refused(tmp_path: Path) -> None:
         read_results(tmp_path / "nowhere.csv")
 
 
-def test_where_only_the_tables_were_kept_their_rows_stay_and_count_as_done(
-    service: FakeService, tmp_path: Path
-) -> None:
+def test_where_only_tables_were_kept_their_rows_stay_and_count_as_done(service: FakeService, tmp_path: Path) -> None:
     """As in a checkout of published results: the same command must not wipe them out."""
     service.failing = {"chair"}
     ran(plan_of(), service, tmp_path)
@@ -453,9 +440,7 @@ def test_where_only_the_tables_were_kept_their_rows_stay_and_count_as_done(
     assert len({each.key for each in read_table(tmp_path / PREDICTIONS, PredictionRow)}) == 6
 
 
-def test_rows_of_other_jobs_that_nothing_else_is_left_of_are_never_overwritten(
-    service: FakeService, tmp_path: Path
-) -> None:
+def test_rows_that_are_all_that_is_left_of_a_job_are_never_overwritten(service: FakeService, tmp_path: Path) -> None:
     ran(plan_of(), service, tmp_path)
     narrower = plan_of(grid={"epsilon": [0.02]})
     assert len(ran(narrower, service, tmp_path)[0]) == 2
@@ -492,9 +477,7 @@ def test_each_job_is_a_run_of_a_tracker(service: FakeService, tmp_path: Path) ->
     assert len(show.ended) == 4
 
 
-def test_the_jobs_of_an_experiment_are_found_on_a_server(
-    service: FakeService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_jobs_are_found_on_a_server(service: FakeService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     service.failing = {"chair"}
     ran(plan_of(), service, tmp_path)
     spec, attacks = JudgementSpec.of("mug", "mug", label="mug"), service.jobs
@@ -529,9 +512,7 @@ def displayed(plan: Plan, service: FakeService, folder: Path, **options: Any) ->
     return written.getvalue()
 
 
-def test_a_log_shows_a_line_for_each_job_that_is_done_and_a_terminal_a_bar_over_all(
-    service: FakeService, tmp_path: Path
-) -> None:
+def test_a_log_shows_a_line_for_each_finished_job_and_a_terminal_a_bar(service: FakeService, tmp_path: Path) -> None:
     service.failing = {"chair"}
     lines = displayed(plan_of(), service, tmp_path / "log").splitlines()
     assert lines[0] == "4 jobs, 0 already done"

@@ -218,9 +218,7 @@ def test_every_answer_tells_browsers_to_be_strict(api: Api) -> None:
         assert headers["cache-control"] == "no-store"
 
 
-def test_the_tokens_are_looked_up_once_for_many_requests_at_the_same_time(
-    api: Api, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tokens_are_looked_up_once_for_many_requests_at_one_time(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     api.headers = api.token("ci", Right.read)
     monkeypatch.setattr("trompe_server.api.guard.FRESH", 600.0)
     look_up = Mock(side_effect=api.services.tokens.by_hash)

@@ -68,9 +68,7 @@ def test_what_cannot_be_classified_is_refused(api: Api) -> None:
         assert said in api.problem(classify(api, files, **form), status, said)["detail"]
 
 
-def test_a_token_that_may_read_classifies_until_its_rate_is_spent(
-    api: Api, pictures: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reader_classifies_until_its_rate_is_spent(api: Api, pictures: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     api.headers = api.token("reader", "read")
     assert classify(api, [encode_png(pictures[0])]).status_code == 200
     monkeypatch.setattr(api.services.classifications, "wait", lambda client: 1.5 if client == "reader" else 0.0)

@@ -194,10 +194,8 @@ def test_an_experiment_is_the_jobs_with_its_label(stocked: Api) -> None:
     vases = stocked.job(labels={"experiment": "vases/2"})
     stocked.post(f"/v1/jobs/{mugs[0]}/cancel")
     listed = {each["name"]: each for each in stocked.get("/v1/experiments").json()}
-    assert {name: each["jobs"] for name, each in listed.items()} == {
-        "mugs": {"cancelled": 1, "queued": 2},
-        "vases/2": {"queued": 1},
-    }
+    counts = {name: each["jobs"] for name, each in listed.items()}
+    assert counts == {"mugs": {"cancelled": 1, "queued": 2}, "vases/2": {"queued": 1}}
     assert listed["mugs"]["created"] == stocked.get(f"/v1/jobs/{mugs[0]}").json()["created"]
     page = stocked.get("/v1/experiments/mugs", params={"limit": 2}).json()
     rest = stocked.get("/v1/experiments/mugs", params={"cursor": page["next_cursor"]}).json()

@@ -46,15 +46,12 @@ def test_a_broken_archive_is_refused_and_nothing_is_kept(api: Api) -> None:
 def test_a_broken_classifier_is_refused_and_nothing_is_kept(api: Api) -> None:
     refusal = api.problem(api.upload_classifier(b"?"), 422)
     assert (refusal["type"], refusal["detail"]) == ("urn:trompe:invalid-classifier", "The classifier is broken.")
-    assert (
-        "is not a supported classifier: upload a .pt2"
-        in api.problem(api.upload_classifier(b"W", "net.pth"), 422)["detail"]
-    )
-    assert (
-        "2 class names for a classifier of 3"
-        in api.problem(api.upload_classifier(b"W", classes='["a", "b"]'), 422)["detail"]
-    )
-    assert "JSON list" in api.problem(api.upload_classifier(b"W", classes="a, b, c"), 422)["detail"]
+    for upload, words in (
+        ({"name": "net.pth"}, "is not a supported classifier: upload a .pt2"),
+        ({"classes": '["a", "b"]'}, "2 class names for a classifier of 3"),
+        ({"classes": "a, b, c"}, "JSON list"),
+    ):
+        assert words in api.problem(api.upload_classifier(b"W", **upload), 422)["detail"]
     assert stored_files(api) == []
 
 
@@ -69,10 +66,8 @@ def test_a_background_is_an_image(api: Api, tmp_path: Path) -> None:
     stored = api.post("/v1/backgrounds", files={"file": ("beach.gif", GIF)}).json()
     assert stored["name"] == "beach"
     assert api.get("/v1/backgrounds").json() == [stored]
-    assert (
-        "is not a readable image"
-        in api.problem(api.post("/v1/backgrounds", files={"file": ("x.png", b"no")}), 422)["detail"]
-    )
+    refused = api.post("/v1/backgrounds", files={"file": ("x.png", b"no")})
+    assert "is not a readable image" in api.problem(refused, 422)["detail"]
 
 
 @pytest.mark.parametrize(
@@ -112,9 +107,7 @@ def test_a_name_that_several_uploads_share_is_refused_with_their_ids(stocked: Ap
     assert stocked.submit(object=other).status_code == 201
 
 
-def test_uploads_are_looked_into_a_few_at_a_time_and_nothing_else_waits_for_them(
-    api: Api, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_uploads_are_read_a_few_at_a_time_and_nothing_else_waits(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     at_work, most, lock, gate = 0, 0, threading.Lock(), threading.Event()
     add = Library.add_object
 
