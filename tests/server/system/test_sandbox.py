@@ -50,9 +50,7 @@ def test_a_refusal_is_raised_with_its_words_as_the_error_that_the_caller_names(r
         pytest.param("x = bytearray(2**31)", "1024 MiB of memory", id="memory"),
         pytest.param("os.abort()", "memory", id="abort, as C++ does without memory"),
         pytest.param("import ctypes; ctypes.string_at(0)", "SIGSEGV", id="a crash"),
-        pytest.param(
-            "os.kill(os.getpid(), 9)", "was killed, probably for want of memory", id="killed, as by the kernel"
-        ),
+        pytest.param("os.kill(os.getpid(), 9)", "was killed, probably for want of memory", id="killed by the kernel"),
         pytest.param("sys.exit(3)", "exit code 3", id="an exit code"),
         pytest.param("raise RuntimeError('boo')", "exit code 1", id="an exception"),
         pytest.param("pass", "without an answer", id="silence"),
