@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ from trompe_server.surrogate.calibration import (
 )
 from trompe_server.surrogate.calibration_file import pack_calibration, unpack_calibration
 from trompe_server.surrogate.fidelity import MAX_ERROR, MIN_EXPLAINED, Fidelity, measure_fidelity
-from trompe_server.surrogate.rasterize import Planes, Samples, Visibility, rasterize
+from trompe_server.surrogate.rasterize import Visibility, rasterize
 from trompe_server.surrogate.shading import ENCODERS, decode, encode
 from trompe_server.surrogate.tone import ToneMap, measure_tone_map
 from trompe_shared.api import SurrogateModel
@@ -152,20 +153,12 @@ def test_the_sampling_of_a_known_target_is_recovered(busy_mug: Object3D, truth: 
     assert calibration.fidelity.mean()["correlation"] > 0.98
 
 
-def test_hypotheses_that_see_the_same_triangles_rasterise_them_once(
-    busy_mug: Object3D, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rasterised: list[object] = []
-
-    def counting(planes: Planes, size: tuple[int, int], samples: Samples, **options: Any) -> Visibility:
-        rasterised.append((samples, len(planes.face)))
-        return rasterize(planes, size, samples, **options)
-
-    clean = USUAL(busy_mug, VIEWS)
-    monkeypatch.setattr("trompe_server.surrogate.surrogate.rasterize", counting)
+def test_hypotheses_of_the_same_triangles_rasterise_once(busy_mug: Object3D, monkeypatch: pytest.MonkeyPatch) -> None:
+    clean, counted = USUAL(busy_mug, VIEWS), Mock(side_effect=rasterize)
+    monkeypatch.setattr("trompe_server.surrogate.surrogate.rasterize", counted)
     calibrate(busy_mug, VIEWS, clean, USUAL, wanted="auto", generator=np.random.default_rng(0))
     # USUAL's own two geometries; three kinds of samples, both sides of triangles, and the best again after those.
-    assert len(rasterised) <= TRIAL_VIEWS * (2 + 3 + 1 + 2)
+    assert counted.call_count <= TRIAL_VIEWS * (2 + 3 + 1 + 2)
 
 
 def test_triangles_known_from_another_hypothesis_make_the_same_geometry(mug: Object3D) -> None:
@@ -191,16 +184,11 @@ def test_a_view_in_which_hardly_anything_changes_does_not_outweigh_all_others(mu
     assert fidelity.explained[0] > -1
 
 
-def grid(azimuths: int | None, elevations: int) -> list[View]:
-    return grid_views(
-        distance=0.3, elevation=(0, 50), azimuths=azimuths, elevations=elevations, background=(255, 255, 255)
-    )
-
-
+grid = partial(grid_views, distance=0.3, elevation=(0, 50), background=(255, 255, 255))
 BOTH_SIDES = [View(Camera(0.4, azimuth, 10)) for azimuth in (0, 40, 180, -40, 200, 160)]
 
 
-@pytest.mark.parametrize("views", [pytest.param(BOTH_SIDES, id="few"), pytest.param(grid(None, 10), id="paper's grid")])
+@pytest.mark.parametrize("views", [BOTH_SIDES, grid(azimuths=None, elevations=10)], ids=["few", "paper's grid"])
 def test_a_target_that_shows_both_sides_of_a_sheet_is_understood(views: Sequence[View]) -> None:
     texture = np.random.default_rng(0).integers(40, 216, (96, 96, 3), dtype=np.uint8)
     truth = SamplingModel(cull=False)
@@ -218,7 +206,7 @@ def test_trial_views_look_from_all_sides_of_a_grid(mug: Object3D, azimuths: int 
         trial.extend(views)
         return np.zeros((len(views), *SIZE, 3), np.uint8)
 
-    views = grid(azimuths, elevations)
+    views = grid(azimuths=azimuths, elevations=elevations)
     calibrate(mug, views, ask(mug, views), ask, wanted="diffuse", generator=np.random.default_rng(0))
     cameras = [view.camera for view in trial[len(views) :]]
     assert len(cameras) == TRIAL_VIEWS
@@ -358,17 +346,12 @@ GRID = SamplingModel(samples="grid", kernel=("gaussian", 4.0), filtered="linear"
 def test_what_path_tracers_and_films_do_is_recovered(
     mug: Object3D, target: KnownTarget, members: dict[str, object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    measured: list[ToneMap] = []
-
-    def tone_map(ask: Render, size: tuple[int, int]) -> ToneMap:
-        measured.append(measure_tone_map(ask, size))
-        return measured[-1]
-
-    monkeypatch.setattr("trompe_server.surrogate.calibration.measure_tone_map", tone_map)
+    measured = Mock(side_effect=measure_tone_map)
+    monkeypatch.setattr("trompe_server.surrogate.calibration.measure_tone_map", measured)
     asked = Asked(target)
     calibration = found(mug, asked, "auto")
     assert calibration.model == "calibrated"
-    assert len(measured) <= 1
+    assert measured.call_count <= 1
     assert calibration.renders == asked.images - len(VIEWS)
     assert {name: getattr(calibration.sampling, name) for name in members} == members
     assert (calibration.tone is not None) == (calibration.sampling.encoding == "measured")

@@ -65,17 +65,13 @@ def canvas_and_change(surrogate: Surrogate, obj: Object3D, share: float) -> tupl
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 1.0])
-def test_views_read_of_a_canvas_what_they_read_of_the_whole_textures(
-    obj: Object3D, surrogate: Surrogate, share: float
-) -> None:
+def test_views_read_of_a_canvas_what_they_read_of_textures(obj: Object3D, surrogate: Surrogate, share: float) -> None:
     canvas, values, changed = canvas_and_change(surrogate, obj, share)
     torch.testing.assert_close(canvas.read(values), surrogate.texels(changed), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("share", [0.02, 1.0])
-def test_the_gradient_of_a_canvas_is_that_of_the_whole_textures(
-    obj: Object3D, surrogate: Surrogate, share: float
-) -> None:
+def test_the_gradient_of_a_canvas_is_that_of_whole_textures(obj: Object3D, surrogate: Surrogate, share: float) -> None:
     canvas, values, changed = canvas_and_change(surrogate, obj, share)
     leaves = {name: texture.requires_grad_() for name, texture in changed.items()}
     whole, some = surrogate.texels(leaves), canvas.read(values.requires_grad_())
@@ -95,9 +91,7 @@ def test_a_canvas_holds_the_texels_that_move_and_splits_into_what_it_joins(obj: 
     assert torch.equal(canvas.join(canvas.split(numbers)), numbers)
 
 
-def test_the_same_canvas_is_not_made_twice_and_another_is_made_for_other_texels(
-    obj: Object3D, surrogate: Surrogate
-) -> None:
+def test_a_canvas_is_not_made_twice_and_another_is_made_for_other_texels(obj: Object3D, surrogate: Surrogate) -> None:
     textures, masks = textures_of(obj), some_texels(obj, 0.1)
     first = surrogate.canvas(textures, masks)
     assert surrogate.canvas(textures, {name: mask.clone() for name, mask in masks.items()}) is first
@@ -116,9 +110,7 @@ def test_views_read_of_stored_levels_what_they_read_of_the_textures(
     torch.testing.assert_close(painted.texels(again), again.values(textures_of(obj)), atol=1e-6, rtol=0)
 
 
-def test_stored_levels_of_other_hypotheses_are_dropped_beyond_their_bytes(
-    obj: Object3D, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stored_levels_beyond_their_bytes_are_dropped(obj: Object3D, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surrogate_module, "KEPT_LEVELS", 0)
     painted = Painted(obj, torch.device("cpu"))
     for sampling in (*MODELS.values(), MODELS["encoded"]):
@@ -158,9 +150,7 @@ def test_means_and_rooms_are_those_of_the_texels_of_each_block(count: int, seed:
 
 @given(COUNTS, SEEDS, st.floats(0.004, 1))
 @settings(max_examples=60)
-def test_a_common_change_has_the_mean_that_was_asked_for_and_stays_within_the_bound(
-    count: int, seed: int, bound: float
-) -> None:
+def test_a_common_change_has_the_mean_asked_for_and_stays_within_the_bound(count: int, seed: int, bound: float) -> None:
     texture = textured(seed)
     down, up = rooms(texture / 255, torch.full((16 >> count, 24 >> count, 1), bound), count)
     share = torch.rand(down.shape, generator=torch.Generator().manual_seed(seed))

@@ -22,9 +22,7 @@ from trompe_shared.geometry import Camera, Light, View
 from trompe_shared.object3d import Object3D
 
 SIZE = (64, 64)
-VIEWS = [
-    View(Camera(0.16 + 0.004 * k, 60.0 * k, 10.0 * k - 25), Light(20.0 * k, 50), (40 * k, 0, 255)) for k in range(6)
-]
+VIEWS = [View(Camera(0.16 + 0.004 * k, 60 * k, 10 * k - 25), Light(20 * k, 50), (40 * k, 0, 255)) for k in range(6)]
 MODELS = [
     pytest.param(SamplingModel(), id="encoded"),
     pytest.param(SamplingModel(filtered="linear", lod="area", shade_at="centroid", bias=0.3), id="linear"),

@@ -87,12 +87,8 @@ def test_the_gradient_is_that_of_finite_differences(
     for seed in range(3):
         generator = torch.Generator().manual_seed(seed)
         ways = {n: torch.randn(t.shape, generator=generator).clamp(-2, 2) * (t - t**2) * 4 for n, t in textures.items()}
-        values = [
-            (images_of(surrogate, {n: textures[n] + s * step * way for n, way in ways.items()}) * weights)
-            .double()
-            .sum()
-            for s in (1, -1)
-        ]
+        moved = [{n: textures[n] + s * step * way for n, way in ways.items()} for s in (1, -1)]
+        values = [(images_of(surrogate, each) * weights).double().sum() for each in moved]
         slope = float(values[0] - values[1]) / (2 * step)
         told = float(sum((gradients[n].double() * way).sum() for n, way in ways.items()))
         assert told == pytest.approx(slope, rel=tolerance, abs=tolerance * 5)
@@ -146,9 +142,6 @@ def test_the_surrogate_predicts_what_the_real_target_shows(mug: Object3D, target
     assert np.polyfit(told, true, 1)[0] == pytest.approx(1, abs=0.25)
 
 
-ASSETS = Path(os.environ.get("TROMPE_ASSETS", "none")) / "objects"
-
-
 def waves(obj: Object3D, generator: np.random.Generator) -> dict[str, NDArray[np.int64]]:
     """A wave of a few periods over each texture, of its own direction and phase in each channel, +-12 of 255."""
 
@@ -176,11 +169,10 @@ def test_the_gradient_is_that_of_finite_differences_of_the_target(name: str, tar
 
     Pixels that are nearly black or white are left out: they can change one way only.
     """
-    obj, facts = load_object(ASSETS / name), json.loads((ASSETS / "objects.json").read_text())[name]
-    low, high = facts["elevation_range"]
-    views = [
-        View(Camera(facts["distance"], 90 * k, low + (high - low) * k / 3), background=(0, 0, 0)) for k in range(4)
-    ]
+    objects = Path(os.environ["TROMPE_ASSETS"]) / "objects"
+    obj, facts = load_object(objects / name), json.loads((objects / "objects.json").read_text())[name]
+    distance, (low, high) = facts["distance"], facts["elevation_range"]
+    views = [View(Camera(distance, 90 * k, low + (high - low) * k / 3), background=(0, 0, 0)) for k in range(4)]
     surrogate, clean = measured(obj, target, CURVE_GREYS, views)
     random, before = np.random.default_rng(0), torch.from_numpy(clean).permute(0, 3, 1, 2) / 255
     coarse = torch.from_numpy(random.normal(size=(len(views), 3, 6, 6))).float()
@@ -231,9 +223,8 @@ def test_the_order_of_the_views_changes_neither_images_nor_gradient(mug: Object3
     weights = torch.randn(len(MANY), 3, *SIZE, generator=torch.Generator().manual_seed(0))
     masks = weights[:, 0] > 0
     one, other = (surrogate_of(mug, views, size=SIZE) for views in (MANY, [MANY[k] for k in order]))
-    torch.testing.assert_close(
-        images_of(one, textures_of(mug))[order], images_of(other, textures_of(mug)), atol=1e-6, rtol=0
-    )
+    shown, moved = (images_of(each, textures_of(mug)) for each in (one, other))
+    torch.testing.assert_close(shown[order], moved, atol=1e-6, rtol=0)
     first, second = gradient_of(one, mug, weights, masks), gradient_of(other, mug, weights[order], masks[order])
     for name, gradient in first.items():
         assert gradient.abs().max() > 0
@@ -267,9 +258,7 @@ def test_the_unpainted_object_is_predicted_as_the_target_shows_it(mug: Object3D,
     assert surrogate.model == ("calibrated" if len(greys) == 2 else "curve")
 
 
-def test_a_prediction_that_is_rounded_to_what_the_target_shows_is_believed_as_it_is(
-    mug: Object3D, curved: Surrogate
-) -> None:
+def test_a_prediction_that_rounds_to_what_the_target_shows_is_kept_as_it_is(mug: Object3D, curved: Surrogate) -> None:
     shown = curved.geometry.batches[0].of(curved.base) / 255
     colours, _ = curved.colours(curved.texels(textures_of(mug)), 0)
     assert curved.missed is not None
@@ -287,9 +276,7 @@ def test_the_diffuse_surrogate_shows_each_views_own_background(mug: Object3D) ->
 
 
 def test_images_are_colours(mug: Object3D, curved: Surrogate) -> None:
-    wild = {
-        name: torch.rand(t.shape, generator=torch.Generator().manual_seed(0)) for name, t in textures_of(mug).items()
-    }
+    wild = {n: torch.rand(t.shape, generator=torch.Generator().manual_seed(0)) for n, t in textures_of(mug).items()}
     for surrogate in (curved, surrogate_of(mug, VIEWS, size=SIZE)):
         images = images_of(surrogate, wild)
         assert images.min() >= 0

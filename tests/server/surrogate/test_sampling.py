@@ -82,7 +82,6 @@ def averaged(level: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.fl
 
 
 def every_texel(layout: module.MipLayout) -> list[Tensor]:
-    """All texels of each level."""
     return [torch.arange(height * width) for sizes in layout.sizes for height, width in sizes]
 
 
@@ -108,9 +107,7 @@ def test_the_pyramid_is_the_texture_averaged_again_and_again(height: int, width:
 
 @given(SIDES, SIDES, st.sampled_from([10, 100, 10_000]), st.floats(0, 1))
 @settings(max_examples=60)
-def test_texels_of_the_pyramid_pass_their_gradient_back_to_all_they_are_averages_of(
-    height: int, width: int, band: int, share: float
-) -> None:
+def test_the_pyramid_passes_gradients_to_all_that_it_averages(height: int, width: int, band: int, share: float) -> None:
     layout, random = mip_layout([(height, width), (3, 2)]), torch.Generator().manual_seed(height)
     levels = [level[torch.randperm(len(level), generator=random)] for level in every_texel(layout)]
     reads = [level[: round(share * len(level))] for level in levels]
@@ -130,10 +127,8 @@ def test_texels_of_the_pyramid_pass_their_gradient_back_to_all_they_are_averages
 def test_levels_rounded_to_8_bits_are_rounded_after_columns_and_again_after_rows() -> None:
     texture = torch.tensor([[0, 1], [0, 0]])[..., None].expand(2, 2, 3) / 255
     layout = mip_layout([(2, 2)])
-    exact, rounded = (
-        read_texels([texture], mip_chains(layout, every_texel(layout)), rounded=choice)[-1, 0]
-        for choice in (False, True)
-    )
+    chains = mip_chains(layout, every_texel(layout))
+    exact, rounded = (read_texels([texture], chains, rounded=choice)[-1, 0] for choice in (False, True))
     assert float(exact) * 255 == pytest.approx(0.25)
     assert float(rounded) * 255 == pytest.approx(1.0)
 
@@ -151,9 +146,7 @@ def test_levels_are_halved_and_rounded_down_to_one_texel(size: tuple[int, int], 
 
 
 @pytest.mark.parametrize("model", MODELS, ids=repr)
-def test_weights_sum_to_one_over_distinct_texels_and_the_way_back_is_their_transpose(
-    mug: Object3D, model: SamplingModel
-) -> None:
+def test_weights_sum_to_one_over_distinct_texels_and_go_back_transposed(mug: Object3D, model: SamplingModel) -> None:
     geometry, _ = reading(mug, model)
     (batch,) = geometry.batches
     count, gather, random = sum(len(reads) for reads in geometry.reads), batch.gather, torch.Generator().manual_seed(0)
@@ -231,9 +224,8 @@ def test_where_alpha_is_below_one_half_what_lies_behind_is_read(model: SamplingM
     obj, views = with_alpha(object_of(front, back), "m0.png", opacity), [View(Camera(0.5, 0, 0))]
     geometry, _ = reading(obj, model, views)
     values = read_values(obj, model, views)[0][:, 0]
-    left, right = (
-        read_values(object_of(quad(np.full((2, 2, 3), k, np.uint8))), model, views)[0][0, 0] for k in (150, 50)
-    )
+    plain = [object_of(quad(np.full((2, 2, 3), k, np.uint8))) for k in (150, 50)]
+    left, right = (read_values(each, model, views)[0][0, 0] for each in plain)
     column = geometry.batches[0].pixel % SIZE[1]
     assert torch.allclose(values[column < 30], left, atol=1e-3)
     assert torch.allclose(values[column > 34], right, atol=1e-3)
@@ -244,9 +236,8 @@ def test_a_sheet_that_is_all_cut_out_leaves_every_number_as_if_it_were_not_there
     with_it, alone = with_alpha(object_of(back, sheet), "m1.png", np.zeros((8, 8), np.uint8)), object_of(back)
     first, second = (reading(obj)[0].batches[0] for obj in (with_it, alone))
     assert torch.equal(first.pixel, second.pixel)
-    assert all(
-        torch.equal(a, b) for a, b in zip(vars(first.gather).values(), vars(second.gather).values(), strict=True)
-    )
+    one, other = vars(first.gather), vars(second.gather)
+    assert all(torch.equal(one[name], other[name]) for name in one)
 
 
 def test_alpha_is_read_at_the_level_that_the_pixel_reads() -> None:
@@ -305,9 +296,7 @@ def test_an_ellipse_is_a_gaussian_over_the_texels_of_the_footprint_and_one_aroun
 
 @pytest.mark.parametrize("shift", [(1.0, 0.0), (0.0, -1.0), (-1.0, 1.0)])
 @pytest.mark.parametrize("samples", ["msaa4", "msaa4-mirrored", "centre"])
-def test_a_shift_by_a_whole_pixel_moves_the_picture_by_one(
-    samples: Any, shift: tuple[float, float], mug: Object3D
-) -> None:
+def test_a_shift_by_a_pixel_moves_the_picture_by_one(samples: Any, shift: tuple[float, float], mug: Object3D) -> None:
     pictures = []
     for model in (SamplingModel(samples=samples), SamplingModel(samples=samples, shift=shift)):
         geometry, surrogate = reading(mug, model)

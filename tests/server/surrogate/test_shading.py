@@ -168,9 +168,7 @@ def test_monotone_probes_give_monotone_colours_between_the_first_and_the_last(va
 @pytest.mark.parametrize("greys", [(0, 128), GREYS], ids=repr)
 @pytest.mark.parametrize("encoding", ["srgb", "power"])
 @pytest.mark.parametrize("grey", [12, 50, 90, 160, 230])
-def test_slopes_of_a_curve_are_those_of_finite_differences(
-    grey: int, encoding: Encoding, greys: tuple[int, ...]
-) -> None:
+def test_slopes_of_a_curve_are_its_finite_differences(grey: int, encoding: Encoding, greys: tuple[int, ...]) -> None:
     probes = 20 + random_probes(len(greys)) * (0.4 if len(greys) == 2 else 0.9)
     shading, step = curve(greys, probes, coverage=0.9, background=0.02, encoding=encoding), 2e-3
     value = values_of(grey)
@@ -243,12 +241,7 @@ def test_the_slopes_of_the_colour_model_are_those_of_finite_differences(tone: To
         assert ((seen - slopes[..., channel]).abs().amax(1) > 0.01).double().mean() < 0.03
 
 
-KERNELS: tuple[tuple[KernelName, float], ...] = (
-    ("box", 1.0),
-    ("tent", 2.0),
-    ("gaussian", 4.0),
-    ("blackman-harris", 3.0),
-)
+KERNELS: list[tuple[KernelName, float]] = [("box", 1.0), ("tent", 2.0), ("gaussian", 4.0), ("blackman-harris", 3.0)]
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
