@@ -146,7 +146,7 @@ def test_the_whole_of_a_budget_can_be_saved(epsilon: float) -> None:
 
 
 NAN = float("nan")
-IMPOSSIBLE = {
+IMPOSSIBLE: dict[str, list[Any]] = {
     "0 < alpha <= epsilon <= 1": [(0.1, 0.0), (0.1, -0.1), (0.1, 0.2), (0.0, 0.0), (1.5, 0.1), (NAN, 0.1)],
     "epsilon must be at least 1/255, .*; got 0.0001: use 0.004 or more": [(0.0001, 0.0001)],
     "epsilon must be at least 1/255, .*; got 0.0039: use 0.004 or more": [(0.0039, 0.0039)],
@@ -155,7 +155,7 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize(("values", "words"), [(each, words) for words, some in IMPOSSIBLE.items() for each in some])
-def test_an_impossible_budget_is_refused(values: tuple[float, ...], words: str) -> None:
+def test_an_impossible_budget_is_refused(values: Any, words: str) -> None:
     with pytest.raises(SpecError, match=words):
         Budget(*values)
 

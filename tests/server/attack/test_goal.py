@@ -18,13 +18,13 @@ CLASSES = 5
 LOGITS = st.lists(st.lists(st.floats(-50, 50, width=32), min_size=5, max_size=5), min_size=1, max_size=6)
 LOSSES = ("margin", "cross_entropy")
 KINDS: dict[str, dict[str, Any]] = {
-    "untargeted": {},
-    "targeted": {"target": 3},
-    "top-3": {"top_k": 3},
+    "untargeted": {"label": 0},
+    "targeted": {"label": 0, "target": 3},
+    "top-3": {"label": 0, "top_k": 3},
     "several classes": {"label": (0, 2)},
     "several classes, top-3": {"label": (0, 2), "top_k": 3},
 }
-GOALS = {f"{loss}, {kind}": Goal(**{"label": 0, "loss": loss} | KINDS[kind]) for loss in LOSSES for kind in KINDS}
+GOALS = {f"{loss}, {kind}": Goal(**KINDS[kind] | {"loss": loss}) for loss in LOSSES for kind in KINDS}
 every_goal = pytest.mark.parametrize("goal", GOALS.values(), ids=GOALS)
 SETS = st.permutations(range(5)).flatmap(lambda order: st.integers(1, 4).map(lambda n: tuple(order[:n])))
 """Some of the five classes, but not all."""

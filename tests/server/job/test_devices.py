@@ -65,12 +65,10 @@ def test_a_job_on_another_device_is_the_same_job(kind: str, tmp_path: Path, monk
     expected = done(kind, tmp_path / "cpu", monkeypatch, device="cpu")
     found = done(kind, tmp_path / "other", monkeypatch, device=pretend_device(monkeypatch))
     files, others = found.lasting(), expected.lasting()
-    (text, numbers), (other_text, other_numbers) = (
-        words_and_numbers(each.pop("result.json")) for each in (files, others)
-    )
+    (text, numbers), (same, close) = (words_and_numbers(each.pop("result.json")) for each in (files, others))
     assert files == others
-    assert text == other_text
-    assert numbers == pytest.approx(other_numbers, rel=1e-5)  # a batch that was filled up differs in the last bits
+    assert text == same
+    assert numbers == pytest.approx(close, rel=1e-5)  # a batch that was filled up differs in the last bits
 
 
 def words_and_numbers(data: bytes) -> tuple[list[str], list[float]]:

@@ -16,9 +16,7 @@ from trompe_shared.api import JobSpec
 from trompe_shared.object3d import load_object
 
 
-def test_an_attack_repaints_glass_leaves_its_transparency_and_says_that_little_is_seen(
-    library: Library, target: SailenvTarget
-) -> None:
+def test_glass_is_painted_but_stays_clear_and_is_said_to_show_little(library: Library, target: SailenvTarget) -> None:
     upload = lantern(opacity=0.2)
     stored = library.add_object(io.BytesIO(upload), "lantern.glb")
     spec = JobSpec.of(stored.id, label="chair", distance=0.8, steps=6, epsilon=0.1, pool=8, held_out=4)

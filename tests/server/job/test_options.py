@@ -12,7 +12,6 @@ from tests.job_runs import CHAIR, MemoryArtifacts, run_job, spec_of
 from trompe_server.classifiers import load_classifier
 from trompe_server.image_pipelines import SUITE
 from trompe_server.library import Library
-from trompe_server.storage.arrays import unpack_arrays
 from trompe_shared.api import JobSpec, Result
 from trompe_shared.object3d import encode_png
 from trompe_shared.shipped import shipped_objects
@@ -53,9 +52,7 @@ def test_every_second_held_out_image_is_also_judged_through_each_pipeline_of_the
     assert [each.pipeline for each in run.result.image_pipelines] == list(SUITE)
     for judged in run.result.image_pipelines:
         for name, share in (("before", judged.held_out.a_before), ("after", judged.held_out.a_after)):
-            images = SUITE[judged.pipeline].shown(
-                unpack_arrays(run.artifacts.files[f"views_{name}.npz"])["held_out"][::2]
-            )
+            images = SUITE[judged.pipeline].shown(run.artifacts.arrays(f"views_{name}")["held_out"][::2])
             assert share == np.mean(classifier.predict(images).argmax(1) == run.result.label)
     assert run_job(spec_of(steps=1, held_out=0), library).result.image_pipelines == []
 
@@ -96,9 +93,7 @@ def test_each_of_several_labels_counts_as_the_object(library: Library, options: 
     ],
     ids=str,
 )
-def test_every_kind_of_attack_stays_in_its_budget_and_says_what_it_was(
-    library: Library, options: dict[str, Any]
-) -> None:
+def test_every_attack_stays_in_its_budget_and_says_what_it_was(library: Library, options: dict[str, Any]) -> None:
     run = run_job(spec_of(steps=4, **options), library)
     for name, image in run.artifacts.painted().textures.items():
         assert np.abs(image.astype(int) - CHAIR.textures[name]).max() <= int(0.1 * 255)
@@ -116,9 +111,7 @@ def test_the_view_constraint_holds_in_the_surrogate_and_is_measured_in_the_targe
 
 
 @pytest.mark.usefixtures("pictures")
-def test_scores_of_a_classifier_without_gradients_are_counted(
-    library: Library, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scores_of_a_classifier_without_gradient_are_counted(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trompe_server.job.setup._stored_classifier", lambda *_, **__: Scores(load_classifier("tiny")))
     run = run_job(spec_of(queries=6, steps=4), library)
     evaluations = run.result.evaluations or 0
@@ -146,9 +139,7 @@ def test_scores_of_a_classifier_without_gradients_are_counted(
     ],
     ids=str,
 )
-def test_paint_is_made_for_changed_images_except_on_the_papers_grid_or_by_scores(
-    options: dict[str, Any], pipeline: str
-) -> None:
+def test_paint_is_made_for_changed_images_but_on_the_grid_or_by_scores(options: dict[str, Any], pipeline: str) -> None:
     assert JobSpec.of("mug", label="mug", **options).image_pipeline == pipeline
 
 

@@ -17,6 +17,10 @@ pytestmark = pytest.mark.usefixtures("few_first_views")
 HARD: dict[str, Any] = {"pool": 16, "steps": 15, "epsilon": 0.1, "alpha": 0.02, "surrogate": "calibrated"}
 
 
+Watched = tuple[Run, dict[str, list[Asked]]]
+"""A finished job that adds views, and what each of its phases asked of the renderer."""
+
+
 @pytest.fixture(scope="module")
 def few_first_views() -> Iterator[None]:
     """Four first views, and four at each look, which is after every chunk of steps. Reports without pictures."""
@@ -28,8 +32,7 @@ def few_first_views() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def hard(library: Library, few_first_views: None) -> tuple[Run, dict[str, list[Asked]]]:
-    """A finished job that adds views, and what each of its phases asked of the renderer."""
+def hard(library: Library, few_first_views: None) -> Watched:
     library.calibrations.delete_all()
     target, run, asked = Recorder(), Run(), dict[str, list[Asked]]()
     job = opened(spec_of(**HARD), library, run.artifacts, target=target)
@@ -40,14 +43,11 @@ def hard(library: Library, few_first_views: None) -> tuple[Run, dict[str, list[A
     return run, asked
 
 
-def test_an_attack_that_loses_views_adds_those_it_has_not_safely_won(
-    library: Library, hard: tuple[Run, dict[str, list[Asked]]]
-) -> None:
+def test_an_attack_that_loses_views_adds_those_it_has_not_safely_won(library: Library, hard: Watched) -> None:
     artifacts, setup = hard[0].artifacts, setup_of(library, **HARD)
     assert (len(setup.views), len(setup.further)) == (4, 12)
-    known = recognised(
-        setup.classifier.predict(FakeTarget().render(setup.obj, setup.views, size=setup.size)), setup.labels
-    )
+    clean = FakeTarget().render(setup.obj, setup.views, size=setup.size)
+    known = recognised(setup.classifier.predict(clean), setup.labels)
     count = round(4 / max(float(known.mean()), 0.25))
     seen = 0
     for phase, asked in hard[1].items():
@@ -93,9 +93,7 @@ def test_an_attack_that_loses_few_of_the_further_views_adds_none(
     ],
     ids=str,
 )
-def test_a_pool_grows_to_the_same_bytes_after_interruption(
-    library: Library, hard: tuple[Run, dict[str, list[Asked]]], options: dict[str, Any]
-) -> None:
+def test_a_pool_grows_alike_after_interruption(library: Library, hard: Watched, options: dict[str, Any]) -> None:
     spec = spec_of(**HARD | options)
     once = run_job(spec, library) if options else hard[0]
     anew = run_job(spec, library, new=True, times=2)
@@ -114,13 +112,13 @@ def test_held_out_views_cannot_influence_the_texture(library: Library) -> None:
     assert judged == [setup.held_out] * 2
 
 
-def test_images_of_looks_are_counted(hard: tuple[Run, dict[str, list[Asked]]]) -> None:
+def test_images_of_looks_are_counted(hard: Watched) -> None:
     run, asked = hard
     assert run.counts()["target_renders"] == sum(len(views) for phase in asked.values() for _, views in phase)
     assert run.result.evaluations == run.counts("attack")["classifier_images"]
 
 
-def test_a_damaged_look_is_taken_anew(library: Library, hard: tuple[Run, dict[str, list[Asked]]]) -> None:
+def test_a_damaged_look_is_taken_anew(library: Library, hard: Watched) -> None:
     spec, artifacts = spec_of(**HARD), MemoryArtifacts()
     whole = hard[0].artifacts.files["look-001.npz"]
     artifacts.files = hard[0].artifacts.files | {"look-001.npz": whole[:-40]}
@@ -130,9 +128,7 @@ def test_a_damaged_look_is_taken_anew(library: Library, hard: tuple[Run, dict[st
     assert artifacts.files["look-001.npz"] == whole
 
 
-@pytest.mark.parametrize(
-    "options", [{"tau": 0.05}, {"keep": 0.1}, {"pool": 4}], ids=["tau", "keep", "no more than the first"]
-)
+@pytest.mark.parametrize("options", [{"tau": 0.05}, {"keep": 0.1}, {"pool": 4}], ids=["tau", "keep", "few views"])
 def test_attacks_whose_choice_rests_on_all_views_start_with_all(library: Library, options: dict[str, Any]) -> None:
     setup = setup_of(library, **HARD | options)
     assert (len(setup.views), setup.further) == (options.get("pool", 16), ())

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,7 +26,6 @@ from trompe_server.job.report.models import model_files
 from trompe_server.job.report.pictures import short_names
 from trompe_server.job.report.warnings import _stronger, _wider
 from trompe_server.library import Library
-from trompe_server.pictures import Verdict
 from trompe_server.renderers import SailenvTarget
 from trompe_server.storage.folders import checked
 from trompe_shared.api import JobSpec
@@ -105,9 +105,7 @@ def test_each_attacked_view_has_the_fidelity_of_its_prediction(library: Library,
     assert not [found for found in result.warnings if "on views" in found]
 
 
-@pytest.mark.parametrize(
-    ("name", "near"), [pytest.param("{} lamp", True, id="all lamps"), pytest.param("{}", False, id="as they are")]
-)
+@pytest.mark.parametrize(("name", "near"), [("{} lamp", True), ("{}", False)], ids=["all lamps", "as they are"])
 def test_the_report_lists_what_the_object_became_and_both_drops(
     library: Library, monkeypatch: pytest.MonkeyPatch, name: str, near: bool
 ) -> None:
@@ -144,15 +142,12 @@ def test_the_report_lists_what_the_object_became_and_both_drops(
         assert not warnings
 
 
-def test_a_judge_classifies_the_same_images_and_knows_the_label_by_its_name(
-    library: Library, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_judge_sees_the_images_and_knows_the_label_by_name(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = load_classifier("tiny")
     assert isinstance(tiny, NetworkClassifier)
     turned = replace(tiny, name="turned", classes=(tiny.classes or ())[::-1], network=Turned(tiny.network))
-    monkeypatch.setattr(
-        "trompe_server.job.setup._stored_classifier", lambda name, **_: turned if name == "turned" else tiny
-    )
+    stored = {"turned": turned, "tiny": tiny}
+    monkeypatch.setattr("trompe_server.job.setup._stored_classifier", lambda name, **_: stored[name])
     result = run_job(spec_of(judges=["turned"]), library).result
     (judge,) = result.judges
     assert (judge.classifier, judge.target, judge.held_out) == ("turned", result.target, result.held_out)
@@ -262,25 +257,19 @@ def test_pictures_tell_classes_apart() -> None:
 
 
 @pytest.mark.usefixtures("pictures")
-def test_the_contact_sheet_shows_recognised_views_alone_and_tells_their_number(
-    library: Library, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sheets: list[tuple[list[tuple[Image8, Image8, Verdict, Verdict]], str]] = []
-
-    def drawn(views: list[tuple[Image8, Image8, Verdict, Verdict]], *, facts: str, **_: Any) -> Any:
-        sheets.append((views, facts))
-        return Image.new("RGB", (8, 8))
-
+def test_a_contact_sheet_shows_and_counts_recognised_views(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = Mock(return_value=Image.new("RGB", (8, 8)))
     monkeypatch.setattr("trompe_server.pictures.contact_sheet.contact_sheet", drawn)
     result = run_job(spec_of(pool=40, elevation=(-89, 89), held_out=0), library).result
-    ((views, facts),) = sheets
+    drawn.assert_called_once()
+    (views,), words = drawn.call_args
     _, _, before, after = zip(*views, strict=True)
     recognised = [view for view in result.views if view.before == result.label]
     assert 0 < len(recognised) < 40
     assert len(before) == min(12, len(recognised))
     assert all(verdict.correct for verdict in before)
     fooled = sum(view.after != result.label for view in recognised)
-    assert f"in {len(recognised)} of 40 views; {fooled} of these are fooled." in facts
+    assert f"in {len(recognised)} of 40 views; {fooled} of these are fooled." in words["facts"]
     order = [verdict.confidence * (1 if verdict.correct else -1) for verdict in after]
     assert order == sorted(order, reverse=True)
 
@@ -311,7 +300,5 @@ def test_the_repainted_object_has_one_name_in_all_its_formats(original: str | No
 )
 def test_the_name_of_a_file_is_safe(name: str, plain: str) -> None:
     chair = load_object(shipped_objects()["chair"].read())
-    assert {checked(file) for file in model_files(chair, name, None)[0]} == {
-        f"{plain}-adversarial.zip",
-        f"{plain}-adversarial.glb",
-    }
+    names = {checked(file) for file in model_files(chair, name, None)[0]}
+    assert names == {f"{plain}-adversarial.zip", f"{plain}-adversarial.glb"}

@@ -33,11 +33,8 @@ def run(library: Library) -> Run:
 
 def test_each_renderer_has_its_figures_and_images(run: Run) -> None:
     result = run.result
-    assert [(each.renderer, each.attacked) for each in result.renderers] == [
-        (SHARP, True),
-        (DARK, True),
-        (COARSE, False),
-    ]
+    told = [(each.renderer, each.attacked) for each in result.renderers]
+    assert told == [(SHARP, True), (DARK, True), (COARSE, False)]
     for number, each in enumerate(result.renderers):
         images = [run.artifacts.arrays(f"views_{when}-{number}".removesuffix("-0")) for when in ("before", "after")]
         assert [arrays["own"].shape[0] for arrays in images] == [4, 4] == [len(each.views), each.target.views]
@@ -63,10 +60,8 @@ def test_the_headline_is_of_the_attacked_renderer_with_the_smallest_drop(run: Ru
 def test_one_paint_works_in_both_where_a_paint_for_one_fails_in_the_other(run: Run, library: Library) -> None:
     """The paint for both has a larger loss in the worse renderer than the paint for the first alone."""
     alone = run_job(spec_of(**SPEC), library, target=TARGETS["target"], judge_targets=TARGETS["more_targets"])
-    kept = [
-        np.mean([view.after_true_confidence for view in each.views])
-        for each in (run.result.renderers[1], alone.result.renderers[1])
-    ]
+    worse = (run.result.renderers[1], alone.result.renderers[1])
+    kept = [np.mean([view.after_true_confidence for view in each.views]) for each in worse]
     assert kept[0] < kept[1]
 
 

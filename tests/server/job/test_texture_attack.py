@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Sequence
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -30,14 +31,8 @@ WHOLE: dict[str, Any] = {"surrogate": "calibrated", "steps": 6}
 """A job that calibrates, and attacks in two phases."""
 
 PICTURES = {
-    "predictions.png",
-    "saliency_object.png",
-    "saliency_textures.png",
-    "contact_sheet.png",
-    "difference.png",
-    "saliency.png",
-    "textures.png",
-    "thumbnail.png",
+    *("contact_sheet.png", "difference.png", "predictions.png", "textures.png", "thumbnail.png"),
+    *("saliency.png", "saliency_object.png", "saliency_textures.png"),
 }
 MODELS = {"chair-adversarial.zip", "chair-adversarial.glb"}
 IMAGES = {"views_before.npz", "views_after.npz"}
@@ -87,9 +82,7 @@ def test_the_time_left_is_told_from_the_second_step_on_as_a_range_that_falls(fin
 
 
 @pytest.mark.parametrize("new", [False, True], ids=["one process", "a process for each phase"])
-def test_the_seconds_of_a_result_sum_to_the_time_that_the_job_took(
-    library: Library, timed: tuple[Run, float], new: bool
-) -> None:
+def test_the_seconds_of_a_result_sum_to_those_of_the_job(library: Library, timed: tuple[Run, float], new: bool) -> None:
     run, took = timed
     if new:
         began = time.perf_counter()
@@ -119,10 +112,8 @@ def test_the_result_holds_options_and_figures(finished: Run) -> None:
 
 
 def test_the_figures_of_the_change_are_those_of_the_files(finished: Run) -> None:
-    result, after = finished.result, finished.artifacts.painted()
-    change = np.concatenate(
-        [np.abs(after.textures[n].astype(int) - t).reshape(-1, 3) for n, t in CHAIR.textures.items()]
-    )
+    result, new = finished.result, finished.artifacts.painted()
+    change = np.concatenate([np.abs(new.textures[n].astype(int) - t).reshape(-1, 3) for n, t in CHAIR.textures.items()])
     altered = change.any(axis=1)
     assert change.max() == 25  # floor(0.1 * 255)
     assert result.texels_altered == pytest.approx(altered.mean())
@@ -230,9 +221,7 @@ def test_few_texels_are_chosen_once_and_again_if_their_file_is_damaged(library: 
     ],
     ids=str,
 )
-def test_all_images_shown_by_the_search_are_counted(
-    library: Library, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shown_images_are_counted(library: Library, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     shown, during = {"attack": 0}, [""]
     logits = NetworkClassifier.logits
 
@@ -266,9 +255,7 @@ def test_a_second_job_on_the_same_object_and_views_renders_no_probe(library: Lib
     assert second.result.fidelity == first.result.fidelity
 
 
-def test_the_views_are_rasterised_while_the_renderer_is_busy_with_probes(
-    library: Library, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_views_are_rasterised_while_a_renderer_draws_probes(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
     """The renderer waits for the rasterisation of all views after the trial views."""
     done, prepared = threading.Event(), list[tuple[View, ...]]()
 
@@ -297,9 +284,7 @@ def test_the_views_are_rasterised_while_the_renderer_is_busy_with_probes(
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("measured_tone")
-def test_a_calibration_serves_only_its_renderer_and_is_made_anew_if_damaged(
-    library: Library, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_calibrations_serve_their_renderer_until_damaged(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = spec_of(surrogate="calibrated")
     whole = run_job(spec, library, until="calibrate")
     count = len(library.calibrations.names())
@@ -355,40 +340,25 @@ def test_saliency_is_that_of_the_targets_images(library: Library) -> None:
     assert (bright != dark).mean() > 0.1
 
 
-class Previewed(MemoryArtifacts):
-    """Counts the previews."""
-
-    previews = 0
-
-    def write(self, name: str, data: bytes) -> None:
-        self.previews += name == "preview.png"
-        super().write(name, data)
-
-
 @pytest.mark.parametrize(("share", "expected"), [(1e-9, 1), (1e9, 3)])
-def test_previews_take_a_limited_share_of_the_time(
-    share: float, expected: int, library: Library, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_previews_are_limited(share: float, expected: int, library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(texture_attack, "PREVIEWING", share)
-    artifacts = Previewed()
+    artifacts = MemoryArtifacts()
+    write = Mock(side_effect=artifacts.write)
+    monkeypatch.setattr(artifacts, "write", write)
     job = opened(spec_of(steps=2 * CHUNK + 1, loss="cross_entropy"), library, artifacts)
     for phase in job.phases():
         job.run(phase, lambda _: None)
-    assert artifacts.previews == expected
+    assert sum(call.args[0] == "preview.png" for call in write.call_args_list) == expected
 
 
 def test_a_classifier_is_loaded_once_for_several_jobs(library: Library, monkeypatch: pytest.MonkeyPatch) -> None:
     setup._loaded.cache_clear()
-    loaded: list[str] = []
-
-    def load(path: str, **options: Any) -> Any:
-        loaded.append(path)
-        return load_classifier(path, **options)
-
+    load = Mock(side_effect=load_classifier)
     monkeypatch.setattr(setup, "load_classifier", load)
     for steps in (1, 2):
         run_job(spec_of(steps=steps, held_out=0), library)
-    assert loaded == ["tiny"]
+    assert [call.args for call in load.call_args_list] == [("tiny",)]
 
 
 @pytest.mark.usefixtures("pictures")
@@ -444,9 +414,7 @@ def test_the_threshold_stops_the_gradient_of_less_salient_pixels(library: Librar
     ],
     ids=str,
 )
-def test_the_images_of_the_judgement_cannot_influence_the_texture(
-    finished: Run, library: Library, options: dict[str, Any]
-) -> None:
+def test_judged_images_cannot_influence_the_texture(finished: Run, library: Library, options: dict[str, Any]) -> None:
     spec = spec_of(**options)
     honest = (finished if options == WHOLE else run_job(spec, library)).artifacts
     library.calibrations.delete_all()

@@ -20,8 +20,7 @@ from trompe_server.service import serve as serving
 from trompe_server.settings import Settings
 from trompe_server.storage.tokens import Right, Tokens, hash_secret
 from trompe_shared.api import Manifest
-from trompe_shared.object3d import load_object
-from trompe_shared.shipped import shipped_objects
+from trompe_shared.object3d import Object3D
 
 
 def run(command: click.Command, *arguments: str) -> tuple[int, str]:
@@ -160,9 +159,7 @@ def test_tokens_are_listed_with_what_became_of_them(tmp_path: Path) -> None:
         (["revoke", "eve"], 1, "no token 'eve'"),
     ],
 )
-def test_what_cannot_be_done_is_refused_with_a_reason(
-    tmp_path: Path, words: list[str], status: int, reason: str
-) -> None:
+def test_the_impossible_is_refused_with_a_reason(tmp_path: Path, words: list[str], status: int, reason: str) -> None:
     token(tmp_path, "create", "ann")
     found, said = token(tmp_path, *words)
     assert (found, reason in said) == (status, True), said
@@ -193,9 +190,8 @@ TROMPE = [sys.executable, "-m", "trompe_client.cli", "judge"]
 
 
 @pytest.fixture
-def painted(tmp_path: Path) -> Path:
+def painted(tmp_path: Path, mug: Object3D) -> Path:
     """The mug, a little darker, as a zip."""
-    mug = load_object(shipped_objects()["mug"].read())
     file = tmp_path / "painted.zip"
     file.write_bytes(mug.with_textures({name: image // 8 * 7 for name, image in mug.textures.items()}).to_zip())
     return file
