@@ -26,6 +26,7 @@ from playwright.sync_api import (
 
 from tests.served import Served
 from trompe_client import Client
+from trompe_shared.api import Result
 
 FLAGS = [
     "--no-sandbox",
@@ -80,6 +81,10 @@ class Service(Served):
             client.job(job).wait(timeout=480)
         return job
 
+    def result(self, job: str) -> Result:
+        with self.client() as client:
+            return client.job(job).result()
+
 
 def drop(page: Page, file: Path) -> None:
     """Drop a file on the form, as a hand does."""
@@ -121,7 +126,6 @@ def held_back(page: Page, address: str) -> list[Route]:
 
 
 def slowed(context: BrowserContext, page: Page, *, bytes_per_second: int) -> None:
-    """Give the page a slow network."""
     network = {"offline": False, "latency": 200, "downloadThroughput": bytes_per_second}
     session = context.new_cdp_session(page)
     session.send("Network.emulateNetworkConditions", network | {"uploadThroughput": bytes_per_second})

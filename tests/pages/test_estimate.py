@@ -15,18 +15,15 @@ START = datetime(2026, 1, 31, tzinfo=UTC)
 
 def job(seconds: float, **options: object) -> Job:
     spec = JobSpec.of("mug", label="mug", **(EFFORT | options))
-    finished = START + timedelta(seconds=seconds)
-    return Job(
-        id="1", state=JobState.succeeded, spec=spec, worker=None, created=START, started=START, finished=finished
-    )
+    end = START + timedelta(seconds=seconds)
+    return Job(id="1", state=JobState.succeeded, spec=spec, worker=None, created=START, started=START, finished=end)
 
 
 def test_it_tells_the_medians_of_jobs_that_are_alike() -> None:
     ended = [(job(20), Outcome(0.6, True)), (job(30), Outcome(0.9, True)), (job(70), Outcome(1.0, True))]
     other = [(job(900, steps=300), Outcome(0.1, True)), (job(900, epsilon=0.1), Outcome(0.1, True))]
-    assert estimate(ended + other, **EFFORT) == (
-        "About 30 s, A_drop about 0.90 (0.60 to 1.00), as in 3 earlier jobs of this effort."
-    )
+    words = "About 30 s, A_drop about 0.90 (0.60 to 1.00), as in 3 earlier jobs of this effort."
+    assert estimate(ended + other, **EFFORT) == words
 
 
 @pytest.mark.parametrize(

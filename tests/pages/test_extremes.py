@@ -88,9 +88,7 @@ def vast(service: Service) -> tuple[str, Result]:
     return job, result
 
 
-def test_a_result_of_two_thousand_views_shows_and_keeps_them_all(
-    service: Service, page: Page, vast: tuple[str, Result]
-) -> None:
+def test_a_result_shows_and_keeps_two_thousand_views(service: Service, page: Page, vast: tuple[str, Result]) -> None:
     job, result = vast
     answer = page.goto(f"{service.url}/jobs/{job}")
     assert answer is not None

@@ -87,9 +87,7 @@ def test_one_of_several_pages_of_an_experiment_says_that_its_figures_are_of_its_
     assert f"{told} (1)" in client.get(f"/experiments/few{older}").text
 
 
-def test_a_network_by_name_keeps_its_reference_in_commands_and_forms_also_where_it_is_not_allowed(
-    tmp_path: Path,
-) -> None:
+def test_a_network_that_is_not_allowed_keeps_its_reference_in_commands_and_forms(tmp_path: Path) -> None:
     request = JobRequest.of("mug", label=["table", MUG], classifier="timm:x")
     result = RESULT | {"spec": request.spec().model_dump(mode="json")}
     with running(Settings(data=tmp_path)) as client:
@@ -107,10 +105,7 @@ def test_the_job_s_own_network_is_asked_by_indices_and_others_by_names() -> None
     result = Result.model_validate(RESULT | {"spec": RESULT["spec"] | {"victim": {"classifier": "timm:x"}}})
     given = orbit(result, "1", list_shipped_classifiers())
     assert given is not None
-    assert [(each["reference"], each["labels"]) for each in given["classifiers"]] == [
-        ("timm:x", [2]),
-        ("tiny", ["mug"]),
-    ]
+    assert [(one["reference"], one["labels"]) for one in given["classifiers"]] == [("timm:x", [2]), ("tiny", ["mug"])]
 
 
 @pytest.mark.parametrize(
@@ -135,9 +130,7 @@ def test_a_phase_is_told_in_words(phase: str, words: str) -> None:
         ("/turntable/mug.png?renderer=a+b", 503, "No renderer worker with the engine &#39;a b&#39; is up; start one"),
     ],
 )
-def test_what_cannot_be_shown_is_told_on_a_page_with_the_headers_of_its_answer(
-    client: Api, path: str, status: int, words: str
-) -> None:
+def test_a_fault_is_told_on_a_page_with_its_own_headers(client: Api, path: str, status: int, words: str) -> None:
     answer = client.get(f"/jobs{path}", headers={"Accept": "text/html"})
     assert answer.status_code == status
     assert words in answer.text

@@ -1,7 +1,6 @@
 """The object turned in the browser: what is drawn, and what the network says of it. WebGL is drawn in software."""
 
 import io
-import json
 import re
 import subprocess
 import sys
@@ -19,7 +18,7 @@ from playwright.sync_api import Browser, BrowserContext, Page, expect
 from tests.pages.conftest import Service, drop, inaccessible, width
 from trompe_server.formats import write_glb
 from trompe_server.pages.offline import LIMIT
-from trompe_shared.api import Result, ViewPrediction
+from trompe_shared.api import ViewPrediction
 from trompe_shared.object3d import load_object
 from trompe_shared.shipped import shipped_objects
 
@@ -96,15 +95,8 @@ def pixels(page: Page, size: tuple[int, int]) -> list[NDArray[np.float64]]:
     return [np.array(Image.open(io.BytesIO(bytes(each))).convert("RGB"), np.float64) for each in found]
 
 
-def result_of(service: Service, job: str) -> Result:
-    with service.client() as client:
-        return client.job(job).result()
-
-
-def test_it_draws_what_the_target_draws_and_the_network_is_wrong_on_as_many_views(
-    service: Service, page: Page, painted: str
-) -> None:
-    result = result_of(service, painted)
+def test_it_draws_as_the_target_and_the_network_is_wrong_as_often(service: Service, page: Page, painted: str) -> None:
+    result = service.result(painted)
     views = result.held_out_views[::3]
     judged = np.array([[each in result.labels for each in (view.before, view.after)] for view in views])
 
@@ -125,9 +117,7 @@ def test_it_draws_what_the_target_draws_and_the_network_is_wrong_on_as_many_view
         assert np.abs(drawn[0] - drawn[1]).max() > 8
 
 
-def test_it_is_turned_by_keys_pointer_and_fields_and_answers_to_each(
-    service: Service, page: Page, painted: str
-) -> None:
+def test_it_is_turned_by_keys_pointer_and_fields_and_answers_each(service: Service, page: Page, painted: str) -> None:
     opened(page, f"{service.url}/jobs/{painted}")
     canvas = page.locator("trompe-orbit canvas")
     azimuth = page.locator("trompe-orbit [name=azimuth]")
@@ -184,12 +174,8 @@ def test_a_browser_without_webgl_says_so_and_shows_the_images(
     assert width(page.locator("trompe-viewer img.after"))
 
 
-def test_an_object_that_is_not_stored_any_more_is_told(
-    service: Service, page: Page, painted: str, faults: list[str]
-) -> None:
-    page.route(
-        "**/models/before.glb", lambda route: route.fulfill(status=404, body=json.dumps({"detail": "No object."}))
-    )
+def test_an_object_no_longer_stored_is_told(service: Service, page: Page, painted: str, faults: list[str]) -> None:
+    page.route("**/models/before.glb", lambda route: route.fulfill(status=404, body='{"detail": "No object."}'))
     page.goto(f"{service.url}/jobs/{painted}")
     page.get_by_role("button", name="Show it in 3D").click()
     expect(page.locator("trompe-orbit .error")).to_contain_text("No object.")
@@ -211,7 +197,7 @@ def test_the_result_as_one_file_opens_without_a_network(
 
     context.set_offline(True)
     opened(page, file.as_uri())
-    result = result_of(service, painted)
+    result = service.result(painted)
     for view in result.held_out_views[:5]:
         assert turned(page, pose_of(view)) == [each in result.labels for each in (view.before, view.after)]
     drawn = []

@@ -126,9 +126,7 @@ def test_a_form_to_which_one_returns_shows_the_object_that_it_submits(service: S
     expect(page.locator("[name=epsilon-says]")).to_have_text("0.2")
 
 
-def test_every_field_of_the_form_reaches_its_option_and_its_fault_is_shown_beside_it(
-    service: Service, page: Page, faults: list[str]
-) -> None:
+def test_every_field_reaches_its_option_and_shows_its_fault(service: Service, page: Page, faults: list[str]) -> None:
     page.goto(f"{service.url}/jobs/new")
     page.select_option("[name=object]", "mug")
     page.get_by_text("More options").click()
@@ -165,9 +163,7 @@ def test_every_field_of_the_form_reaches_its_option_and_its_fault_is_shown_besid
     faults.clear()  # browsers report answers of 422 on the console
 
 
-def test_the_divider_is_dragged_and_views_are_chosen_by_key_and_on_the_map(
-    service: Service, page: Page, done: str
-) -> None:
+def test_the_divider_is_dragged_and_views_are_chosen_by_key_and_map(service: Service, page: Page, done: str) -> None:
     page.goto(f"{service.url}/jobs/{done}")
     box = page.locator("trompe-viewer .stage").bounding_box()
     assert box is not None
@@ -197,16 +193,13 @@ def test_the_divider_is_dragged_and_views_are_chosen_by_key_and_on_the_map(
     assert "difference" in (shown.get_attribute("src") or "")
 
 
-def test_a_new_job_appears_in_the_list_by_itself_with_what_came_of_it_and_is_deleted(
-    service: Service, page: Page, done: str
-) -> None:
+def test_a_new_job_appears_in_the_list_with_its_result_and_is_deleted(service: Service, page: Page, done: str) -> None:
     page.goto(f"{service.url}/jobs")
     expect(page.locator(f"#job-{done}")).to_be_visible()
     job = service.submit()
     row = page.locator(f"#job-{job}")
     expect(row.locator(".state")).to_have_text("succeeded", timeout=600_000)
-    with service.client() as client:
-        result = client.job(job).result()
+    result = service.result(job)
     assert result.held_out is not None
     expect(row).to_contain_text(f"{result.held_out.a_drop:.2f} held-out")
     assert width(row.locator("img")) > 100
@@ -243,8 +236,7 @@ def test_a_row_with_the_focus_is_updated_once_the_focus_leaves_it(service: Servi
 def test_the_page_of_a_result_says_what_the_result_says_and_gives_it_as_one_zip(
     service: Service, page: Page, done: str, tmp_path: Path
 ) -> None:
-    with service.client() as client:
-        result = client.job(done).result()
+    result = service.result(done)
     page.goto(f"{service.url}/jobs/{done}")
 
     row = page.locator("tr", has=page.get_by_role("rowheader", name="target (own views)", exact=True))
@@ -350,9 +342,7 @@ def test_an_experiment_shows_its_jobs_as_points_that_open(service: Service, page
     expect(page).to_have_url(f"{service.url}/jobs/{done}")
 
 
-def test_a_result_is_judged_with_the_form_and_its_page_is_shown(
-    service: Service, page: Page, done: str, faults: list[str]
-) -> None:
+def test_a_result_is_judged_with_the_form_and_shown(service: Service, page: Page, done: str, faults: list[str]) -> None:
     page.goto(f"{service.url}/jobs/{done}")
     page.get_by_role("link", name="Judge the painted object").click()
     expect(page.locator("[name=after]")).to_have_value(f"job:{done}")
@@ -381,9 +371,7 @@ def test_a_result_is_judged_with_the_form_and_its_page_is_shown(
     expect(page.get_by_role("link", name="judged beside mug").first).to_be_visible()
 
 
-def test_all_classes_of_an_attack_count_in_the_judgement_of_its_result(
-    service: Service, page: Page, faults: list[str]
-) -> None:
+def test_all_classes_of_an_attack_count_in_its_judgement(service: Service, page: Page, faults: list[str]) -> None:
     job = service.store.create(JobRequest.of("mug", label=["mug", 7], needs={"gpu": 1000}))[0].id
     page.goto(f"{service.url}/judgements/new?job={job}")
     with page.expect_request("**/v1/judgements") as sent:
@@ -395,9 +383,7 @@ def test_all_classes_of_an_attack_count_in_the_judgement_of_its_result(
     faults.clear()  # browsers report answers of 409 on the console
 
 
-def test_a_judgement_without_an_object_after_is_refused_beside_its_field(
-    service: Service, page: Page, faults: list[str]
-) -> None:
+def test_a_missing_painted_object_is_refused_beside_its_field(service: Service, page: Page, faults: list[str]) -> None:
     page.goto(f"{service.url}/judgements/new")
     page.fill("[name=label]", "mug")
     page.get_by_role("button", name="Judge").click()
@@ -491,8 +477,7 @@ def test_every_page_is_accessible_and_none_is_too_wide_cut_off_half_empty_or_mov
 def test_on_a_slow_network_a_result_is_read_before_its_viewer_is_there_and_3d_says_what_it_loads(
     service: Service, page: Page, context: BrowserContext, done: str
 ) -> None:
-    with service.client() as client:
-        result = client.job(done).result()
+    result = service.result(done)
     slowed(context, page, bytes_per_second=150_000)
     held = held_back(page, "**/viewer.js*")
     page.goto(f"{service.url}/jobs/{done}", wait_until="commit")
@@ -507,9 +492,8 @@ def test_on_a_slow_network_a_result_is_read_before_its_viewer_is_there_and_3d_sa
     expect(page.locator("trompe-orbit")).to_have_attribute("data-answered", re.compile("azimuth"))
     told = page.evaluate("window.told")
     assert told[0] == "Loading three.js"
-    loaded = [
-        [float(each) for each in re.findall(r"([\d.]+) MB", text)] for text in told if "Loading the object" in text
-    ]
+    loading = [text for text in told if "Loading the object" in text]
+    loaded = [[float(each) for each in re.findall(r"([\d.]+) MB", text)] for text in loading]
     assert len(loaded) > 2
     assert loaded == sorted(loaded, key=sum)
 
@@ -551,9 +535,7 @@ def guarded(new_service: Callable[..., Service]) -> Iterator[Service]:
         yield service
 
 
-def test_with_tokens_it_asks_for_one_and_goes_on_to_where_one_wanted(
-    guarded: Service, page: Page, faults: list[str]
-) -> None:
+def test_with_tokens_it_asks_for_one_and_goes_on_as_wanted(guarded: Service, page: Page, faults: list[str]) -> None:
     page.goto(f"{guarded.url}/jobs?state=queued")
     assert page.url == f"{guarded.url}/login?next=/jobs%3Fstate%3Dqueued"
     for scheme in ("light", "dark"):
