@@ -19,7 +19,6 @@ from trompe_server.formats import import_file, read_object, repaint_file, repain
 from trompe_server.formats.fbx import unit
 from trompe_server.formats.fbx_tree import MAGIC, Node, Tree, parse_tree
 from trompe_server.formats.pictures import cutout_alpha, encode_srgb, linear_rgb, tinted
-from trompe_server.formats.registry import FORMATS
 from trompe_server.formats.unwrap import unwrap
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.errors import ObjectError
