@@ -47,9 +47,9 @@ class OnnxClassifier:
 
 
 def load_onnx(path: Path, device: str = "cpu") -> OnnxClassifier:
-    """Load an ``.onnx`` file on ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+    """Load an ``.onnx`` file on ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, on the CPU where this onnxruntime has no other.
 
-    Raises ``ClassifierError`` if it breaks the contract, or if this onnxruntime does not support the device.
+    Raises ``ClassifierError`` if it breaks the contract.
     """
     session = _session(path, device)
     fixed_batch, size = _input(session, path.name)
@@ -71,16 +71,11 @@ def load_onnx(path: Path, device: str = "cpu") -> OnnxClassifier:
 
 
 def _providers(device: str) -> list[str | tuple[str, dict[str, str]]]:
-    """onnxruntime's providers for the device, with the CPU as a fallback for single operators."""
+    """onnxruntime's providers for the device, where this build has them (onnxruntime-gpu), and the CPU."""
     kind, _, number = device.partition(":")
-    if kind == "cpu":
-        return ["CPUExecutionProvider"]
     provider = f"{kind.upper()}ExecutionProvider"
-    if provider not in onnxruntime.get_available_providers():
-        raise ClassifierError(
-            f"This onnxruntime cannot use the device {device!r}: it has {onnxruntime.get_available_providers()}. "
-            "Install onnxruntime-gpu in its place, or load .onnx files on 'cpu'."
-        )
+    if kind == "cpu" or provider not in onnxruntime.get_available_providers():
+        return ["CPUExecutionProvider"]
     return [(provider, {"device_id": number or "0"}), "CPUExecutionProvider"]
 
 

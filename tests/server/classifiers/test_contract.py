@@ -543,6 +543,12 @@ def test_a_network_that_onnxruntime_runs_leaves_nothing_in_the_home_folder(tmp_p
     assert list(home.rglob("*")) == []
 
 
+def test_an_onnx_network_runs_on_the_cpu_where_onnxruntime_has_no_other_device(tmp_path: Path) -> None:
+    """As in a service on a card with the plain onnxruntime, which judges by such files too."""
+    file, images = write_onnx(tmp_path / "net.onnx"), np.full((2, *SIZE, 3), 90, np.uint8)
+    np.testing.assert_allclose(load_onnx(file, "cuda:0").predict(images), load_onnx(file).predict(images), rtol=1e-3)
+
+
 def test_an_onnx_network_whose_weights_are_elsewhere_is_refused_with_the_remedy(tmp_path: Path) -> None:
     file = write_onnx(tmp_path / "net.onnx")
     options: dict[str, Any] = {"save_as_external_data": True, "location": "net.onnx.data", "size_threshold": 0}
