@@ -321,7 +321,7 @@ def object_from_files(files: Mapping[str, bytes]) -> Object3D:
     parts = parse_obj(text_of(files[mesh]), mesh)
     if not any(np.ptp(part.vertices, axis=0).any() for part in parts):
         raise ObjectError(f"{mesh!r} has no extent: all its corners are in one place.")
-    materials = _materials(files, {part.material for part in parts})
+    materials = _materials(files, parts)
     for part in parts:
         if part.material not in materials:
             raise ObjectError(
@@ -376,17 +376,29 @@ def mtl_texts(files: Mapping[str, bytes]) -> dict[str, str]:
     return {name: text_of(files[name]) for name in libraries(text_of(files[_mesh_name(files)]), files)}
 
 
-def _materials(files: Mapping[str, bytes], used: Collection[str]) -> dict[str, Material]:
-    """Materials of the mat_def file, else of the MTL files; normal maps of the ``used`` ones."""
+def _materials(files: Mapping[str, bytes], parts: Collection[Part]) -> dict[str, Material]:
+    """Materials of the mat_def file, else of the MTL files; normal maps of those that ``parts`` use."""
     if (definition := definition_of(files)) is not None:
         return _materials_from_json(files[definition], definition)
+    used = {part.material for part in parts}
     materials: dict[str, Material] = {}
     for text in mtl_texts(files).values():
         for name, maps in parse_mtl(text).items():
             if "albedo" in maps and name not in materials:
+                if "clamp" in maps:
+                    _check_clamped(name, [part.uvs for part in parts if part.material == name])
                 normal = _normal(maps, files) if name in used else None
                 materials[name] = Material(name, maps["albedo"], normal, opacity=dissolve(maps, name))
     return materials
+
+
+def _check_clamped(material: str, uvs: Collection[NDArray[np.float32]]) -> None:
+    """Raise ``ObjectError`` unless all coordinates of a texture that does not repeat are within [0, 1]."""
+    if any(each.min() < -1e-3 or each.max() > 1 + 1e-3 for each in uvs):
+        raise ObjectError(
+            f"Material {material!r} clamps its texture beyond the edges (-clamp on), which is not supported; use "
+            "texture coordinates (vt) within [0, 1], or delete the option to repeat the texture."
+        )
 
 
 def _normal(maps: Mapping[str, str], files: Mapping[str, bytes]) -> str | None:

@@ -273,7 +273,8 @@ def parse_mtl(text: str) -> dict[str, dict[str, str]]:
     """Maps of each material of an MTL text: ``{name: {"albedo": file, "normal": file}}``, files without folders.
 
     ``bump`` maps normals or heights. Transparent materials have ``map_d`` (a file), ``d`` or ``tr`` (numbers), too;
-    see ``dissolve``. Raises ``ObjectError`` for a map that is scaled or moved.
+    see ``dissolve``. An albedo that does not repeat has ``clamp``. Raises ``ObjectError`` for a map that is scaled or
+    moved.
     """
     keys = {"map_kd": "albedo", "map_bump": "bump", "bump": "bump", "norm": "normal", "map_kn": "normal"}
     keys |= {key: key for key in ("map_d", "d", "tr")}
@@ -293,6 +294,8 @@ def parse_mtl(text: str) -> dict[str, dict[str, str]]:
                     "apply that to the texture coordinates in a modelling program."
                 )
             current[keys[words[0].lower()]] = base_name(name)
+            if words[0].lower() == "map_kd" and re.search(r"-clamp\s+on\s", options.lower()):
+                current["clamp"] = "on"
     return materials
 
 

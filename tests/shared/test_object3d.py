@@ -150,15 +150,15 @@ def test_a_bump_map_that_is_the_albedo_is_no_normal_map() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "name"),
+    ("words", "maps"),
     [
-        ("-clamp on my tex.png", "my tex.png"),
-        ("-bm 1.0 -o 0 0 -mm 0 1 -imfchan r maps\\my 2 tex.png ", "my 2 tex.png"),
-        ("-unknown my tex.png", "tex.png"),
+        ("-clamp on my tex.png", {"albedo": "my tex.png", "clamp": "on"}),
+        ("-clamp off -bm 1.0 -o 0 0 -mm 0 1 -imfchan r maps\\my 2 tex.png ", {"albedo": "my 2 tex.png"}),
+        ("-unknown my tex.png", {"albedo": "tex.png"}),
     ],
 )
-def test_options_of_a_map_are_no_part_of_its_name(words: str, name: str) -> None:
-    assert parse_mtl(f"newmtl m\nmap_Kd {words}\n") == {"m": {"albedo": name}}
+def test_options_of_a_map_are_no_part_of_its_name(words: str, maps: dict[str, str]) -> None:
+    assert parse_mtl(f"newmtl m\nmap_Kd {words}\n") == {"m": maps}
 
 
 def test_an_mtl_replaces_a_missing_material_definition() -> None:
