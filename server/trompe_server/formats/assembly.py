@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_server.formats.pictures import Pixels, encode_srgb, linear_rgb, shrink
-from trompe_server.formats.unwrap import BAKED_SIDE, bake, unwrap
+from trompe_server.formats.unwrap import BAKED_SIDE, bake, laid_out, unwrap
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Material, Object3D, encode_png, object_from_files
 from trompe_shared.wavefront import LARGEST, Part, Surface, obj_text
@@ -37,11 +37,11 @@ def flat_picture(colour: Sequence[float], size: tuple[int, int] = (BAKED_SIDE, B
 
 
 def painted_flat(surface: Surface, colour: Sequence[float]) -> tuple[Part, Pixels]:
-    """A surface without texture with its generated one; unwrapped if it lacks UVs or has vertex colours.
+    """A surface without texture with its generated one; unwrapped if it lacks UVs with area or has vertex colours.
 
     colour: linear; multiplies the vertex colours, which are sRGB-encoded in [0, 1].
     """
-    if surface.colours is None and surface.uvs is not None:
+    if surface.colours is None and surface.uvs is not None and laid_out(surface.uvs, surface.faces):
         part = Part(surface.material, surface.vertices, surface.normals, surface.uvs, surface.faces)
         return part, flat_picture(colour)
     (cut,), size = unwrap([(surface.vertices, surface.faces)])

@@ -14,7 +14,7 @@ from trompe_server.formats.gltf_container import Container, at, open_container
 from trompe_server.formats.gltf_schema import Material, TextureInfo
 from trompe_server.formats.gltf_shapes import Instance, Shape, instances, placed, read_shape
 from trompe_server.formats.pictures import cutout_alpha, metallic_smoothness, scaled_normals, tinted
-from trompe_server.formats.unwrap import Unwrapped, bake, unwrap
+from trompe_server.formats.unwrap import Unwrapped, bake, laid_out, unwrap
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import base_name
@@ -214,9 +214,10 @@ def _colours(shape: Shape) -> NDArray[np.float64]:
 def _needs_unwrapping(shape: Shape, material: Material) -> bool:
     if shape.colours is not None and material.maps:
         raise ObjectError(
-            f"Material {material.name!r} has textures and vertex colours; bake them into its base colour texture."
+            f"Material {material.name or shape.material!r} has textures and vertex colours; bake them into its base "
+            "colour texture."
         )
-    return shape.uvs is None or shape.colours is not None
+    return shape.colours is not None or not (material.maps or laid_out(shape.uvs, shape.faces))
 
 
 def _ending(data: bytes) -> str | None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from trompe_server.formats.assembly import check_numbers
 from trompe_server.formats.gltf_container import Container, at
-from trompe_server.formats.gltf_schema import Document, Material, Node, Primitive, UvTransform
+from trompe_server.formats.gltf_schema import Document, Node, Primitive, TextureInfo, UvTransform
 from trompe_server.formats.unwrap import Unwrapped
 from trompe_shared.errors import ObjectError
 from trompe_shared.wavefront import MAX_FACES, Part
@@ -187,7 +187,7 @@ def _uvs(container: Container, primitive: Primitive) -> NDArray[np.float32] | No
             )
         return None
     uvs = _moved(container.numbers(primitive.attributes[f"TEXCOORD_{which}"], 2), transform)
-    _check_wrapping(container.document, material, uvs)
+    _check_wrapping(container.document, f"Material {material.name or primitive.material!r}", material.maps, uvs)
     return np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1)
 
 
@@ -199,18 +199,18 @@ def _moved(uvs: NDArray[np.float32], transform: UvTransform) -> NDArray[np.float
     return np.asarray(uvs @ turn.T + transform.offset, np.float32)
 
 
-def _check_wrapping(document: Document, material: Material, uvs: NDArray[np.float32]) -> None:
+def _check_wrapping(document: Document, what: str, maps: Sequence[TextureInfo], uvs: NDArray[np.float32]) -> None:
     """Raise ``ObjectError`` for wrapping other than repetition, unless all coordinates are within [0, 1]."""
     if uvs.min() >= -1e-3 and uvs.max() <= 1 + 1e-3:
         return
-    for info in material.maps:
+    for info in maps:
         texture = at(document.textures, info.index, "texture")
         if texture.sampler is None:
             continue
         sampler = at(document.samplers, texture.sampler, "sampler")
         if (sampler.wrap_s, sampler.wrap_t) != (10497, 10497):
             raise ObjectError(
-                f"Material {material.name!r} clamps or mirrors a texture beyond its edges, which is not supported; use "
+                f"{what} clamps or mirrors a texture beyond its edges, which is not supported; use "
                 "repetition, or texture coordinates within [0, 1]."
             )
 

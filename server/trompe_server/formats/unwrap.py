@@ -35,6 +35,14 @@ class Unwrapped:
     uvs: NDArray[np.float32]
 
 
+def laid_out(uvs: NDArray[np.float32] | None, faces: NDArray[np.int32]) -> bool:
+    """Whether any triangle (F, 3) has area in the texture; programs give plain surfaces one point for all corners."""
+    if uvs is None:
+        return False
+    a, b, c = np.moveaxis(uvs[faces].astype(np.float64), 1, 0)
+    return bool(np.linalg.det(np.stack([b - a, c - a], axis=1)).any())
+
+
 def unwrap(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int32]]]) -> tuple[list[Unwrapped], tuple[int, int]]:
     """Lay out meshes (vertices (V, 3), faces (F, 3)) in one texture of size (H, W); deterministic.
 

@@ -187,7 +187,7 @@ class _Completion:
             self._parts.append(textured(surface, self._mesh))
             return
         part, picture = painted_flat(surface, self._colour(surface))
-        self._rewritten |= surface.uvs is None or surface.colours is not None
+        self._rewritten |= part.uvs is not surface.uvs
         self._parts.append(part)
         name = free_name(f"{safe_name(surface.material)}_albedo.png", self._files)
         self._files[name] = encode_png(picture)

@@ -166,6 +166,17 @@ def test_a_texture_that_the_mtl_scales_or_moves_is_refused(options: str, moved: 
         assert (next(iter(read_object(data, name="t.zip").obj.textures.values())) == PICTURE).all()
 
 
+@pytest.mark.parametrize(("option", "refused"), [("-clamp on", True), ("-clamp off", False)])
+def test_a_texture_that_does_not_repeat_is_refused_beyond_its_edges(option: str, refused: bool) -> None:
+    files = {"t.mtl": f"newmtl red\nmap_Kd {option} red.png\n".encode(), "red.png": encode_png(PICTURE)}
+    within, beyond = (pack_zip(files | {"t.obj": text.encode()}) for text in (OBJ, OBJ.replace("vt 1 1", "vt 1 1.5")))
+    read_object(within, name="t.zip")
+    if refused:
+        assert "Material 'red' clamps its texture beyond the edges" in refusal(beyond, "t.zip")
+    else:
+        read_object(beyond, name="t.zip")
+
+
 @pytest.mark.parametrize(
     ("lines", "opacity", "alpha"),
     [
@@ -209,8 +220,9 @@ def test_one_texture_with_two_opacity_maps_is_refused_with_a_remedy() -> None:
     assert "expected 0 to 1" in refusal(pack_zip(wrong), "t.zip")
 
 
-def test_a_mesh_without_texture_coordinates_is_unwrapped_and_written_anew() -> None:
-    obj, out = comes_back(pack_zip({"t.obj": BARE.encode(), "t.mtl": MTL.encode(), "notes.txt": b"kept"}), "t.zip")
+@pytest.mark.parametrize("mesh", [BARE, re.sub("vt . .", "vt 0 0", OBJ)], ids=["none", "all in one point"])
+def test_a_mesh_without_texture_coordinates_is_unwrapped_and_written_anew(mesh: str) -> None:
+    obj, out = comes_back(pack_zip({"t.obj": mesh.encode(), "t.mtl": MTL.encode(), "notes.txt": b"kept"}), "t.zip")
     assert unpack(out)["notes.txt"] == b"kept"
     (part,) = obj.parts
     assert part.uvs.min() >= 0

@@ -268,7 +268,7 @@ def test_what_cannot_be_shown_is_refused_with_a_reason() -> None:
     mirrored = textured()
     mirrored.document["textures"][0]["sampler"] = mirrored.add("samplers", {"wrapS": 33648})
     mirrored.document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = mirrored.accessor(UVS * np.float32(3))
-    assert "mirrors" in refusal(mirrored.to_glb(), "scene.glb")
+    assert "Material 0 clamps or mirrors" in refusal(mirrored.to_glb(), "scene.glb")
 
     apart = textured()
     apart.document["materials"][0]["normalTexture"] = {"index": apart.texture(GRADIENT), "texCoord": 1}
@@ -277,7 +277,7 @@ def test_what_cannot_be_shown_is_refused_with_a_reason() -> None:
     both = Scene()
     shade = both.accessor(np.full((4, 3), 0.5, "<f4"))
     both.square(both.material(both.texture(GRADIENT)), COLOR_0=shade)
-    assert "bake" in refusal(both.to_glb(), "scene.glb")
+    assert "Material 0 has textures and vertex colours; bake" in refusal(both.to_glb(), "scene.glb")
 
     for mode in ("BLEND", "MASK"):
         faded = Scene()
@@ -436,7 +436,7 @@ def test_alpha_of_the_image_is_kept_whatever_it_means() -> None:
         assert (np.array(image.getchannel("A")) == alpha).all()
 
 
-@pytest.mark.parametrize("uvs", [None, UVS], ids=["without texture coordinates", "with them"])
+@pytest.mark.parametrize("uvs", [None, UVS, 0 * UVS], ids=["without texture coordinates", "with them", "in one point"])
 @pytest.mark.parametrize("colours", [False, True])
 def test_a_flat_colour_becomes_a_texture_with_missing_coordinates(uvs: NDArray[Any] | None, colours: bool) -> None:
     scene = Scene()
@@ -445,6 +445,7 @@ def test_a_flat_colour_becomes_a_texture_with_missing_coordinates(uvs: NDArray[A
     scene.square(0)
     new, out = painted_over(beside(scene))
     same_paint(read(out), new)
+    assert all(np.ptp(part.uvs, axis=0).all() for part in new.parts)
 
 
 def test_compressed_copies_are_moved_or_dropped_with_what_they_are_copies_of() -> None:
