@@ -246,6 +246,17 @@ def on_object(change: Callable[[Levels], Levels], *, background: bool = False) -
     return see
 
 
+def metered(shown: bool) -> See:
+    """Exposure by the brightness of the picture, or of its object alone (``shown``)."""
+
+    def see(picture: Levels, world: Snapshot) -> Levels:
+        there = (picture != np.round(255 * np.array(world.background))).any(axis=-1)
+        mean = linear(picture)[there if shown else ...].mean() if there.any() else 0.0
+        return on_object(lambda levels: encoded(linear(levels) * 0.3 / (mean + 0.05)))(picture, world)
+
+    return see
+
+
 def slow(picture: Levels, _: Snapshot) -> Levels:
     time.sleep(0.1)
     return picture
@@ -273,6 +284,8 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "one pixel": ("not repeatable", one_pixel),
     "grain": ("not repeatable", seen(grain(3, lambda _: None))),
     "adaptive exposure": ("not repeatable", adapting),
+    "exposure by the whole picture": ("exposure", seen(metered(shown=False))),
+    "exposure by the object": ("exposure", seen(metered(shown=True))),
     "noise without seed": ("noise not numbered", seen(grain(3, lambda _: None), RANDOM)),
     "noise with a constant seed": ("noise number ignored", seen(grain(3, lambda _: 7), RANDOM)),
     "noise declared, and none": ("noise number ignored", seen(lambda picture, _: picture, RANDOM)),

@@ -14,7 +14,7 @@ REMEDIES: Final[Mapping[str, str]] = {
     "invisible": "Place Snapshot.instances by their poses, use Snapshot.camera, and clip nothing between 0.1 and 10 m.",
     "untextured": "Bind each part's albedo, obj.textures[obj.albedo_of(part)].",
     "channel order": "Return the channels in the order red, green, blue: picture[..., ::-1] turns BGR into RGB.",
-    "background": "Fill the background with Snapshot.background, sRGB, after any tone mapping and dithering.",
+    "background": "Fill the background with Snapshot.background, sRGB, after any tone mapping, vignette and dithering.",
     "stale scene": "Remove the objects of the last picture that are not in Snapshot.instances.",
     "stale object": "Find cached objects by HashedModel.key, not by name or number.",
     "stale texture": "Find cached textures by HashedModel.albedos, not by file name.",
@@ -37,6 +37,7 @@ REMEDIES: Final[Mapping[str, str]] = {
     "texture not decoded": "Mark the albedo texture as sRGB, so that the engine decodes it to linear light.",
     "texture decoded twice": "Decode the albedo texture once: mark it as sRGB or convert it yourself.",
     "light on encoded colours": "Mark the albedo texture as sRGB and encode the picture, if the engine can.",
+    "exposure": "Turn off automatic exposure: a colour must not depend on the rest of the picture.",
     "light missing": "Apply Snapshot.lights; a directional light travels along its direction.",
     "light follows camera": "Place the light in the world, not below the camera.",
     "light reversed": "WorldLight.direction is the way the light travels; negate it if the engine wants the opposite.",
@@ -44,7 +45,7 @@ REMEDIES: Final[Mapping[str, str]] = {
     "light intensity": "Multiply the light by WorldLight.intensity (and by pi where the engine divides by it).",
     "light colour": "Multiply the light by WorldLight.color / 255, linear.",
     "ambient missing": "Add Snapshot.ambient, light from all sides, to the directional lights.",
-    "extra light": "Take all light from Snapshot.lights and .ambient: turn off the engine's own sky and lamps.",
+    "extra light": "Take all light from Snapshot.lights and .ambient: turn off the engine's own sky, lamps and fog.",
     "not shaded": "Keep shading on where Snapshot.lights is empty: add a black light if the engine needs one.",
     "frozen texture": "Read obj.textures (obj.files keeps the old paint); find cached textures by HashedModel.albedos.",
     "late texture": "Finish the upload of a texture before the picture is drawn.",
@@ -59,6 +60,7 @@ FINAL: Final = {
     "stale texture",
     "moved object",
     "axes",
+    "exposure",
     "overexposed",
 }
 """Faults after which other questions have no answer."""

@@ -387,6 +387,25 @@ def _rings(look: _Look, picture: Picture) -> list[float]:
     return [max(level(picture, np.abs(ring - k - 0.5) < 0.25), 1.0) for k in range(len(RINGS))]
 
 
+FRAMED: Final = {
+    level: plate(0.29, np.pad(plain(110, 110, 110), ((2, 2), (2, 2), (0, 0)), constant_values=level))
+    for level in (5, 190)
+}
+"""A grey square in a dark and in a bright frame."""
+ADAPTED: Final = 8.0
+"""Levels by which a bright surrounding may change the grey, as bloom does."""
+
+
+def exposure(look: _Look, _: EngineInfo) -> Findings:
+    """The same grey in a dark picture and in a bright one."""
+    middle = np.s_[SQUARE[0] // 2 - 4 : SQUARE[0] // 2 + 4, SQUARE[1] // 2 - 4 : SQUARE[1] // 2 + 4]
+    dark, bright = (
+        float(np.median(look.at(obj, replace(FRONT, background=(level,) * 3))[middle])) for level, obj in FRAMED.items()
+    )
+    if abs(bright - dark) > ADAPTED:
+        yield fault("exposure", f"A grey comes as {dark:.0f} in a dark picture, as {bright:.0f} in a bright one.")
+
+
 SUN: Final = Light(azimuth=60, elevation=35, intensity=1.0, ambient=0.0)
 SIDES: Final = (Camera(2.0, 0, 0), Camera(2.0, 110, 10))
 BALL_RADIUS: Final = 0.38
@@ -523,6 +542,7 @@ QUESTIONS: Final[tuple[Callable[[_Look, EngineInfo], Findings], ...]] = (
     background,
     objects,
     orientation,
+    exposure,
     light,
     texture,
     lens,
