@@ -28,7 +28,7 @@ from trompe_server.queue.store import JobStore
 from trompe_server.queue.tables import events, jobs, metadata, workers
 from trompe_server.queue.workers import Worker, forget_workers, record_workers
 from trompe_server.storage import tokens
-from trompe_server.storage.database import write
+from trompe_server.storage.database import DatabaseDownError, write
 from trompe_shared.api import JobState, Needs, Progress
 from trompe_shared.errors import SpecError
 
@@ -360,6 +360,17 @@ def test_a_job_to_be_cancelled_ends_with_its_worker(store: JobStore, end: Callab
 def test_a_word_that_the_database_cannot_hold_is_a_wrong_word(store: JobStore) -> None:
     with pytest.raises((NotFoundError, SpecError)):
         store.get("job\0")
+
+
+def test_a_database_that_may_only_be_read_is_not_available(store: JobStore) -> None:
+    create(store)
+    reading = {"sqlite": "PRAGMA query_only=on", "postgresql": "SET default_transaction_read_only=on"}
+    with store.engine.connect() as connection:
+        connection.exec_driver_sql(reading[store.engine.dialect.name])
+        connection.commit()
+        with pytest.raises(DatabaseDownError, match=r"read-?only"):
+            connection.execute(jobs.delete())
+        connection.invalidate()
 
 
 def test_a_loss_is_counted_once_whoever_notices_it(store: JobStore) -> None:
