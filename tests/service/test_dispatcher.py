@@ -87,6 +87,31 @@ def test_a_job_that_stands_still_is_lost_but_not_right_after_the_dispatcher_was_
     assert executed.state(job).attempts == 2
 
 
+@pytest.mark.parametrize("hours", [1, -1])
+def test_no_attempt_is_lost_when_the_clock_is_set(executed: Executed, hours: int) -> None:
+    job = executed.submit("fine")
+    ours, clock = dispatcher(executed, lambda: frozen(executed))
+    for _ in range(6):
+        ours.step()
+        clock.now += 6
+    with write(executed.store.engine) as connection:  # its last sign of life, as the new time sees it
+        connection.execute(jobs.update().values(seen=jobs.c.seen - START_ALLOWANCE - 3600))
+    now = ours._claims.now
+    ours._claims.now = lambda: now() + 3600 * hours  # type: ignore[method-assign]
+    for _ in range(5):
+        clock.now += 6
+        ours.step()
+        assert executed.state(job).attempts == 1
+
+
+def test_a_dispatcher_that_fails_by_a_mistake_says_so_until_it_works(executed: Executed) -> None:
+    open_executor = Mock(side_effect=[FileExistsError(17, "File exists", "metrics"), executed.open()])
+    ours, _ = dispatcher(executed, open_executor)
+    with ours.running():
+        assert "FileExistsError" in (ours.fault or "")
+        wait_until(lambda: ours.fault is None)
+
+
 def test_an_executor_that_is_lost_is_opened_again_and_the_jobs_go_on(executed: Executed) -> None:
     opened: list[Executor] = []
 

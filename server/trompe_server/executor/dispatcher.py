@@ -55,6 +55,7 @@ class Dispatcher:
         self._lost: list[tuple[Claim, str]] = []
         self._round = 0.0
         self._heard_since = clock()
+        self._ahead = 0.0
         self.fault: str | None = None
         self._tried = threading.Event()
 
@@ -90,8 +91,9 @@ class Dispatcher:
         except ServiceError as error:
             self._abandon(str(error))
             return self._interval
-        except Exception:
+        except Exception as error:
             logger.exception("the dispatcher failed; retrying")
+            self.fault = f"the dispatcher failed ({type(error).__name__}: {error})"
             return RETRY
 
     def step(self) -> bool:
@@ -114,15 +116,17 @@ class Dispatcher:
     def _begin_round(self) -> bool:
         """Renew the lease, and look after what changes slowly. Returns whether the lease is ours."""
         now = self._clock()
-        if now - self._round > self._silence / 2:
-            self._heard_since = now  # we were frozen, the machine asleep or the database locked
+        ahead = self._claims.now() - now
+        if max(now - self._round, abs(ahead - self._ahead)) > self._silence / 2:
+            self._heard_since = now  # we were frozen, the machine asleep, the database locked or its clock set
+        self._ahead = ahead
         if not take_lease(self._claims.engine, DISPATCHER, holder=self._name, seconds=self._silence):
             self._abandon(None)
             return False
-        self._round = now + self._interval
         if self._executor is None:
             logger.info("%s dispatches the jobs", self._name)
             self._executor = self._open()
+        self._round = now + self._interval
         for job in self._claims.lose_unknown(self._held, "its worker or dispatcher died"):
             logger.warning("job %s was requeued: nobody runs it", job)
         self._cancel_dead(self._executor)

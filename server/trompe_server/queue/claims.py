@@ -64,6 +64,11 @@ class Claims:
     def __init__(self, engine: sa.Engine) -> None:
         self.engine = engine
 
+    def now(self) -> float:
+        """Time of the database, seconds since 1970."""
+        with self.engine.connect() as connection:
+            return connection.execute(sa.select(clock())).scalar_one()
+
     def waiting(self) -> dict[Needs, int]:
         """Number of queued jobs by their needs."""
         query = sa.select(jobs.c.needs, sa.func.count().label("amount")).where(jobs.c.state == JobState.queued.value)
