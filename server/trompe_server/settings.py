@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import from_json
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
@@ -22,11 +22,11 @@ Texts = Annotated[tuple[str, ...], BeforeValidator(_decoded)]
 
 
 class Settings(BaseSettings):
-    """Settings of the service. ``TROMPE_DATA`` sets ``data``, and so on."""
+    """Settings of the service. ``TROMPE_DATA`` sets ``data``, and so on; an empty variable sets nothing."""
 
-    model_config = SettingsConfigDict(env_prefix="TROMPE_", frozen=True, enable_decoding=False)
+    model_config = SettingsConfigDict(env_prefix="TROMPE_", frozen=True, enable_decoding=False, env_ignore_empty=True)
 
-    data: Path = Path.home() / ".local" / "share" / "trompe"
+    data: Annotated[Path, AfterValidator(Path.expanduser)] = Path.home() / ".local" / "share" / "trompe"
     """Folder of all data, except what ``database`` and ``store`` place elsewhere."""
     database: str = ""
     """URL of the database, SQLite or PostgreSQL; empty: a file in the data folder."""
@@ -41,7 +41,7 @@ class Settings(BaseSettings):
     on this machine alone."""
     stall_timeout: Annotated[float, Field(gt=0)] = 1800.0
     """Seconds without progress after which an attempt counts as lost."""
-    silence: Annotated[float, Field(ge=1.0)] = 30.0
+    silence: Annotated[float, Field(ge=1.0, le=86_400.0)] = 30.0
     """Seconds without a heartbeat after which an attempt, or the dispatcher, counts as dead and is replaced."""
     retention_days: Annotated[float, Field(ge=0)] = 0.0
     """Days after which ended jobs, their artifacts and unused calibrations are deleted; 0 keeps them."""

@@ -1,9 +1,12 @@
 """Commands of this package for ``trompe``: serve, worker, migrate, demo, doctor."""
 
+import logging
+import os
 import subprocess
 import sys
+from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 from pydantic import ValidationError
@@ -18,6 +21,11 @@ from trompe_shared.json_option import as_json, json_option
 
 if TYPE_CHECKING:
     from trompe_server.renderers.discovery import RendererAddresses
+
+logger = logging.getLogger(__name__)
+
+ALIKE: Final = 0.84
+"""Likeness to a setting from which a variable counts as a misspelt one: TROMPE_ has other readers, too."""
 
 data_option = click.option(
     "--data", type=click.Path(path_type=Path, file_okay=False), help="Folder of data (or TROMPE_DATA)."
@@ -63,6 +71,7 @@ _executor = click.option(
 
 def settings_of(data: Path | None, **others: object) -> Settings:
     """Settings from the environment, overridden by the given options. Raises ``SpecError``."""
+    _warn_of_misspelt()
     options = {"data": data and data.absolute(), **others}
     given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     try:
@@ -72,6 +81,15 @@ def settings_of(data: Path | None, **others: object) -> Settings:
         raise SpecError(
             f"Invalid settings: {wrong}. Correct the option, or the variable of the environment."
         ) from error
+
+
+def _warn_of_misspelt() -> None:
+    """Warn of each variable that is nearly called as a setting."""
+    known = [name.upper() for name in Settings.model_fields]
+    found = {name.removeprefix("TROMPE_") for name in os.environ if name.startswith("TROMPE_")}
+    for name in sorted(found - set(known)):
+        for meant in get_close_matches(name, known, n=1, cutoff=ALIKE):
+            logger.warning("the variable TROMPE_%s sets nothing; did you mean TROMPE_%s?", name, meant)
 
 
 @click.command()

@@ -77,6 +77,7 @@ def test_serve_says_what_is_wrong_with_the_data_folder(tmp_path: Path) -> None:
         ("TROMPE_WORKERS", "many", "workers: Input should be a valid integer, unable to parse"),
         ("TROMPE_NETWORKS", "tiny", "networks: 'tiny' is not a JSON list"),
         ("TROMPE_MAX_UPLOAD", "-1", "max_upload: Input should be greater than 0"),
+        ("TROMPE_SILENCE", "inf", "silence: Input should be less than or equal to 86400"),
         ("TROMPE_RENDERER_PATIENCE", "nan", "renderer_patience: Input should be greater than or equal to 0"),
     ],
 )
@@ -105,6 +106,27 @@ def test_an_option_goes_before_a_wrong_variable(monkeypatch: pytest.MonkeyPatch)
 def test_the_data_folder_is_set_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TROMPE_DATA", str(tmp_path))
     assert Settings().data == tmp_path
+    monkeypatch.setenv("TROMPE_DATA", "~/trompe")
+    assert Settings().data == Path.home() / "trompe"
+
+
+def test_an_empty_variable_sets_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = Settings()
+    for name in ("data", "workers", "device", "networks"):
+        monkeypatch.setenv(f"TROMPE_{name.upper()}", "")
+    assert Settings() == expected
+
+
+def test_a_misspelt_variable_is_told_and_those_of_other_readers_are_not(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("SILENSE", "WORKER", "PORT", "BIND", "TOKEN", "RAY_NODES", "RENDERER_CPUS", "WORKER_MEMORY"):
+        monkeypatch.setenv(f"TROMPE_{name}", "3")
+    commands.settings_of(None)
+    assert caplog.messages == [
+        "the variable TROMPE_SILENSE sets nothing; did you mean TROMPE_SILENCE?",
+        "the variable TROMPE_WORKER sets nothing; did you mean TROMPE_WORKERS?",
+    ]
 
 
 # Tokens
