@@ -139,11 +139,10 @@ def test_a_background_is_a_colour_or_a_picture_file(tmp_path: Path) -> None:
         pytest.param({"ranges": {"colour": (0, 1)}}, "`ranges` colour: Extra inputs", id="no such range"),
         pytest.param({"ranges": {"roll": 3}}, "`ranges` roll: Input should be", id="no range"),
         pytest.param(
-            {"label": True}, "`label` 0: should be a class by name or index; got true", id="label of no class"
+            {"label": [True]}, "`label` 0: should be a class by name or index; got true", id="label of no class"
         ),
-        pytest.param(
-            {"target": False}, "`target`: should be a class by name or index; got false", id="target of no class"
-        ),
+        pytest.param({"target": False}, "`target`: should not be a truth value; got false", id="target of no class"),
+        pytest.param({"epsilon": True}, "`epsilon`: should not be a truth value; got true", id="truth as a number"),
         pytest.param({"background": []}, "`background`: Value should have at least 1 item", id="no background"),
     ],
 )

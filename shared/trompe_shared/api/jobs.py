@@ -12,7 +12,16 @@ from difflib import get_close_matches
 from types import NoneType, UnionType
 from typing import Annotated, Any, Final, Literal, Self, SupportsIndex, TypedDict, Union, Unpack, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic.fields import FieldInfo
 
 from trompe_shared.errors import SpecError
@@ -52,6 +61,14 @@ class Schema(BaseModel):
 
 class _Part(Schema):
     model_config = ConfigDict(frozen=True)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_truth_as_number(cls, given: Any, info: ValidationInfo) -> Any:
+        assert info.field_name is not None
+        if isinstance(given, bool) and cls.model_fields[info.field_name].annotation is not bool:
+            raise ValueError(f"should not be a truth value; got {str(given).lower()}")
+        return given
 
 
 Amount = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
