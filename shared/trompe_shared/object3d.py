@@ -193,9 +193,13 @@ def decode_rgb(data: bytes, name: str) -> Texture:
     Raises ``ObjectError`` with ``name`` for an unreadable file.
     """
     with open_image(data, name) as image:
-        if image.mode.startswith("I;16"):  # Pillow clips these greys instead of scaling them
-            return np.repeat((np.array(image) >> 8).astype(np.uint8)[..., None], 3, axis=2)
-        return np.array(image.convert("RGB"))
+        return _rgb(image)
+
+
+def _rgb(image: Image.Image) -> Texture:
+    if image.mode.startswith("I;16"):  # Pillow clips these greys instead of scaling them
+        return np.repeat((np.array(image) >> 8).astype(np.uint8)[..., None], 3, axis=2)
+    return np.array(image.convert("RGB"))
 
 
 def decode_alpha(data: bytes, name: str) -> Texture | None:
@@ -208,7 +212,7 @@ def roughness_metallic(data: bytes, name: str) -> Texture:
     """Roughness and metallic (H, W, 2) uint8 of a metallic map (``Material``). Raises ``ObjectError``."""
     with open_image(data, name) as image:
         smoothness = np.array(image.getchannel("A")) if "A" in image.getbands() else None
-        metallic = np.array(image.convert("RGB"))[..., 0]
+        metallic = _rgb(image)[..., 0]
     plain = np.full(metallic.shape, round(255 * PLAIN_ROUGHNESS), np.uint8)
     return np.stack([plain if smoothness is None else 255 - smoothness, metallic], axis=-1)
 

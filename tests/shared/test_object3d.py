@@ -17,7 +17,15 @@ from PIL import Image
 from tests.small_models import large_png, zipped
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import pack_zip
-from trompe_shared.object3d import Object3D, decode_rgb, encode_png, load_object, object_from_files, unpack
+from trompe_shared.object3d import (
+    Object3D,
+    decode_rgb,
+    encode_png,
+    load_object,
+    object_from_files,
+    roughness_metallic,
+    unpack,
+)
 from trompe_shared.wavefront import parse_mtl, parse_obj
 
 MESH = """# a triangle
@@ -309,6 +317,7 @@ def test_greys_of_16_bits_are_scaled_to_8_not_clipped(form: str, mode: str) -> N
     assert read.dtype == np.uint8
     assert (read == (grey >> 8)[..., None]).all()
     assert read.shape == (2, 4, 3)
+    assert (roughness_metallic(buffer.getvalue(), "grey.png")[..., 1] == grey >> 8).all()
 
 
 def test_every_file_comes_back_byte_for_byte_and_the_same_content_gives_the_same_bytes() -> None:
