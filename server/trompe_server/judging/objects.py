@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from trompe_server.judging.metrics import difference
 from trompe_shared.api import Finding, TextureChange, levels_within
-from trompe_shared.object3d import Material, Object3D, decode_rgb, open_image
+from trompe_shared.object3d import PLAIN_ROUGHNESS, Material, Object3D, decode_rgb, open_image, roughness_metallic
 
 TOLERANCE: Final = 1e-4
 """Distance of equal corners, as a share of the object's radius, and of equal texture coordinates."""
@@ -33,8 +33,8 @@ LEVELS: Final = 2
 """Difference of a map's levels that conversion between formats may cause."""
 
 FLAT_NORMAL: Final = (128, 128, 255)
-MATT: Final = (0, 0, 0, 26)
-"""Pixel of a material without a map: no metal, roughness 0.9."""
+MATT: Final = (round(255 * PLAIN_ROUGHNESS), 0)
+"""Roughness and metallic of a material without a map."""
 
 Texture = UInt8[np.ndarray, "H W 3"]
 Textures = Mapping[str, Texture]
@@ -293,11 +293,12 @@ def _normal(obj: Object3D, material: Material) -> NDArray[np.uint8]:
 
 
 def _metallic(obj: Object3D, material: Material) -> NDArray[np.uint8]:
-    """Red (metal) and alpha (smoothness)."""
-    if material.metallic is None:
-        return np.array([[MATT]], np.uint8)[..., [0, 3]]
-    with open_image(obj.files[material.metallic], material.metallic) as image:
-        return np.array(image.convert("RGBA"))[..., [0, 3]]
+    """Roughness and metallic, as renderers read them: a map without alpha is matt."""
+    return (
+        np.array([[MATT]], np.uint8)
+        if material.metallic is None
+        else roughness_metallic(obj.files[material.metallic], material.metallic)
+    )
 
 
 def _alpha(obj: Object3D, material: Material) -> NDArray[np.uint8]:

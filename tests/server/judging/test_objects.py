@@ -91,6 +91,16 @@ def lighter(obj: Object3D, *, map_of: str) -> Object3D:
     return replace(obj, files={**obj.files, file: encode_png(np.full((8, 8, 4), 200, np.uint8))})
 
 
+def with_smoothness(obj: Object3D, alpha: int | None) -> Object3D:
+    """The object with one metal and smoothness everywhere; ``None``: a map without alpha."""
+    (material,) = obj.materials.values()
+    assert material.metallic is not None
+    pixel = (0, 0, 0) if alpha is None else (0, 0, 0, alpha)
+    return replace(
+        obj, files={**obj.files, material.metallic: encode_png(np.full((8, 8, len(pixel)), pixel, np.uint8))}
+    )
+
+
 MUG = shipped("mug")
 CHANGES = {
     "another object": (shipped("ball"), "object", "2368 triangles, the second 1728"),
@@ -118,6 +128,13 @@ def test_each_other_difference_is_one_clear_sentence(after: Object3D, kind: str,
     assert re.search(text, found.text)
     comparable = kind == "material" or "shaded" in found.text
     assert bool(pair.textures[0]) == bool(pair.textures[1]) == comparable
+
+
+def test_a_map_without_alpha_is_matt_not_a_mirror() -> None:
+    mirror, matt, plain = (with_smoothness(MUG, alpha) for alpha in (255, 25, None))
+    (found,) = ObjectPair(mirror, plain).findings()
+    assert "metal and smoothness" in found.text
+    assert ObjectPair(matt, plain).findings() == []
 
 
 def test_triangles_that_keep_their_layout_keep_their_figures() -> None:
