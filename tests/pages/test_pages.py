@@ -113,6 +113,7 @@ def test_nothing_is_submitted_before_the_file_that_was_picked_last_is_stored(ser
     held[1].continue_()
     expect(page.locator("#file-says")).to_contain_text("mug: ")
     expect(submit).to_be_enabled()
+    expect(page.locator("[name='goal.label']")).to_have_value("")  # not that of the object before
 
 
 def test_a_form_to_which_one_returns_shows_the_object_that_it_submits(service: Service, page: Page) -> None:

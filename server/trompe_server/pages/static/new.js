@@ -24,12 +24,14 @@ async function take(picked) {
 }
 
 const turntable = new Turntable(form.querySelector(".turntable"));
+let suggested = "";
 async function chosen() {
-  const known = object.selectedOptions[0]?.dataset.label;
-  if (known && known !== label.value) {
+  const known = object.selectedOptions[0]?.dataset.label ?? "";
+  if (known !== label.value && (known || label.value === suggested)) { // the shipped object's label goes with it
     label.value = known;
     for (const more of [...form.querySelectorAll(`[name='${label.name}']`)].slice(1)) more.remove();
   }
+  suggested = known;
   const asked = { background: option("views.background").value };
   if (option("views.distance").value) asked.distance = option("views.distance").value;
   if (option("views.renderers")) asked.renderer = option("views.renderers").value;
