@@ -27,7 +27,7 @@ from PIL import Image, UnidentifiedImageError
 
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import base_name, files_of, libraries, named, pack_zip, text_of
-from trompe_shared.wavefront import Part, dissolve, parse_mtl, parse_obj
+from trompe_shared.wavefront import Part, beyond_edges, dissolve, parse_mtl, parse_obj
 
 MAX_ARCHIVE_BYTES: Final = 512 * 2**20
 MAX_MEMBERS: Final = 256
@@ -398,7 +398,7 @@ def _materials(files: Mapping[str, bytes], parts: Collection[Part]) -> dict[str,
 
 def _check_clamped(material: str, uvs: Collection[NDArray[np.float32]]) -> None:
     """Raise ``ObjectError`` unless all coordinates of a texture that does not repeat are within [0, 1]."""
-    if any(each.min() < -1e-3 or each.max() > 1 + 1e-3 for each in uvs):
+    if any(map(beyond_edges, uvs)):
         raise ObjectError(
             f"Material {material!r} clamps its texture beyond the edges (-clamp on), which is not supported; use "
             "texture coordinates (vt) within [0, 1], or delete the option to repeat the texture."

@@ -269,6 +269,11 @@ def _statements(parts: tuple[Part, ...], libraries: Iterable[str]) -> Iterator[s
         first += len(part.vertices)
 
 
+def beyond_edges(uvs: NDArray[np.float32]) -> bool:
+    """Whether texture coordinates (V, 2) leave [0, 1], so that it matters how a texture goes on there."""
+    return bool(uvs.min() < -1e-3 or uvs.max() > 1 + 1e-3)
+
+
 def parse_mtl(text: str) -> dict[str, dict[str, str]]:
     """Maps of each material of an MTL text: ``{name: {"albedo": file, "normal": file}}``, files without folders.
 

@@ -12,7 +12,7 @@ from trompe_server.formats.gltf_container import Container, at
 from trompe_server.formats.gltf_schema import Document, Node, Primitive, TextureInfo, UvTransform
 from trompe_server.formats.unwrap import Unwrapped
 from trompe_shared.errors import ObjectError
-from trompe_shared.wavefront import MAX_FACES, Part
+from trompe_shared.wavefront import MAX_FACES, Part, beyond_edges
 
 Matrix = NDArray[np.float64]
 
@@ -201,7 +201,7 @@ def _moved(uvs: NDArray[np.float32], transform: UvTransform) -> NDArray[np.float
 
 def _check_wrapping(document: Document, what: str, maps: Sequence[TextureInfo], uvs: NDArray[np.float32]) -> None:
     """Raise ``ObjectError`` for wrapping other than repetition, unless all coordinates are within [0, 1]."""
-    if uvs.min() >= -1e-3 and uvs.max() <= 1 + 1e-3:
+    if not beyond_edges(uvs):
         return
     for info in maps:
         texture = at(document.textures, info.index, "texture")
