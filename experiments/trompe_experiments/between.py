@@ -32,7 +32,7 @@ def between_chart(rows: Sequence[ResultRow]) -> Drawing:
                 axes.plot(fmean(drops or [nan]), place + shift, ms=8, mec="white", mew=0.6, label=label, **style)
         axes.set_yticks(range(len(places)), places)
         axes.invert_yaxis()
-        axes.set_xlim(0, 1)
+        axes.set_xlim(min(0, axes.dataLim.x0), 1)
         axes.set_xlabel("A_drop on held-out views (share)")
         axes.set_ylabel("in between")
         made.figure.legend(loc="outside lower center", ncols=len(attacks))
