@@ -78,7 +78,7 @@ class Geometry:
     reads: for each mip level in the layout's order, the texels read by any view, in the order of the first read, so
     that neighbours in an image are neighbours in memory. Concatenated they are the operators' ``texels``.
     areas: the same views with mip levels, whose reads say what part of the texture a pixel shows, if ``sampling`` reads
-    single texels instead; otherwise ``None``.
+    single texels instead; otherwise ``None``. Those of a pixel, not of its sub-pixels.
     """
 
     textures: tuple[str, ...]
@@ -191,9 +191,9 @@ def prepare_geometry(
     )
     areas = None
     if sampling.minified != "mipmaps":
-        areas = prepare_geometry(
-            obj, views, size=size, sampling=sampling.but(minified="mipmaps"), device=device, known=known
-        )
+        whole = sampling.subdivision == 1
+        shown = sampling.but(minified="mipmaps", samples=sampling.samples if whole else "centre")
+        areas = prepare_geometry(obj, views, size=size, sampling=shown, device=device, known=known if whole else None)
     return Geometry(mesh.textures, layout, reads, sampling, size, batches, areas)
 
 

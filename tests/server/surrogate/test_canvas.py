@@ -205,9 +205,10 @@ def test_the_mip_levels_that_views_hardly_read_are_spare(fine: Object3D) -> None
     assert joined([surrogate, of_blocks(fine, bias=-2.0)]).spare_levels[names[0]] == spare - 2
 
 
-@pytest.mark.parametrize("minified", ["linear", "nearest"])
-def test_texels_without_mip_levels_move_with_what_a_pixel_shows(fine: Object3D, minified: str) -> None:
-    usual, surrogate, names = of_blocks(fine), of_blocks(fine, minified=minified), sorted(fine.textures)
+@pytest.mark.parametrize(("minified", "samples"), [("linear", "msaa4"), ("nearest", "msaa4"), ("nearest", "grid")])
+def test_texels_without_mip_levels_move_with_what_a_pixel_shows(fine: Object3D, minified: str, samples: str) -> None:
+    usual = of_blocks(fine, samples="centre" if samples == "grid" else samples)  # not what a sub-pixel shows
+    surrogate, names = of_blocks(fine, minified=minified, samples=samples), sorted(fine.textures)
     assert not any(map(len, surrogate.geometry.reads[1:9]))
     assert all(torch.equal(surrogate.influence()[name], weight) for name, weight in usual.influence().items())
     shares = usual.level_weights[names[0]].cumsum(0) / usual.level_weights[names[0]].sum()
