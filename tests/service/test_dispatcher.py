@@ -1,7 +1,9 @@
 """The dispatcher on the fake executor: leases, losses, and executors that fail."""
 
+import errno
 import os
 import signal
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,7 +22,7 @@ from trompe_server.queue.claims import START_ALLOWANCE, Claim, Claims
 from trompe_server.queue.tables import events, jobs
 from trompe_server.renderers.discovery import RendererAddresses
 from trompe_server.settings import Settings
-from trompe_server.storage.database import write
+from trompe_server.storage.database import DatabaseDownError, write
 from trompe_shared.api import JobState
 
 
@@ -104,11 +106,17 @@ def test_no_attempt_is_lost_when_the_clock_is_set(executed: Executed, hours: int
         assert executed.state(job).attempts == 1
 
 
-def test_a_dispatcher_that_fails_by_a_mistake_says_so_until_it_works(executed: Executed) -> None:
-    open_executor = Mock(side_effect=[FileExistsError(17, "File exists", "metrics"), executed.open()])
-    ours, _ = dispatcher(executed, open_executor)
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (FileExistsError(17, "File exists", "metrics"), "FileExistsError"),
+        (DatabaseDownError("The database is not available (database or disk is full)."), "disk is full"),
+    ],
+)
+def test_a_dispatcher_that_fails_says_so_until_it_works(executed: Executed, error: Exception, told: str) -> None:
+    ours, _ = dispatcher(executed, Mock(side_effect=[error, executed.open()]))
     with ours.running():
-        assert "FileExistsError" in (ours.fault or "")
+        assert told in (ours.fault or "")
         wait_until(lambda: ours.fault is None)
 
 
@@ -212,8 +220,15 @@ def test_a_stop_does_not_wait_for_a_process_that_is_starting(tmp_path: Path, mon
     started.set()
 
 
-def test_a_data_folder_keeps_its_dispatcher_s_name_and_lends_it_to_one(tmp_path: Path) -> None:
+def test_a_data_folder_keeps_its_dispatcher_s_name_and_lends_it_to_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with dispatcher_name(tmp_path) as first, dispatcher_name(tmp_path) as second:
         assert first != second
     with dispatcher_name(tmp_path) as again:
         assert again == first
+    (tmp_path / "dispatcher").write_bytes(b"")
+    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+    monkeypatch.setattr(tempfile, "mkstemp", full)
+    with pytest.raises(ServiceError, match=f"no space left at {tmp_path}"), dispatcher_name(tmp_path):
+        pass

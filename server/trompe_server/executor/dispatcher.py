@@ -16,7 +16,7 @@ from trompe_server.queue.claims import Claim, Claims, LostJobError
 from trompe_server.queue.leases import DISPATCHER, end_lease, take_lease
 from trompe_server.queue.workers import forget_workers, record_workers
 from trompe_server.storage.database import DatabaseDownError
-from trompe_server.system.files import exclusive
+from trompe_server.system.files import exclusive, write_whole
 
 logger = logging.getLogger(__name__)
 
@@ -87,6 +87,7 @@ class Dispatcher:
         except DatabaseDownError as error:
             self._heard_since = self._clock()
             logger.warning("%s Retrying.", error)
+            self.fault = str(error)
             return RETRY
         except ServiceError as error:
             self._abandon(str(error))
@@ -213,7 +214,7 @@ def dispatcher_name(folder: Path) -> Iterator[str]:
             return
         name = file.read_text() if file.exists() else ""
         if not name:
-            file.write_text(name := _new_name())
+            write_whole(file, (name := _new_name()).encode())
         yield name
 
 
