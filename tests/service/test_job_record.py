@@ -539,3 +539,12 @@ def test_tables_of_another_version_are_refused_and_stay(store: JobStore, stateme
     with pytest.raises(ServiceError, match=message):
         store.migrate()
     assert store.get(job).id == job
+
+
+def test_a_database_that_lost_a_table_is_not_available_and_not_up_to_date(store: JobStore) -> None:
+    with write(store.engine) as connection:
+        connection.exec_driver_sql("DROP TABLE job_labels")
+    with pytest.raises(DatabaseDownError, match="job_labels"):
+        store.page(labels={"a": "1"})
+    with pytest.raises(ServiceError, match="lacks the tables job_labels: restore a backup"):
+        store.migrate()

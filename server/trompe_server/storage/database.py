@@ -11,7 +11,15 @@ from typing import Any, Final
 
 import sqlalchemy as sa
 from sqlalchemy.engine.interfaces import ExceptionContext
-from sqlalchemy.exc import ArgumentError, DatabaseError, DataError, InterfaceError, InternalError, OperationalError
+from sqlalchemy.exc import (
+    ArgumentError,
+    DatabaseError,
+    DataError,
+    InterfaceError,
+    InternalError,
+    OperationalError,
+    ProgrammingError,
+)
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 
@@ -101,8 +109,9 @@ def _translate(context: ExceptionContext) -> BaseException | None:
         return None  # the pool replaces a broken connection
     words = (str(context.original_exception).strip().splitlines() or [type(context.original_exception).__name__])[0]
     damaged = type(error) is DatabaseError  # SQLite's file; its subclasses mean other things
-    # PostgreSQL's InternalError: it only reads, as a standby or for want of space
-    if damaged or context.is_disconnect or isinstance(error, (OperationalError, InterfaceError, InternalError)):
+    # PostgreSQL's InternalError: it only reads, as a standby or for want of space; ProgrammingError: no such table
+    away = (OperationalError, InterfaceError, InternalError, ProgrammingError)
+    if damaged or context.is_disconnect or isinstance(error, away):
         return DatabaseDownError(f"The database is not available ({words}).")
     if isinstance(error, DataError):
         return SpecError(f"The database cannot hold such a value ({words}); use text without NUL characters.")

@@ -7,6 +7,7 @@ from typing import Final
 import sqlalchemy as sa
 
 from trompe_server.errors import ServiceError
+from trompe_server.queue.tables import metadata
 from trompe_server.storage.database import write
 
 __all__ = ["HEAD", "upgrade"]
@@ -20,13 +21,18 @@ _LOCK: Final = 0x74726F6D7065
 def upgrade(engine: sa.Engine) -> None:
     """Bring the database to revision ``HEAD``. On SQLite also switch the file to WAL mode, permanently.
 
-    Raises ``ServiceError`` for a database of version 0.1 or of a newer version.
+    Raises ``ServiceError`` for a database of version 0.1 or of a newer version, and for one that has lost tables.
     """
     if engine.dialect.name == "sqlite":
         with engine.connect() as connection:
             connection.exec_driver_sql("PRAGMA journal_mode=WAL")
     with engine.connect() as connection:
         if _revision(connection) == HEAD:
+            if missing := sorted(metadata.tables.keys() - set(sa.inspect(connection).get_table_names())):
+                raise ServiceError(
+                    f"{engine.url!r} lacks the tables {', '.join(missing)}: restore a backup, or choose another "
+                    "--data or --database."
+                )
             return
     with write(engine) as connection:
         if engine.dialect.name == "postgresql":
