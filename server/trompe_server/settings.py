@@ -45,7 +45,7 @@ class Settings(BaseSettings):
     """Seconds without a heartbeat after which an attempt, or the dispatcher, counts as dead and is replaced."""
     retention_days: Annotated[float, Field(ge=0)] = 0.0
     """Days after which ended jobs, their artifacts and unused calibrations are deleted; 0 keeps them."""
-    device: str = "cpu"
+    device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")] = "cpu"
     """Device of the attack workers, by torch's name: cpu, cuda, cuda:1."""
     workers: Annotated[int, Field(ge=0, le=64)] = 1
     """Attack workers of this machine; they share the cores. 0: ``serve`` leaves the jobs to a ``trompe worker``."""

@@ -76,6 +76,7 @@ def test_serve_says_what_is_wrong_with_the_data_folder(tmp_path: Path) -> None:
     [
         ("TROMPE_WORKERS", "many", "workers: Input should be a valid integer, unable to parse"),
         ("TROMPE_NETWORKS", "tiny", "networks: 'tiny' is not a JSON list"),
+        ("TROMPE_DEVICE", "gpu", r"device: String should match pattern '\^\(cpu\|cuda\(:\\d\+\)\?\)\$'"),
         ("TROMPE_MAX_UPLOAD", "-1", "max_upload: Input should be greater than 0"),
         ("TROMPE_SILENCE", "inf", "silence: Input should be less than or equal to 86400"),
         ("TROMPE_RENDERER_PATIENCE", "nan", "renderer_patience: Input should be greater than or equal to 0"),
