@@ -52,19 +52,20 @@ class _Repainting:
         if slot.unwrapped is not None:
             self._wrap(rgb)
         elif image is None:
-            self._point_to(self._editor.add_texture(with_alpha_of(rgb, None), {}))
+            self._point_to(self._editor.add_texture(self._editor.add_image(with_alpha_of(rgb, None))))
         else:
             png = with_alpha_of(rgb, decode_alpha(self._model.container.image_bytes(image), "the image"))
             if self._editor.serves_only(image, self._materials):
                 self._editor.replace_image(image, png)
                 self._point_to(None)
             else:
-                self._point_to(self._editor.add_texture(png, self._texture_entry()))
+                self._point_to_copies(self._editor.add_image(png))
 
-    def _texture_entry(self) -> Json:
-        material = self._editor.document["materials"][self._materials[0]]
-        index = material["pbrMetallicRoughness"]["baseColorTexture"]["index"]
-        return dict(self._editor.document["textures"][index])
+    def _point_to_copies(self, image: int) -> None:
+        """Point each of the slot's materials to ``image``, sampled as its present texture."""
+        for material in (self._editor.document["materials"][index] for index in self._materials):
+            texture = self._editor.document["textures"][material["pbrMetallicRoughness"]["baseColorTexture"]["index"]]
+            self._paint(material, self._editor.add_texture(image, sampled_like=texture))
 
     def _point_to(self, texture: int | None) -> None:
         """Point the slot's materials to ``texture`` (``None``: the present one) with a factor of 1."""
@@ -101,7 +102,7 @@ class _Repainting:
         own = slot.unwrapped is not None and slot.unwrapped >= 0
         material = copy.deepcopy(document["materials"][slot.unwrapped]) if own else {}
         mapped = any(_texture_uses(material, ""))
-        texture = self._editor.add_texture(with_alpha_of(rgb, None), {})
+        texture = self._editor.add_texture(self._editor.add_image(with_alpha_of(rgb, None)))
         self._paint(material, texture)
         index = self._editor.add("materials", material)
         wanted = slot.unwrapped if own else None
@@ -192,15 +193,19 @@ class _Editor(Writer):
             if other.get("byteOffset", 0) >= end:
                 other["byteOffset"] += shift
 
-    def add_texture(self, png: bytes, entry: Json) -> int:
-        """Add a texture with a new image, sampled like the texture ``entry``; return its number."""
+    def add_texture(self, image: int, *, sampled_like: Json | None = None) -> int:
+        """Add a texture of an image, with the sampler of the texture ``sampled_like``; return its number."""
+        kept = {key: value for key, value in (sampled_like or {}).items() if key == "sampler"}
+        return self.add("textures", kept | {"source": image})
+
+    def add_image(self, png: bytes) -> int:
+        """Add an image; return its number."""
         image: Json = {"mimeType": "image/png"}
         if self._container.binary:
             image["bufferView"] = self.add_view(png)
         else:
             image["uri"] = _data_uri(png, "image/png")
-        kept = {key: value for key, value in entry.items() if key == "sampler"}
-        return self.add("textures", kept | {"source": self.add("images", image)})
+        return self.add("images", image)
 
     def cut_open(self, primitive: Json, shape: Shape, cut: Unwrapped) -> None:
         """Split a primitive's vertices at the seams and add the texture coordinates of its paint."""

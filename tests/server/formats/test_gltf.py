@@ -405,6 +405,19 @@ def test_an_image_that_is_more_than_a_base_colour_is_left_alone() -> None:
     assert (decode_rgb(seen_through(view, chunk), "x") == GRADIENT).all()
 
 
+def test_a_new_image_is_sampled_in_each_material_as_the_old_one() -> None:
+    scene = textured()
+    samplers = [scene.add("samplers", {"wrapS": wrap, "wrapT": wrap}) for wrap in (33071, 10497)]
+    scene.document["textures"][0]["sampler"] = samplers[0]
+    again = scene.add("textures", {"source": 0, "sampler": samplers[1]})
+    scene.square(scene.material(again, emissiveTexture={"index": 0}), uvs=3 * UVS)
+    new, out = painted_over(beside(scene))
+    same_paint(read(out), new)
+    document, _ = contents(out)
+    assert [texture["sampler"] for texture in document["textures"]] == 2 * samplers
+    assert len(document["images"]) == 2
+
+
 def test_colours_of_the_older_kind_go_with_the_first_paint() -> None:
     older = "KHR_materials_pbrSpecularGlossiness"
     scene = textured(extensions={older: {"diffuseTexture": {"index": 0}}, "other": {}})
