@@ -62,15 +62,21 @@ def test_a_wrong_file_and_a_wrong_class_are_told_in_the_servers_words(
     drop(page, file)
     expect(page.locator('[data-error="object"]')).to_contain_text("zip")
     expect(page.locator("#file-says")).to_contain_text("refused")
-    for place, field, told in (
-        ("#file", "object", "zip"),
-        ("#classifier-file", "victim.classifier", "not a supported classifier"),
+    page.fill("[name='goal.label']", "mug")
+    for place, field, told, epsilon in (
+        ("#file", "object", "zip", "0.1"),
+        ("#classifier-file", "victim.classifier", "not a supported classifier", "0.2"),
     ):
         page.set_input_files(place, file)
         expect(page.locator(f'[data-error^="{field}"]')).to_contain_text(told)
-        page.wait_for_timeout(1500)  # the form is checked meanwhile
+        with page.expect_response("**/v1/jobs/check"):
+            page.fill("[name='paint.epsilon']", epsilon)
+        page.wait_for_timeout(500)  # for the answer's effect
         expect(page.locator(f'[data-error^="{field}"]')).to_be_visible()
     expect(page.locator('[data-error="object"]')).to_be_visible()
+    page.select_option("[name=object]", "mug")
+    page.select_option("[name='victim.classifier']", "tiny")
+    expect(page.locator(".error:visible")).to_have_count(0)
 
     for label, told in (("", "Field required"), ("elephant", "elephant")):
         page.fill("[name='goal.label']", label)

@@ -11,19 +11,22 @@ function keyOf(body) {
   return keys.get(body);
 }
 
-// Show the faults of an error, or none. Those of an upload (`own`: its place) leave what is told of others.
+// Show the faults of an error, or none. Those of an upload (`own`: its place) leave what is told of others, and stay
+// until another file is stored or chosen.
 export function complain(error, own = "") {
   for (const place of form.querySelectorAll("[data-error]")) {
-    const { error: names } = place.dataset;
-    if (!own || !names || names.split(" ").includes(own)) place.hidden = true;
+    const { error: names, refused } = place.dataset;
+    if (own ? !names || names.split(" ").includes(own) : !refused) place.hidden = true;
   }
   if (!error) return;
+  if (own) form.elements[own].addEventListener("change", () => complain(null, own), { once: true });
   const faults = error.problem?.errors ?? [{ field: own, message: words(error) }];
   for (const { field, message } of faults) {
     const known = [...form.querySelectorAll("[data-error]")].find(
       (each) => each.dataset.error && each.dataset.error.split(" ").some((name) => `${field}.`.startsWith(`${name}.`) || name.startsWith(`${field}.`)));
     const place = known ?? form.querySelector('[data-error=""]');
     place.textContent = known || !field ? message : `${field}: ${message}`;
+    place.dataset.refused = own;
     place.hidden = false;
   }
 }
