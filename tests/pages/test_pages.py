@@ -413,6 +413,7 @@ def test_the_picture_of_an_object_that_is_no_longer_chosen_is_not_shown(service:
     expect(drawn).to_be_visible()
     held = held_back(page, "**/turntable/ball.png*")
     page.select_option("[name=object]", "ball")
+    assert not turntables(page)[0].any(), "nor that of the object before, while it is drawn"
     page.select_option("[name=object]", "mug")
     expect(drawn).to_be_visible()
     (shown,) = turntables(page)

@@ -11,6 +11,8 @@ export class Turntable {
     const path = `/jobs/turntable/${encodeURIComponent(reference)}.png?${new URLSearchParams(options)}`;
     this.path = path;
     this.caption.textContent = "The target renderer is drawing it.";
+    this.picture = null;
+    this.turn();
     const answer = await fetch(path).catch(() => null);
     const picture = answer?.ok ? await createImageBitmap(await answer.blob()) : null;
     const says = picture ? "In the target renderer" : `No picture: ${await reason(answer)}`;
