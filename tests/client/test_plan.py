@@ -143,6 +143,14 @@ def test_a_background_is_a_colour_or_a_picture_file(tmp_path: Path) -> None:
         ),
         pytest.param({"target": False}, "`target`: should not be a truth value; got false", id="target of no class"),
         pytest.param({"epsilon": True}, "`epsilon`: should not be a truth value; got true", id="truth as a number"),
+        pytest.param(
+            {"ranges": {"intensity": [True, 2]}},
+            "`ranges` intensity.*: should not be a truth value",
+            id="truth as an end",
+        ),
+        pytest.param(
+            {"elevation": [False, 9]}, "`elevation`.*: should not be a truth value; got f", id="truth as angle"
+        ),
         pytest.param({"background": []}, "`background`: Value should have at least 1 item", id="no background"),
     ],
 )

@@ -39,8 +39,17 @@ Labels = Annotated[
     ],
     Field(max_length=32, description="labels of your own, to find jobs by"),
 ]
-Range = tuple[float, float]
-Channel = Annotated[int, Field(ge=0, le=255)]
+
+
+def _no_truth(given: Any) -> Any:
+    if isinstance(given, bool):
+        raise ValueError(f"should not be a truth value; got {str(given).lower()}")
+    return given
+
+
+Number = Annotated[float, BeforeValidator(_no_truth)]
+Range = tuple[Number, Number]
+Channel = Annotated[int, Field(ge=0, le=255), BeforeValidator(_no_truth)]
 Colour = tuple[Channel, Channel, Channel]
 
 PAPER_AZIMUTHS: Final = 6
@@ -66,9 +75,7 @@ class _Part(Schema):
     @classmethod
     def _no_truth_as_number(cls, given: Any, info: ValidationInfo) -> Any:
         assert info.field_name is not None
-        if isinstance(given, bool) and cls.model_fields[info.field_name].annotation is not bool:
-            raise ValueError(f"should not be a truth value; got {str(given).lower()}")
-        return given
+        return given if cls.model_fields[info.field_name].annotation is bool else _no_truth(given)
 
 
 Amount = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
