@@ -71,6 +71,11 @@ def attack_object(
         raise SpecError(f"Unknown image pipeline {image_pipeline!r}; choose one of {', '.join(SAFE_MARGINS)}.")
     if seed < 0:
         raise SpecError(f"`seed` must be 0 or more, got {seed}.")
+    if steps < 1:
+        raise SpecError(f"`steps` must be 1 or more, got {steps}.")
+    for name, given in (("views", views), ("held_out", held_out)):
+        if given is not None and not isinstance(given, Sequence):
+            raise SpecError(f"`{name}` must be a list of views, got {given!r}; ViewDistribution.sample draws some.")
     if views is not None and not len(views):
         raise SpecError("There are no `views` to attack: give at least one, or leave `views` out for random ones.")
     obj = obj if isinstance(obj, Object3D) else _load(obj)

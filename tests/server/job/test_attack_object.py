@@ -74,6 +74,9 @@ def test_images_of_another_kind_are_refused_in_words(change: Callable[[Any], Any
     [
         pytest.param({"held_out": [replace(VIEWS[0], backdrop="sea")]}, "picture behind the object", id="backdrop"),
         pytest.param({"views": []}, "no `views` to attack: give at least one", id="views"),
+        pytest.param({"views": 6}, "`views` must be a list of views, got 6", id="number of views"),
+        pytest.param({"held_out": 6}, "`held_out` must be a list of views, got 6", id="number of held-out views"),
+        pytest.param({"steps": 0}, "`steps` must be 1 or more, got 0", id="steps"),
         pytest.param({"image_pipeline": "strong"}, "'strong'; choose one of none, robust, transfer", id="pipeline"),
         pytest.param({"seed": -1}, "`seed` must be 0 or more, got -1", id="seed"),
     ],
