@@ -125,14 +125,16 @@ class Object3D:
         return self.materials[part.material].albedo
 
     def with_textures(self, textures: Mapping[str, Texture]) -> "Object3D":
-        """The same object with some albedo images replaced, (H, W, 3) uint8 of any size; alpha stays.
+        """The same object with some albedo images replaced, (H, W, 3) uint8 of any size; alpha stays, and each file of
+        equal pixels.
 
         Raises ``ObjectError`` for a name that is not one of this object's albedo textures.
         """
         unknown = sorted(set(textures) - set(self.textures))
         if unknown:
             raise ObjectError(f"{unknown} are not albedo textures of {self.name!r}; it has {sorted(self.textures)}.")
-        painted = {name: with_alpha_of(image, decode_alpha(self.files[name], name)) for name, image in textures.items()}
+        new = {name: image for name, image in textures.items() if not np.array_equal(image, self.textures[name])}
+        painted = {name: with_alpha_of(image, decode_alpha(self.files[name], name)) for name, image in new.items()}
         return replace(self, files={**self.files, **painted}, textures={**self.textures, **textures})
 
     def to_zip(self) -> bytes:

@@ -109,7 +109,7 @@ DOORS: dict[str, tuple[type[TrompeError], Callable[[bytes], object]]] = {
     "what alpha is read from": (ObjectError, opacity_of),
     "what is painted over": (
         ObjectError,
-        lambda data: smuggled(albedo=data).with_textures({"albedo.png": np.zeros((SIDE, SIDE, 3), np.uint8)}),
+        lambda data: smuggled(albedo=data).with_textures({"albedo.png": np.full((SIDE, SIDE, 3), 9, np.uint8)}),
     ),
     "what is written as GLB": (ObjectError, lambda data: write_glb(smuggled(metallic=data))),
     "a view that a renderer shows": (ProtocolError, lambda data: _picture(data, (SIDE, SIDE))),

@@ -346,6 +346,13 @@ def test_a_repainted_object_differs_in_its_albedo_file_alone_and_no_other_file_c
         obj.with_textures({"readme.txt": PAINT})
 
 
+def test_a_texture_of_equal_pixels_keeps_its_file() -> None:
+    jpeg = io.BytesIO()
+    Image.fromarray(PAINT).save(jpeg, "JPEG")
+    obj = object_from_files(with_files(paint__png=jpeg.getvalue()))
+    assert obj.with_textures(obj.textures).files == obj.files
+
+
 @pytest.mark.parametrize("mode", ["RGBA", "LA"])
 def test_a_repainted_texture_keeps_its_opacity_and_may_change_its_size(mode: str) -> None:
     alpha = np.arange(24, dtype=np.uint8).reshape(4, 6) * 10
