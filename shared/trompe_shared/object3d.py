@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import base_name, files_of, libraries, named, pack_zip, text_of
@@ -176,6 +176,12 @@ def open_image(data: bytes, name: str) -> Iterator[Image.Image]:
             if max(image.size) > MAX_TEXTURE_SIDE:
                 raise ObjectError(
                     f"Texture {name!r} is {image.size} pixels; at most {MAX_TEXTURE_SIDE} a side are read."
+                )
+            orientation = image.getexif().get(ExifTags.Base.Orientation, 1) if image.format == "JPEG" else 1
+            if orientation in range(2, 9):
+                raise ObjectError(
+                    f"Picture {name!r} is stored turned (EXIF orientation {orientation}), which programs treat "
+                    "differently; save it upright."
                 )
             yield image
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:

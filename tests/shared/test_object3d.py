@@ -5,14 +5,16 @@ import json
 import tracemalloc
 import zipfile
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import ExifTags, Image
 
 from tests.small_models import large_png, zipped
 from trompe_shared.errors import ObjectError
@@ -305,6 +307,17 @@ def test_images_of_every_mode_are_read_as_rgb(mode: str) -> None:
 
 
 # What comes back
+
+
+@pytest.mark.parametrize(
+    ("orientation", "refused"), [(1, nullcontext()), (6, pytest.raises(ObjectError, match="turned"))]
+)
+def test_a_photograph_that_some_programs_turn_is_refused(orientation: int, refused: Any) -> None:
+    exif, jpeg = Image.Exif(), io.BytesIO()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(PAINT).save(jpeg, "JPEG", exif=exif)
+    with refused:
+        assert decode_rgb(jpeg.getvalue(), "photo.jpg").shape == PAINT.shape
 
 
 @pytest.mark.parametrize(("form", "mode"), [("PNG", "I;16"), ("TIFF", "I;16"), ("TIFF", "I;16B")])
