@@ -103,6 +103,9 @@ def _header(data: bytes) -> _Header:
     if found is None:
         raise ObjectError("The PLY file has no complete header; save it again.")
     text = found[0].replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if b" red\n" not in text:
+        for name in (b"red", b"green", b"blue"):
+            text = re.sub(rb"^(property +\w+ +)(?:diffuse_%s|%s)$" % (name, name[:1]), rb"\1" + name, text, flags=re.M)
     rows = sum(int(element[2]) for element in ELEMENT.finditer(text))
     if rows > 3 * MAX_FACES:
         raise ObjectError(f"The PLY's header announces {rows} rows; at most {3 * MAX_FACES} are read.")
@@ -225,11 +228,13 @@ def _floats(values: Any) -> NDArray[np.float32] | None:
 
 
 def _colours(values: Any) -> NDArray[np.float32] | None:
-    """Colours (V, 3) in [0, 1] of integers, or of floats up to 1 or up to 255."""
+    """Colours (V, 3) in [0, 1] of integers up to 255 or of 16 bits, or of floats up to 1 or up to 255."""
     colours = _floats(values)
     if colours is None:
         return None
-    return np.nan_to_num(colours[:, :3] / 255 if values.dtype.kind in "iu" else in_unit(colours[:, :3]))
+    if values.dtype.kind in "iu":
+        return colours[:, :3] / np.float32(255 if values.max(initial=0) <= 255 else 65535)
+    return np.nan_to_num(in_unit(colours[:, :3]))
 
 
 def _check_faces(faces: NDArray[np.int64], count: int) -> None:

@@ -544,16 +544,18 @@ def test_normals_of_a_ply_are_smooth_across_the_seams_of_its_texture() -> None:
     np.testing.assert_allclose(np.abs(part.normals[ridge]), np.tile([0, 1, 0], (4, 1)), atol=1e-6)
 
 
+@pytest.mark.parametrize("columns", ["red green blue", "diffuse_red diffuse_green diffuse_blue", "r g b"])
 @pytest.mark.parametrize(
-    ("scale", "kind"), [(1, "float"), (255, "float"), (255, "uchar"), (1, "double"), (1.0000001, "double")]
+    ("scale", "kind"),
+    [(1, "float"), (255, "float"), (255, "uchar"), (65535, "ushort"), (1, "double"), (1.0000001, "double")],
 )
-def test_colours_of_a_ply_are_those_of_its_numbers(scale: float, kind: str) -> None:
-    rows = ", ".join(f"{point} {scale} 0 0" for point in SQUARE.split(", "))
-    data = ply(rows, "4 0 1 2 3", columns="red green blue")
-    for name in (b"red", b"green", b"blue"):
+def test_colours_of_a_ply_are_those_of_its_numbers(scale: float, kind: str, columns: str) -> None:
+    rows = ", ".join(f"{point} {scale} {scale * 3 // 5} 0" for point in SQUARE.split(", "))
+    data = ply(rows, "4 0 1 2 3", columns=columns)
+    for name in columns.encode().split():
         data = data.replace(b"float " + name, kind.encode() + b" " + name)
     (image,) = read_object(data, name="t.ply").obj.textures.values()
-    assert np.unique(image.reshape(-1, 3), axis=0).tolist() == [[255, 0, 0]]
+    assert np.unique(image.reshape(-1, 3), axis=0).tolist() == [[255, 153 if scale > 2 else 0, 0]]
 
 
 @pytest.mark.parametrize("file_type", ["stl", "stl_ascii"])
