@@ -109,6 +109,16 @@ def turned(light: WorldLight, matrix: Levels) -> WorldLight:
     return replace(light, direction=(x, y, z))
 
 
+def tinted(change: Callable[[Levels], Levels]) -> Fault:
+    """Lights of another colour; 0 to 255 in, 0 to 1 out."""
+
+    def other(light: WorldLight, _: Snapshot) -> WorldLight:
+        red, green, blue = np.round(255 * change(np.array(light.color, float))).astype(int).tolist()
+        return replace(light, color=(red, green, blue))
+
+    return lit(other)
+
+
 def encoded(light: Levels) -> Levels:
     return 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.clip(light, 1e-9, None) ** (1 / 2.4) - 0.055)
 
@@ -331,7 +341,12 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "headlight": ("light follows camera", lit(headlight)),
     "no light": ("light missing", lit(lambda light, _: replace(light, intensity=0.0))),
     "constant light": ("light intensity", lit(lambda light, _: replace(light, intensity=0.6))),
-    "white light": ("light colour", lit(lambda light, _: replace(light, color=(255, 255, 255)))),
+    "pi times as strong": ("light balance", lit(lambda light, _: replace(light, intensity=np.pi * light.intensity))),
+    "divided by pi": ("light balance", lit(lambda light, _: replace(light, intensity=light.intensity / np.pi))),
+    "white light": ("light colour", tinted(np.ones_like)),
+    "BGR light": ("light colour", tinted(lambda levels: levels[::-1] / 255)),
+    "light colour decoded": ("light colour", tinted(linear)),
+    "light colour encoded": ("light colour", tinted(lambda levels: encoded(levels / 255) / 255)),
     "a sky of its own": ("extra light", aimed(lambda world, *_: replace(world, ambient=(world.ambient[0] + 0.2,) * 3))),
     "textures as they are without lights": (
         "not shaded",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trompe_renderer.check.findings import FINAL, Finding, fault, ok, warning
-from trompe_renderer.check.measures import Blob, Picture, blob, border, level, median, patterns, positions
+from trompe_renderer.check.measures import FAINT, Blob, Picture, blob, border, level, median, patterns, positions
 from trompe_renderer.check.probes import FACES, RINGS, TEXTURE, ball, chart, cube, disc, plain, plate
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View, spherical
@@ -414,6 +414,10 @@ TOLERANCE: Final = 30.0
 """Degrees by which the brightest direction may differ from the light's."""
 
 
+AMBIENT: Final = 0.6
+TINT: Final = (255, 40, 40)
+TINTED: Final = 16.0
+"""Levels by which a tinted light may differ from a white one that is as strong in a channel, as by a film's curve."""
 FAINT_LIGHT: Final = 0.001
 """Intensity of a light that shows nothing, but is there."""
 
@@ -422,7 +426,7 @@ def light(look: _Look, _: EngineInfo) -> Findings:
     """A white ball in ambient light alone, in none, and in directional light alone from two sides."""
     soft, faint, unlit = (
         look.at(BALL, _lit(Light(intensity=intensity, ambient=ambient), SIDES[0]))
-        for intensity, ambient in ((FAINT_LIGHT, 0.6), (FAINT_LIGHT, 0.0), (0.0, 0.0))
+        for intensity, ambient in ((FAINT_LIGHT, AMBIENT), (FAINT_LIGHT, 0.0), (0.0, 0.0))
     )
     rows, columns = np.indices(SQUARE) + 0.5 - SQUARE[0] / 2
     x, y = (places / _pixels(BALL_RADIUS, SQUARE, 2.0) for places in (columns, -rows))
@@ -440,8 +444,12 @@ def light(look: _Look, _: EngineInfo) -> Findings:
         return
     guesses = [_brightest(normals, picture[inside].mean(axis=1)) for picture in hard]
     yield from _direction(guesses)
-    if look.dims:
-        yield from _colour(look, hard[0], inside)
+    asked = SIDES[0].world_to_camera()[:3, :3] @ spherical(SUN.azimuth, SUN.elevation)
+    if not look.dims:
+        return
+    yield from _colour(look, hard[0], inside)
+    if look.dims and _angle(guesses[0], asked) <= TOLERANCE:
+        yield from _balance(level(soft, inside), hard[0][inside], normals @ asked)
 
 
 def _brightest(normals: NDArray[np.float64], seen: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -480,16 +488,30 @@ def _direction(guesses: Sequence[NDArray[np.float64]]) -> Findings:
 
 
 def _colour(look: _Look, white: Picture, inside: NDArray[np.bool_]) -> Findings:
-    """A weaker, redder light: red falls by the intensity, green and blue by the colour as well."""
-    weak = look.at(BALL, _lit(replace(SUN, intensity=0.15, colour=(255, 40, 40)), SIDES[0]))
+    """A weaker, redder light, and a white one as weak as its green and blue."""
+    weak, weaker = (
+        look.at(BALL, _lit(replace(SUN, intensity=intensity, colour=colour), SIDES[0]))
+        for intensity, colour in ((0.15, TINT), (0.15 * TINT[1] / 255, SUN.colour))
+    )
     levels = white.mean(axis=-1)
     bright = inside & (levels > min(np.percentile(levels[inside], 60), levels[inside].max() - 1))  # all may be white
-    before, after = median(white, bright) + 1, median(weak, bright) + 1
-    if after[0] > 0.9 * before[0]:
+    seen = median(weak, bright)
+    if seen[0] > 0.9 * median(white, bright)[0]:
         look.dims = False
         yield fault("light intensity", "0.15 of the light's intensity looks as bright as 1.")
-    if after[1] / after[0] > 0.85 * before[1] / before[0]:
-        yield fault("light colour", "A red light looks white.")
+    elif np.abs(seen[1:] - level(weaker, bright)).max() > TINTED:
+        yield fault("light colour", f"In light of the colour {TINT} a white ball is {seen.round()}.")
+
+
+def _balance(soft: float, hard: Picture, facing: NDArray[np.float64]) -> Findings:
+    """Ambient light of ``AMBIENT`` looks brighter than light of 1 that grazes, and darker than light that faces."""
+    grazed, faced = level(hard, (facing > 0.2) & (facing < 0.3)), level(hard, facing > 0.9)
+    if soft >= 20 and not grazed - FAINT < soft < faced + FAINT:
+        yield fault(
+            "light balance",
+            f"A white ball has a brightness of {soft:.0f} in ambient light of {AMBIENT}, of {faced:.0f} where it faces "
+            f"directional light of 1, of {grazed:.0f} at 75 degrees to that.",
+        )
 
 
 GREY: Final = plate(0.25, plain(110, 110, 110))
