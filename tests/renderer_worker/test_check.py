@@ -145,7 +145,7 @@ def read(change: Callable[[Levels], Levels]) -> Fault:
 
     def other(each: Instance) -> Instance:
         obj = replace(each.model.obj, parts=tuple(map(moved, each.model.obj.parts)))
-        return replace(each, model=replace(each.model, shape=f"{each.model.shape} moved", obj=obj))
+        return replace(each, model=replace(each.model, shape=f"{each.model.shape} {id(change)}", obj=obj))
 
     return showing(other)
 
@@ -233,6 +233,17 @@ def one_pixel(engine: Engine) -> Engine:
     return Wrong(engine, see=see)
 
 
+def one_behind(engine: Engine) -> Engine:
+    """Each picture is of the request before it, as with asynchronous read-back."""
+    past: list[Levels] = []
+
+    def see(picture: Levels, _: Snapshot) -> Levels:
+        past.append(picture)
+        return past[-2:][0]
+
+    return Wrong(engine, see=see)
+
+
 def adapting(engine: Engine) -> Engine:
     """Its exposure follows the pictures of before."""
     past = [80.0]
@@ -293,6 +304,7 @@ def headlight(light: WorldLight, world: Snapshot) -> WorldLight:
 FAULTS: dict[str, tuple[str, Fault]] = {
     "one pixel": ("not repeatable", one_pixel),
     "grain": ("not repeatable", seen(grain(3, lambda _: None))),
+    "one picture behind": ("late picture", one_behind),
     "adaptive exposure": ("not repeatable", adapting),
     "exposure by the whole picture": ("exposure", seen(metered(shown=False))),
     "exposure by the object": ("exposure", seen(metered(shown=True))),
@@ -304,6 +316,7 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "v flipped": ("v flipped", painted(lambda texture: texture[::-1])),
     "u flipped": ("u flipped", painted(lambda texture: texture[:, ::-1])),
     "transposed": ("texture turned", painted(lambda texture: texture.swapaxes(0, 1))),
+    "wrapped at vertices": ("texture turned", read(lambda uvs: uvs % 1)),
     "clamped": ("texture not repeated", read(lambda uvs: uvs.clip(0, 1))),
     "repeated by mirroring": ("texture not repeated", read(lambda uvs: np.abs((uvs + 1) % 2 - 1))),
     "no textures": ("untextured", painted(lambda texture: np.full_like(texture, 180))),

@@ -8,6 +8,7 @@ from typing import Final, Literal
 REMEDIES: Final[Mapping[str, str]] = {
     "not repeatable": "Reset what one picture leaves to the next (jitter, exposure, history), or declare "
     "EngineInfo(deterministic=False) and draw the noise from noise_seed(world).",
+    "late picture": "Finish the picture of this request before it is read back.",
     "noise not numbered": "Seed the engine with noise_seed(world) before each picture, or fix what else differs.",
     "noise number ignored": "Seed the engine with noise_seed(world), not with a constant; if its pictures are always "
     "equal, declare deterministic=True.",
@@ -26,7 +27,8 @@ REMEDIES: Final[Mapping[str, str]] = {
     "v flipped": "v = 0 is the bottom row of the texture: use 1 - v, or flip the rows of the texture.",
     "u flipped": "u = 0 is the left column of the texture: use u as it is.",
     "texture not repeated": "Repeat textures in u and v (GL_REPEAT): coordinates may lie outside [0, 1].",
-    "texture turned": "u runs along the rows of the texture, v up its columns; do not transpose it.",
+    "texture turned": "u runs along the rows of the texture, v up its columns: do not transpose it. Wrap "
+    "coordinates for each pixel, not at vertices.",
     "field of view": "60 degrees (FIELD_OF_VIEW) is the vertical field of view.",
     "aspect": "Set the camera's aspect to width / height for each picture, and keep the vertical field of view.",
     "sheared": "Read the rows without padding: in OpenGL glPixelStorei(GL_PACK_ALIGNMENT, 1).",
@@ -54,8 +56,10 @@ REMEDIES: Final[Mapping[str, str]] = {
     "slow": "A job takes about 1,000 pictures: use fewer samples, or several workers.",
 }
 FINAL: Final = {
+    "late picture",
     "invisible",
     "untextured",
+    "texture turned",
     "stale scene",
     "stale object",
     "stale texture",

@@ -106,8 +106,12 @@ BESIDE: Final = ball(0.15, plain(240, 240, 240), middle=0.32)
 
 
 def repeats(look: _Look, info: EngineInfo) -> Findings:
-    """The same request twice. Later, with other pictures between, once more."""
+    """The same request twice, after another one. Later, with other pictures between, once more."""
+    before = look.raw(ORANGE, replace(FRONT, background=(255, 255, 255)))
     look.first, again = look.raw(ORANGE, FRONT), look.raw(ORANGE, FRONT)
+    if np.array_equal(before, look.first) and not np.array_equal(look.first, again):
+        yield fault("late picture", "A request gives the picture of the one before it.")
+        return
     look.repeats = info != SAILENV and np.array_equal(look.first, again)
     if info.deterministic:
         yield from _difference("not repeatable", look.first, again, "equal requests give equal bytes")
@@ -564,9 +568,9 @@ QUESTIONS: Final[tuple[Callable[[_Look, EngineInfo], Findings], ...]] = (
     background,
     objects,
     orientation,
+    texture,
     exposure,
     light,
-    texture,
     lens,
     gamma,
     repaint,
