@@ -199,6 +199,21 @@ def test_several_objects_and_a_point_light_are_drawn_as_by_pyrender(engine: str,
     assert images[3][..., 0].mean() > images[3][..., 1].mean() + 5
 
 
+@pytest.mark.parametrize("engine", ["pyrender", "three"])
+def test_a_surface_casts_a_shadow_if_light_meets_its_front(shown: SailenvTarget) -> None:
+    white, camera, size = plain(255, 255, 255), Camera(0.6, -50, 20), (120, 160)
+    corners, uvs, _ = quad(white, half=0.03, z=0.1)
+    sun = Light(azimuth=40, elevation=0, intensity=0.8, ambient=0.2)
+    points = np.array([[-0.1 * np.tan(np.radians(40)), y, 0] for y in (0, 0.07)])  # one behind the small square
+    levels = []
+    for small in (corners, corners[:, ::-1]):
+        image = picture(shown, object_of(quad(white), (small, uvs, white)), camera, sun, size=size)
+        levels.append([image[row, column].mean() for column, row in on_screen(camera, points, size).astype(int)])
+    (shadow, beside), turned = levels
+    assert shadow < 0.7 * beside
+    assert np.ptp([*turned, beside]) < 5
+
+
 def test_surfaces_show_what_is_behind_them(shown: SailenvTarget) -> None:
     camera, size = Camera(0.8, 0, 0), (160, 160)
     image = picture(shown, read_object(lantern(opacity=0.4), name="lantern.glb").obj, camera, size=size)

@@ -68,7 +68,7 @@ function drop(key) {
 
 function place(number, item) {
   if (!slots[number]) {
-    slots[number] = new THREE.Mesh(undefined, new THREE.MeshStandardMaterial());
+    slots[number] = new THREE.Mesh(undefined, new THREE.MeshStandardMaterial({shadowSide: THREE.FrontSide}));
     slots[number].matrixAutoUpdate = false;
     slots[number].castShadow = slots[number].receiveShadow = true;
     slots[number].frustumCulled = false;
