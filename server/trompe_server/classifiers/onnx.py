@@ -65,7 +65,9 @@ def load_onnx(path: Path, device: str = "cpu") -> OnnxClassifier:
     if not _alike(_run(session, images[1:], fixed_batch), logits):
         raise broken(path.name, "its logits of an image depend on chance")
     refuse_probabilities(logits, path.name)
-    if fixed_batch is None and not _takes_batches(session, images, logits):
+    if fixed_batch != 1 and not _takes_batches(session, images, logits, fixed_batch):
+        if fixed_batch:
+            raise broken(path.name, f"its logits of an image depend on the others of its batch of {fixed_batch}")
         fixed_batch = 1
     return OnnxClassifier(path.stem, session, size, logits.shape[1], fixed_batch)
 
@@ -117,14 +119,15 @@ def _listed(kind: str, values: Sequence[Any]) -> str:
     return f"{len(values)} {kind}s ({', '.join(value.name for value in values[:5])})"
 
 
-def _takes_batches(session: Any, images: Logits, last: Logits) -> bool:
+def _takes_batches(session: Any, images: Logits, last: Logits, fixed_batch: int | None) -> bool:
     """Whether two images get the same logits together as alone; ``last``: those of the second one.
 
-    Not from a graph with a reshape for one image, nor if 8-bit activations are scaled by the range of the batch.
+    Not from a graph with a reshape for one image or in training mode, nor if 8-bit activations are scaled by the range
+    of the batch.
     """
-    alone = np.concatenate([_run(session, images[:1], None), last])
+    alone = np.concatenate([_run(session, images[:1], fixed_batch), last])
     try:
-        together = _run(session, images, None)
+        together = _run(session, images, fixed_batch)
     except Exception:  # of onnxruntime, which has no common class of errors
         return False
     return _alike(together, alone)

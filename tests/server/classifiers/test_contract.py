@@ -116,6 +116,7 @@ def write_onnx(
     last: str = "Identity",
     inner: int = -1,
     outputs: tuple[str, ...] = ("logits",),
+    **of_last: Any,
 ) -> Path:
     """A network: mean over the image, then a linear layer. ``inner``: the batch inside its graph, -1 for any."""
     weight = np.random.default_rng(0).normal(size=(3, n_classes)).astype(np.float32)
@@ -125,7 +126,7 @@ def write_onnx(
         helper.make_node("Constant", [], ["flattened"], value_ints=[inner, 3]),
         helper.make_node("Reshape", ["pooled", "flattened"], ["flat"]),
         helper.make_node("MatMul", ["flat", "weight"], ["raw"]),
-        helper.make_node(last, ["raw"], ["logits"]),
+        helper.make_node(last, ["raw"], ["logits"], **of_last),
     ]
     image = helper.make_tensor_value_info("image", kind, [batch, channels, *size])
     logits = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [batch, n_classes]) for name in outputs]
@@ -154,6 +155,7 @@ ONNX: dict[str, dict[str, Any]] = {
     "onnx with a batch of 1": {"batch": 1},
     "onnx with a batch of 4": {"batch": 4},
     "onnx of one image inside": {"inner": 1},
+    "onnx that mixes a batch": {"last": "LpNormalization", "axis": 0},
     "onnx with a name for its channels": {"channels": "num_channels"},
 }
 
@@ -526,6 +528,7 @@ def test_cut_and_foreign_files_are_refused(pt2: Path, tmp_path: Path) -> None:
         pytest.param({"last": "Shape"}, "onnxruntime cannot read it|its output for one image", id="no logits"),
         pytest.param({"last": "Log"}, "not finite", id="not finite"),
         pytest.param({"last": "RandomNormalLike"}, "depend on chance", id="chance"),
+        pytest.param({"last": "LpNormalization", "axis": 0, "batch": 4}, "others of its batch of 4", id="mixed batch"),
     ],
 )
 def test_an_onnx_network_against_the_contract_is_refused(options: dict[str, Any], message: str, tmp_path: Path) -> None:
