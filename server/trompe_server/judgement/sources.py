@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from trompe_server.classifiers import Classifier, classifier_file, load_classifier
 from trompe_server.formats import import_file
@@ -26,6 +27,9 @@ from trompe_shared.errors import LabelError
 from trompe_shared.local_files import CLASSIFIER_SUFFIXES, LOOKED_UP, classes_beside, model_file
 from trompe_shared.object3d import Object3D, load_object, unpack
 from trompe_shared.shipped import shipped_objects
+
+_APART: Final = re.compile(rb"\n\x08location\x12([\x01-\x7f])")
+"""In an .onnx file, before the name of another file with weights: its length (``TensorProto.external_data``)."""
 
 
 @dataclass(frozen=True)
@@ -141,11 +145,20 @@ def _judge(
     return judge, JudgedNetwork(
         name=reference if by_name else network.name,
         reference=reference,
-        sha256=identity_of(classifier_file(file).read_bytes()),
+        sha256=_hash_of_network(classifier_file(file)),
         image_size=network.image_size,
         labels=list(judge.labels),
         label_names=None if names is None else [names[index] for index in judge.labels],
     )
+
+
+def _hash_of_network(file: Path) -> str:
+    """Hash of the file, and of those in which an .onnx keeps its weights."""
+    data = file.read_bytes()
+    found = _APART.finditer(data) if file.suffix.lower() == ".onnx" else ()
+    names = {os.fsdecode(data[each.end() : each.end() + each[1][0]]) for each in found}
+    apart = [path for name in sorted(names) if (path := file.parent / name).is_file()]
+    return identity_of(b"".join([data, *(path.read_bytes() for path in apart)]))
 
 
 def known_labels(label: Sequence[str | int], network: Classifier) -> tuple[int, ...]:

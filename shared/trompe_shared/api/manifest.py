@@ -51,7 +51,7 @@ class JudgedNetwork(Schema):
 
     name: str
     reference: str = Field(description="name, or path relative to the manifest's folder")
-    sha256: str | None = Field(default=None, description="of its file, or of the weights of a network by name")
+    sha256: str | None = Field(default=None, description="of its file or files, or of the weights of a network by name")
     image_size: tuple[int, int] | None = None
     labels: list[int] = Field(default_factory=list)
     label_names: list[str] | None = None

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 
 from tests.job_runs import Recorder
@@ -158,6 +159,16 @@ def test_an_index_counts_only_for_networks_with_the_same_class_there(judge: Judg
     assert manifest.networks[0].label_names == ["mug"]
     told = "The index 5 is another class for the judge 'other': 'f', not 'mug'"
     assert (manifest.networks[1].missing or "").startswith(told)
+
+
+def test_the_hash_of_a_network_covers_weights_in_another_file(tmp_path: Path) -> None:
+    file, sources = write_onnx(tmp_path / "net.onnx"), LocalSources(tmp_path)
+    onnx.save(onnx.load(file), file, save_as_external_data=True, location="weights.bin", size_threshold=0)
+    _, before = sources.network(str(file), [0])
+    weights = tmp_path / "weights.bin"
+    weights.write_bytes(bytes(weights.stat().st_size))
+    _, after = sources.network(str(file), [0])
+    assert before.sha256 != after.sha256
 
 
 def test_another_object_is_judged_by_itself_and_has_no_drop(judge: Judge, tmp_path: Path) -> None:
