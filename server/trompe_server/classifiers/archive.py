@@ -43,7 +43,7 @@ TARGET: Final = re.compile(
     r"|_operator\.(add|eq|floordiv|ge|getitem|gt|le|lt|mod|mul|ne|neg|sub|truediv)",
     re.ASCII,
 )
-NAME: Final = re.compile(r"[\w .,:@+>-]*", re.ASCII)
+NAME: Final = re.compile(r"[\w .,:/@+>-]*", re.ASCII)
 SIZE: Final = re.compile(
     r"(Symbol\('[su]\d+'(, (positive|integer)=True)*\)"
     r"|(Integer|Add|Mul|Pow|FloorDiv|CleanDiv|Mod|Max|Min)(?=\()|s\d+|\d+|[-+*/(), ])+",

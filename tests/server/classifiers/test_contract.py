@@ -268,6 +268,13 @@ def test_an_exported_network_is_the_network_it_was(pt2: Path) -> None:
     torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
 
 
+def test_a_network_with_slashes_in_its_names_is_read_as_keras_writes_it(tmp_path: Path) -> None:
+    network = Around(lambda net, x: net(x) + net.get_parameter("dense/bias"))
+    network.net.register_parameter("dense/bias", nn.Parameter(torch.arange(7.0)))
+    read, images = white_box(export(network, tmp_path / "net.pt2")), torch.rand((2, 3, *SIZE))
+    torch.testing.assert_close(read.logits(images), network(images))
+
+
 def test_a_network_exported_on_a_graphics_card_is_read_without_one(pt2: Path, tmp_path: Path) -> None:
     cpu, card = b'"type": "cpu", "index": null', b'"type": "cuda", "index": 0'
     with zipfile.ZipFile(pt2) as old, zipfile.ZipFile(tmp_path / "card.pt2", "w") as new:
