@@ -312,19 +312,6 @@ def test_an_engine_counts_as_lost_when_a_picture_takes_for_ever(engine: _Engine)
     assert lost == ["a picture takes more than 2 s"]
 
 
-def test_a_worker_ends_whose_engine_keeps_pythons_lock_for_ever() -> None:
-    program = (
-        "import ctypes\n"
-        "from trompe_renderer.engines.render_thread import RenderThread\n"
-        "def keep_lock(_): ctypes.PyDLL(None).sleep(600)\n"
-        "thread = RenderThread(object, turn_limit=1.0)\n"
-        "thread.run(keep_lock, agent=RenderThread)\n"
-    )
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
-    assert found.returncode == 1
-    assert "in keep_lock" in found.stderr
-
-
 def sessions(count: int, limits: Limits | None = None) -> list[Session]:
     cache = ModelCache(limits or Limits())
     return [Session(cache, ENGINE) for _ in range(count)]

@@ -4,7 +4,6 @@ The next turn goes to the waiting agent whose turns have taken the least time, s
 delay agents with small ones.
 """
 
-import faulthandler
 import logging
 import os
 import threading
@@ -70,7 +69,7 @@ class RenderThread:
     """Runs an engine in a thread of its own. Any thread may ask; ``agent`` is the object that takes a turn.
 
     ``lost`` is called with the reason when the engine hangs or fails for good. By default it ends the process with the
-    exit status ``os.EX_TEMPFAIL``, or 1, with a traceback, if the engine keeps Python's lock.
+    exit status ``os.EX_TEMPFAIL``.
     """
 
     def __init__(
@@ -137,8 +136,6 @@ class RenderThread:
 
     def _watch(self) -> None:
         while True:
-            if self._lost is _exit_process:
-                faulthandler.dump_traceback_later(self._limit, exit=True)  # unless this thread runs again
             time.sleep(min(1.0, self._limit / 4))
             since = self._since
             if since is not None and time.monotonic() - since > self._limit:
