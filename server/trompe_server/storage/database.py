@@ -11,21 +11,16 @@ from typing import Any, Final
 
 import sqlalchemy as sa
 from sqlalchemy.engine.interfaces import ExceptionContext
-from sqlalchemy.exc import (
-    ArgumentError,
-    DatabaseError,
-    DataError,
-    InterfaceError,
-    InternalError,
-    OperationalError,
-    ProgrammingError,
-)
+from sqlalchemy.exc import ArgumentError, DatabaseError, DataError, InterfaceError, InternalError, OperationalError
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 
 from trompe_server.errors import ServiceError
 from trompe_shared.addresses import without_password
 from trompe_shared.errors import SpecError
+
+NO_SUCH_TABLE, NO_RIGHT = "42P01", "42501"
+"""PostgreSQL's codes (SQLSTATE) of statements that are right, in a database that is not."""
 
 BUSY_TIMEOUT: Final = 30_000
 """Milliseconds a writer of SQLite waits for the writer before it."""
@@ -109,9 +104,10 @@ def _translate(context: ExceptionContext) -> BaseException | None:
         return None  # the pool replaces a broken connection
     words = (str(context.original_exception).strip().splitlines() or [type(context.original_exception).__name__])[0]
     damaged = type(error) is DatabaseError  # SQLite's file; its subclasses mean other things
-    # PostgreSQL's InternalError: it only reads, as a standby or for want of space; ProgrammingError: no such table
-    away = (OperationalError, InterfaceError, InternalError, ProgrammingError)
-    if damaged or context.is_disconnect or isinstance(error, away):
+    closed = getattr(context.original_exception, "sqlstate", None) in {NO_SUCH_TABLE, NO_RIGHT}
+    # PostgreSQL's InternalError: it only reads, as a standby or for want of space
+    away = isinstance(error, (OperationalError, InterfaceError, InternalError))
+    if damaged or closed or context.is_disconnect or away:
         return DatabaseDownError(f"The database is not available ({words}).")
     if isinstance(error, DataError):
         return SpecError(f"The database cannot hold such a value ({words}); use text without NUL characters.")
