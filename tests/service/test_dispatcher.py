@@ -210,6 +210,16 @@ def test_a_process_that_dies_before_it_is_ready_is_a_fault_and_is_tried_again(tm
         executor.close()
 
 
+def test_a_fork_server_that_dies_is_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("trompe_server.executor.local.fork", Mock(side_effect=EOFError("unexpected EOF")))
+    LocalExecutor(Setup(Settings(data=tmp_path), RendererAddresses())).close()
+    wait_until(lambda: len(caplog.records) == 1)
+    assert "died (unexpected EOF)" in caplog.text
+    assert caplog.records[0].exc_info is None
+
+
 def test_a_stop_does_not_wait_for_a_process_that_is_starting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started = threading.Event()
     monkeypatch.setattr("trompe_server.executor.local.fork", lambda *_: started.wait())

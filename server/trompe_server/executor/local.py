@@ -96,8 +96,8 @@ class _Slot:
     def _start(self, theirs: Connection) -> None:
         try:
             self._process = fork(theirs, self._environment, self._setup)
-        except (EOFError, OSError):  # ``listen`` will hear it
-            logger.exception("the fork server of the attack workers died")
+        except (EOFError, OSError) as error:  # ``listen`` will hear it
+            logger.error("the fork server of the attack workers died (%s)", error)
         finally:
             theirs.close()
 
