@@ -119,6 +119,9 @@ def test_scores_of_a_classifier_without_gradient_are_counted(library: Library, m
     assert any(mask.any() for mask in changed(run.artifacts).values())
     assert "saliency.png" not in run.artifacts.files
     assert "contact_sheet.png" in run.artifacts.files
+    note = run_job(spec_of(queries=6, label="ball"), library).reports["prepare"].note
+    assert note is not None
+    assert note.endswith("`background`, and that the .onnx file normalises its images.")
 
 
 # Rules of the options alone
