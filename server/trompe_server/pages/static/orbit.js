@@ -131,7 +131,9 @@ async function parse(THREE, data) {
   });
   const { scene } = await loader.parseAsync(data, "");
   scene.traverse((mesh) => {
-    if (mesh.isMesh) mesh.castShadow = mesh.receiveShadow = !mesh.material.transparent;
+    if (!mesh.isMesh) return;
+    mesh.castShadow = mesh.receiveShadow = !mesh.material.transparent;
+    mesh.material.shadowSide = THREE.FrontSide;  // as the renderer: the faces that light meets
   });
   return scene;
 }
