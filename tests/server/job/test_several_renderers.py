@@ -99,7 +99,8 @@ def test_no_attack_needs_one_renderer_that_recognises_the_object(library: Librar
 
 @pytest.mark.usefixtures("pictures")
 def test_a_headline_that_recognises_nothing_in_its_own_views_has_pictures(library: Library) -> None:
-    own = setup_of(library).views
+    sampled = {"pool": 12, "held_out": 6}
+    own = setup_of(library, **sampled).views
 
     class Unmoved(FakeTarget):
         """Shows nothing in the own views, and the same chair in all others."""
@@ -108,7 +109,7 @@ def test_a_headline_that_recognises_nothing_in_its_own_views_has_pictures(librar
             images = super().render(CHAIR, views, **options)
             return images * np.array([view not in own for view in views], np.uint8)[:, None, None, None]
 
-    run = run_job(spec_of(epsilon=0.3, alpha=0.1, steps=6), library, more_targets=[Unmoved(engine=DARK)])
+    run = run_job(spec_of(epsilon=0.5, alpha=0.1, steps=12, **sampled), library, more_targets=[Unmoved(engine=DARK)])
     assert (run.result.renderer, run.result.target.a_before) == (DARK, 0)
     assert run.result.held_out is not None
     assert run.result.held_out.a_drop == 0
