@@ -1,6 +1,5 @@
 """Goal of the attack: the loss to maximise, and the condition of success."""
 
-import math
 import operator
 from dataclasses import dataclass
 from typing import Final, SupportsIndex, get_args
@@ -17,9 +16,6 @@ from trompe_shared.errors import SpecError
 SAFE_MARGIN: Final = 1.0
 """Margin from which a view is safely won: the margin loss has no gradient there."""
 
-COLD: Final = 1e-6
-"""Least temperature of the smooth maxima, in logits."""
-
 Logits = Float[Tensor, "views classes"]
 PerView = Float[Tensor, " views"]
 
@@ -29,9 +25,8 @@ class Goal:
     """Away from ``label``, or towards ``target`` if given.
 
     label: the true class, or several that all count as the object. top_k: no true class may be among the k best (1: the
-    best). loss: maximised; ``margin`` (Carlini and Wagner 2017, with smooth maxima, constant once a view is
-    safely won) or ``cross_entropy``. safe: margin from which a view is safely won. Raises ``SpecError`` for
-    contradictory options.
+    best). loss: maximised; ``margin`` (Carlini and Wagner 2017, clamped once a view is safely won) or
+    ``cross_entropy``. safe: margin from which a view is safely won. Raises ``SpecError`` for contradictory options.
     """
 
     label: SupportsIndex | tuple[int, ...]
@@ -93,23 +88,11 @@ class Goal:
         ``clamped=False`` omits the margin's clamp, so that safely won views have a gradient too.
         """
         if self.loss == "margin":
-            smooth = self._smooth_margins(logits)
-            return torch.where(self.settled(logits), self.safe, smooth) if clamped else smooth
+            margins = self.margins(logits)
+            return margins.clamp(max=self.safe) if clamped else margins
         log_shares = finite(logits).log_softmax(1).index_select(1, self._subject(logits))
         losses = -log_shares.logsumexp(1)  # the probabilities of several classes add up
         return losses if self.target is None else -losses
-
-    def _smooth_margins(self, logits: Logits) -> PerView:
-        """The margins with smooth maxima, so that each class that may win has a gradient: the log-odds, up to a
-        constant. They do not exceed the margins."""
-        logits, subject = finite(logits), self._subject(logits)
-        heat = logits.detach().std(1, keepdim=True).clamp(COLD, 1)  # small logits have small differences
-        logits = logits / heat
-        others = logits.index_fill(1, subject, -torch.inf)
-        better = others.detach().topk(self.top_k - 1, dim=1).indices
-        odds = others.scatter(1, better, -torch.inf).logsumexp(1) - logits.index_select(1, subject).logsumexp(1)
-        n_others = logits.shape[1] - len(subject) - self.top_k + 1
-        return heat[:, 0] * (odds - math.log(n_others) if self.target is None else -odds)
 
     def settled(self, logits: Logits) -> Bool[Tensor, " views"]:
         """Whether each view is safely won, so that its loss has no gradient."""
