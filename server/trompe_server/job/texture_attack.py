@@ -166,10 +166,10 @@ class TextureAttack:
 
     def _end_without_attack(self) -> PhaseReport:
         names = " or ".join(repr(self.setup.judge.class_name(label)) for label in self.setup.labels)
-        inside = "" if self.spec.victim.queries is None else ", and that the .onnx file normalises its images"
+        hint = "" if self.spec.victim.queries is None else ", and that the .onnx file normalises its images"
         note = (
             f"{self.setup.classifier.name!r} recognises {names} in none of the {len(self._clean)} target views of the "
-            f"unpainted object, so nothing can drop. Check `label`, `distance`, `elevation` and `background`{inside}."
+            f"unpainted object, so nothing can drop. Check `label`, `distance`, `elevation` and `background`{hint}."
         )
         public = write_report(self._seen(), self.artifacts, seconds=self._seconds, warnings=(note,))
         return PhaseReport(DONE, JobState.not_applicable, note, public)
