@@ -13,11 +13,10 @@ from tests.served import wait_until, workers_of
 from tests.service.executors import NAME, Executed
 from tests.service.records import claim
 from trompe_server.executor import task
-from trompe_server.executor.attempts import MARK
 from trompe_server.executor.forks import Forks
 from trompe_server.executor.process import READY, Setup
 from trompe_server.executor.task import run_forked
-from trompe_server.queue.leases import DISPATCHER, take_lease
+from trompe_server.queue.leases import DISPATCHER, mark_store, take_lease
 from trompe_server.storage.folders import open_folder
 from trompe_shared.api import JobState
 
@@ -77,7 +76,7 @@ def test_the_process_of_a_dead_task_is_killed_even_if_it_is_frozen(forks: Forks,
 def test_a_node_is_sound_if_it_sees_the_store_and_can_fork(forks: Forks, executed: Executed) -> None:
     take_lease(executed.store.engine, DISPATCHER, holder=NAME, seconds=60)
     assert "does not see the store" in str(forks.fault(executed.setup, NAME))
-    open_folder(executed.settings.store_url).write(MARK, NAME.encode())
+    mark_store(open_folder(executed.settings.store_url), NAME)
     assert forks.fault(executed.setup, NAME) is None
     lacking = Setup(executed.settings.model_copy(update={"silence": "soon"}), executed.setup.renderers)
     assert "die before they are ready (status 1)" in str(forks.fault(lacking, NAME))

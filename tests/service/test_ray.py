@@ -14,10 +14,10 @@ import pytest
 
 from tests.fake_job import trace
 from tests.served import reserved_port, wait_until
-from tests.service.executors import Executed
+from tests.service.executors import NAME, Executed
 from tests.service.ray_nodes import RayNodes, task_of
 from trompe_server.errors import ServiceError
-from trompe_server.executor.attempts import MARK
+from trompe_server.queue.leases import MARKS
 from trompe_server.storage.folders import open_folder
 from trompe_shared.api import JobState
 
@@ -91,7 +91,7 @@ def test_a_node_without_the_store_gets_no_job_and_says_so(cluster: RayNodes, que
     executed = queue(cluster.address, silence=4.0)
     with executed.dispatching():
         wait_until(lambda: executed.ended(executed.submit("fine")))
-        open_folder(executed.settings.store_url).write(MARK, b"another")  # as if the new node had another folder there
+        open_folder(executed.settings.store_url).within(MARKS).delete(NAME)  # as if the new node had another folder
         node = cluster.add(num_gpus=4)
         job = executed.submit("fine", needs={"gpu": 3})
         wait_until(lambda: "does not see the store" in str(executed.state(job).note), seconds=CLEAR + 20)

@@ -197,7 +197,8 @@ def create(
     response: Response,
     key: str | None,
 ) -> Job:
-    """Queue a job, and answer with its place."""
+    """Queue a job, and answer with its place. Raises ``ServiceError`` if those who run it have another store."""
+    services.check_store()
     job, new = services.store.create(request, names=names, idempotency_key=key)
     response.status_code = 201 if new else 200
     response.headers["Location"] = f"/v1/jobs/{job.id}"

@@ -9,12 +9,15 @@ from fastapi import Depends, Request
 
 from trompe_server.api.middleware import HttpMetrics
 from trompe_server.api.rate import RateLimit
+from trompe_server.errors import ServiceError
 from trompe_server.library import Library
 from trompe_server.library.classification import Networks
+from trompe_server.queue.leases import DISPATCHER, is_leased, lease_holder, shares_store
 from trompe_server.queue.store import JobStore
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import Folder, JobArtifacts, job_artifacts
 from trompe_server.storage.tokens import Tokens
+from trompe_shared.addresses import without_password
 from trompe_shared.api import RendererInfo
 
 UPLOADS: Final = 2
@@ -42,6 +45,17 @@ class Services:
     def artifacts(self, job: str) -> JobArtifacts:
         """The files of a job, for reading."""
         return job_artifacts(self.files, job)
+
+    def check_store(self) -> None:
+        """Raises ``ServiceError`` if the jobs are dispatched by a process with another store."""
+        engine, url = self.store.engine, without_password(self.settings.store_url)
+        holder = lease_holder(engine, DISPATCHER) if is_leased(engine, DISPATCHER) else None
+        if holder is not None and not shares_store(self.files, holder):
+            raise ServiceError(
+                f"{holder} runs the jobs of this database with another store than this service, which has {url}: it "
+                "would not find the uploads. Start all services and workers of a database with the same --store "
+                "(TROMPE_STORE)."
+            )
 
 
 def _services(request: Request) -> Services:

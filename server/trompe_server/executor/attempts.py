@@ -5,12 +5,11 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final
 
 from trompe_server.executor.opener import JobOpener, load
 from trompe_server.executor.runner import JobRunner
 from trompe_server.queue.claims import Claim, Claims
-from trompe_server.queue.leases import DISPATCHER, lease_holder
+from trompe_server.queue.leases import DISPATCHER, lease_holder, shares_store
 from trompe_server.queue.store import JobStore
 from trompe_server.renderers.discovery import RendererAddresses
 from trompe_server.settings import Settings
@@ -22,9 +21,6 @@ from trompe_server.system.threads import prepare_threads
 from trompe_shared.errors import TrompeError
 
 logger = logging.getLogger(__name__)
-
-MARK: Final = "cluster-mark"
-"""File in the store with the name of the dispatcher: a node that reads it has our store."""
 
 
 class Attempts:
@@ -78,14 +74,13 @@ def prepare(pipeline: str) -> None:
 
 
 def fault_here(settings: Settings, mark: str) -> str | None:
-    """What this machine lacks of a shared service: the database or the store with the dispatcher's ``mark``."""
+    """What this machine lacks of a shared service: the database or the store of the dispatcher ``mark``."""
     try:
         settings.data.mkdir(parents=True, exist_ok=True)
         if not _is_dispatcher(settings, mark):
             place = connect(settings.database_url).url.render_as_string(hide_password=True)
             return f"it sees another database at {place}; all nodes must reach the same one (PostgreSQL)"
-        folder = open_folder(settings.store_url)
-        if not folder.exists(MARK) or folder.read(MARK) != mark.encode():
+        if not shares_store(open_folder(settings.store_url), mark):
             return f"it does not see the store {settings.store_url}; mount it there, or use an object store"
     except (OSError, TrompeError) as error:
         return f"it cannot use the database or the store ({error})"

@@ -86,7 +86,8 @@ class Dispatcher:
             return 0.0 if self.step() else self._interval
         except DatabaseDownError as error:
             self._heard_since = self._clock()
-            logger.warning("%s Retrying.", error)
+            if self.fault != str(error):
+                logger.warning("%s Retrying.", error)
             self.fault = str(error)
             return RETRY
         except ServiceError as error:

@@ -12,14 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from trompe_server.errors import ServiceError
-from trompe_server.executor.attempts import MARK
 from trompe_server.executor.forks import Forks
 from trompe_server.executor.port import Ended, fits, left_in, too_much
 from trompe_server.executor.process import Setup
 from trompe_server.executor.task import run_task
 from trompe_server.queue.claims import Claim
 from trompe_server.queue.workers import Worker
-from trompe_server.storage.folders import open_folder
 from trompe_server.system.memory import GIB
 from trompe_shared.addresses import host_and_port
 from trompe_shared.api import Needs
@@ -76,7 +74,6 @@ class RayExecutor:
         self._setups = {device: pickle.dumps(replace(setup, settings=own)) for device, own in devices.items()}
         self._address = setup.settings.executor
         self._ray = _connected(self._address, setup.settings.workers)
-        open_folder(setup.settings.store_url).write(MARK, mark.encode())
         self._run = self._ray.remote(max_retries=0)(run_task)
         self._forks = self._ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(Forks)
         self._demand = self._ray.remote(max_retries=0, num_cpus=0)(_request)

@@ -1,4 +1,4 @@
-"""Leases: work done by one process at a time."""
+"""Leases: work done by one process at a time, and the store of the one that dispatches the jobs."""
 
 from typing import Final
 
@@ -6,9 +6,12 @@ import sqlalchemy as sa
 
 from trompe_server.queue.tables import leases
 from trompe_server.storage.database import clock, write
+from trompe_server.storage.folders import Folder
 
 DISPATCHER: Final = "dispatcher"
 RETENTION: Final = "retention"
+MARKS: Final = "dispatchers"
+"""Folder in the store with a file for each dispatcher that uses it."""
 
 
 def take_lease(engine: sa.Engine, name: str, *, holder: str, seconds: float) -> bool:
@@ -37,3 +40,13 @@ def end_lease(engine: sa.Engine, name: str, *, holder: str) -> None:
     held = sa.and_(leases.c.name == name, leases.c.holder == holder)
     with write(engine) as connection:
         connection.execute(leases.update().where(held).values(until=0.0))
+
+
+def mark_store(files: Folder, dispatcher: str) -> None:
+    """Tell all who see the store ``files`` that ``dispatcher`` uses it."""
+    files.within(MARKS).write(dispatcher, dispatcher.encode())
+
+
+def shares_store(files: Folder, dispatcher: str) -> bool:
+    """Whether ``files`` is the store of ``dispatcher``."""
+    return files.within(MARKS).exists(dispatcher)

@@ -1,6 +1,7 @@
 """Dispatches jobs for a service: in ``trompe serve``, or alone as ``trompe worker``."""
 
 import signal
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -19,6 +20,7 @@ from trompe_server.executor.local import LocalExecutor
 from trompe_server.executor.port import Executor
 from trompe_server.executor.process import Setup
 from trompe_server.queue.claims import Claims
+from trompe_server.queue.leases import mark_store
 from trompe_server.queue.retention import Retention
 from trompe_server.queue.store import JobStore
 from trompe_server.renderers.discovery import RendererAddresses
@@ -34,6 +36,7 @@ def prepare_data(settings: Settings) -> None:
     """Create the data folder, and create or upgrade the database. Raises ``ServiceError``."""
     try:
         settings.data.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=settings.data).close()
         with closing(JobStore(settings.database_url)) as store:
             store.migrate()
     except (OSError, SQLAlchemyError, DatabaseDownError) as error:
@@ -46,8 +49,9 @@ def prepare_data(settings: Settings) -> None:
 def open_executor(settings: Settings, renderers: RendererAddresses, *, mark: str) -> Executor:
     """Start the processes of this machine, or connect to the cluster. ``mark``: name of the dispatcher with the lease.
 
-    Raises ``ServiceError`` if the cluster cannot be used.
+    Raises ``ServiceError`` if the store or the cluster cannot be used.
     """
+    mark_store(open_folder(settings.store_url), mark)
     setup = Setup(settings, renderers)
     if settings.executor == "local":
         return LocalExecutor(setup)

@@ -1,6 +1,7 @@
 """Jobs over HTTP: submit once, find again, cancel, repeat, delete."""
 
 import json
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
@@ -10,7 +11,8 @@ import pytest
 from tests.server.api.conftest import CLASSES, GIF, Api
 from tests.small_models import triangle_zip
 from trompe_server.errors import ServiceError
-from trompe_server.storage.folders import JobArtifacts
+from trompe_server.queue.leases import DISPATCHER, MARKS, end_lease, mark_store, take_lease
+from trompe_server.storage.folders import JobArtifacts, open_folder
 from trompe_shared.api import JobState
 from trompe_shared.object3d import encode_png
 
@@ -41,6 +43,20 @@ def test_a_job_keeps_the_ids_of_what_it_names_and_shows_what_the_queue_knows_of_
     assert "priority" not in spec
     assert job["names"] == {spec["object"]: "triangle", net: "net", member: "member", picture: "beach"}
     assert stocked.get(f"/v1/jobs/{job['id']}").json() == job
+
+
+def test_no_job_is_queued_for_those_who_run_it_with_another_store(stocked: Api, tmp_path: Path) -> None:
+    engine, refusal = stocked.services.store.engine, "elsewhere runs the jobs of this database with another store"
+    take_lease(engine, DISPATCHER, holder="elsewhere", seconds=60)
+    mark_store(open_folder(tmp_path / "another"), "elsewhere")
+    refused = stocked.submit()
+    assert (refused.status_code, refusal in refused.text) == (503, True)
+    assert stocked.get("/v1/jobs").json()["jobs"] == []
+    mark_store(stocked.services.files, "elsewhere")
+    assert stocked.submit().status_code == 201
+    stocked.services.files.within(MARKS).delete("elsewhere")
+    end_lease(engine, DISPATCHER, holder="elsewhere")
+    assert stocked.submit().status_code == 201, "it is gone"
 
 
 def test_a_classifier_without_gradients_can_be_attacked_by_its_scores(stocked: Api) -> None:

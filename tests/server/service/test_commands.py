@@ -71,6 +71,13 @@ def test_serve_says_what_is_wrong_with_the_data_folder(tmp_path: Path) -> None:
     assert "TROMPE_DATA" in words
 
 
+def test_a_data_folder_without_the_database_must_be_writable_too(tmp_path: Path) -> None:
+    elsewhere = ("--database", f"sqlite:///{tmp_path / 'jobs.sqlite'}", "--renderer", "127.0.0.1:1")
+    for command in (commands.serve, commands.worker):
+        status, words = run(command, "--data", "/proc", *elsewhere)
+        assert (status, "The data folder /proc or the database cannot be written" in words) == (1, True), words
+
+
 @pytest.mark.parametrize(
     ("variable", "value", "fault"),
     [
