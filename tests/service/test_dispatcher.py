@@ -120,12 +120,12 @@ def test_a_dispatcher_that_fails_says_so_until_it_works(executed: Executed, erro
         wait_until(lambda: ours.fault is None)
 
 
-def test_an_outage_of_the_database_is_logged_once(executed: Executed, caplog: pytest.LogCaptureFixture) -> None:
-    away = DatabaseDownError("The database is away.")
+@pytest.mark.parametrize("away", [DatabaseDownError("It is away."), PermissionError("It is away.")])
+def test_an_outage_is_logged_once(executed: Executed, caplog: pytest.LogCaptureFixture, away: Exception) -> None:
     ours, _ = dispatcher(executed, Mock(side_effect=[away, away, executed.open()]))
     for _ in range(3):
         ours._try()
-    assert (caplog.text.count("is away"), ours.fault) == (1, None)
+    assert (caplog.text.count("Retrying"), ours.fault) == (1, None)
 
 
 def test_an_executor_that_is_lost_is_opened_again_and_the_jobs_go_on(executed: Executed) -> None:

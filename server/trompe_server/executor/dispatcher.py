@@ -86,17 +86,19 @@ class Dispatcher:
             return 0.0 if self.step() else self._interval
         except DatabaseDownError as error:
             self._heard_since = self._clock()
-            if self.fault != str(error):
-                logger.warning("%s Retrying.", error)
-            self.fault = str(error)
-            return RETRY
+            return self._retry(str(error))
         except ServiceError as error:
             self._abandon(str(error))
             return self._interval
         except Exception as error:
-            logger.exception("the dispatcher failed; retrying")
-            self.fault = f"the dispatcher failed ({type(error).__name__}: {error})"
-            return RETRY
+            return self._retry(f"the dispatcher failed ({type(error).__name__}: {error})", trace=error)
+
+    def _retry(self, fault: str, trace: Exception | None = None) -> float:
+        """Log a new fault. Returns the seconds to wait."""
+        if fault != self.fault:
+            logger.error("%s Retrying.", fault, exc_info=trace)
+        self.fault = fault
+        return RETRY
 
     def step(self) -> bool:
         """Dispatch once. Returns whether this dispatcher has the lease.
