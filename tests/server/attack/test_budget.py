@@ -1,6 +1,7 @@
 """The budget: projection, steps, 8-bit quantisation, perceptual bounds and the bound on images, against formulas."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +10,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 from tests.attack_runs import EPS, SMALL, SQUARE, SURROGATE, random_state, run, same, surrogate_of
@@ -123,10 +126,11 @@ def test_blocks_are_saved_with_the_means_that_the_attack_found(count: int, epsil
     assert (means(change, count) - 255 * delta).abs().max() <= 1.5  # rounded, and down to a whole level at the bound
 
 
-def test_a_flipped_texture_is_a_texture() -> None:
+@pytest.mark.parametrize("view", [np.asarray, lambda image: np.asarray(Image.fromarray(image))])
+def test_a_flipped_or_read_only_texture_is_a_texture(view: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> None:
     flipped, copied = (
         SQUARE.with_textures({name: make(image[::-1]) for name, image in SQUARE.textures.items()})
-        for make in (np.asarray, np.array)
+        for make in (view, np.array)
     )
     change = {name: torch.full(image.shape, 0.02) for name, image in SQUARE.textures.items()}
     assert same(start(textures_of(flipped)), start(textures_of(copied)))
