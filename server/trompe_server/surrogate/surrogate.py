@@ -617,4 +617,4 @@ def textures_of(obj: Object3D, *, device: torch.device | str = "cpu") -> dict[st
 
 def tensor_of(texture: Image8) -> UInt8[Tensor, "H W 3"]:
     """A texture as a tensor, a flipped or read-only one too: torch refuses or warns of a view of it."""
-    return torch.from_numpy(np.require(texture, requirements="CW"))
+    return torch.from_numpy(np.require(texture, requirements=("C", "W")))
