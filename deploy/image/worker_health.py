@@ -2,8 +2,8 @@
 
 import sys
 
-from trompe_server.queue.leases import DISPATCHER, is_leased
+from trompe_server.queue.leases import DISPATCHER, lease_holder
 from trompe_server.settings import Settings
 from trompe_server.storage.database import connect
 
-sys.exit(not is_leased(connect(Settings().database_url), DISPATCHER))
+sys.exit(lease_holder(connect(Settings().database_url), DISPATCHER) is None)

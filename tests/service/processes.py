@@ -74,8 +74,8 @@ class Service(Queue):
     def end_silence(self) -> None:
         """Let the lease of a dead or frozen dispatcher be over now, not after its silence."""
         holder = lease_holder(self.store.engine, DISPATCHER)
-        assert holder is not None
-        end_lease(self.store.engine, DISPATCHER, holder=holder)
+        if holder is not None:
+            end_lease(self.store.engine, DISPATCHER, holder=holder)
 
     def ended(self, job: str) -> Job:
         wait_until(lambda: self.state(job).state.final)

@@ -78,5 +78,9 @@ def test_a_node_is_sound_if_it_sees_the_store_and_can_fork(forks: Forks, execute
     assert "does not see the store" in str(forks.fault(executed.setup, NAME))
     mark_store(open_folder(executed.settings.store_url), NAME)
     assert forks.fault(executed.setup, NAME) is None
+    elsewhere = executed.settings.model_copy(update={"store": "memory://user:secret@elsewhere"})
+    fault = str(forks.fault(Setup(elsewhere, executed.setup.renderers), NAME))
+    assert "does not see the store" in fault
+    assert "secret" not in fault
     lacking = Setup(executed.settings.model_copy(update={"silence": "soon"}), executed.setup.renderers)
     assert "die before they are ready (status 1)" in str(forks.fault(lacking, NAME))

@@ -12,7 +12,7 @@ from trompe_server.api.rate import RateLimit
 from trompe_server.errors import ServiceError
 from trompe_server.library import Library
 from trompe_server.library.classification import Networks
-from trompe_server.queue.leases import DISPATCHER, is_leased, lease_holder, shares_store
+from trompe_server.queue.leases import DISPATCHER, lease_holder, shares_store
 from trompe_server.queue.store import JobStore
 from trompe_server.settings import Settings
 from trompe_server.storage.folders import Folder, JobArtifacts, job_artifacts
@@ -49,7 +49,7 @@ class Services:
     def check_store(self) -> None:
         """Raises ``ServiceError`` if the jobs are dispatched by a process with another store."""
         engine, url = self.store.engine, without_password(self.settings.store_url)
-        holder = lease_holder(engine, DISPATCHER) if is_leased(engine, DISPATCHER) else None
+        holder = lease_holder(engine, DISPATCHER)
         if holder is not None and not shares_store(self.files, holder):
             raise ServiceError(
                 f"{holder} runs the jobs of this database with another store than this service, which has {url}: it "

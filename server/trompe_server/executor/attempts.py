@@ -18,6 +18,7 @@ from trompe_server.storage.folders import open_folder
 from trompe_server.system.log import about_job, log_to_stderr
 from trompe_server.system.memory import keep_freed_memory
 from trompe_server.system.threads import prepare_threads
+from trompe_shared.addresses import without_password
 from trompe_shared.errors import TrompeError
 
 logger = logging.getLogger(__name__)
@@ -81,7 +82,8 @@ def fault_here(settings: Settings, mark: str) -> str | None:
             place = connect(settings.database_url).url.render_as_string(hide_password=True)
             return f"it sees another database at {place}; all nodes must reach the same one (PostgreSQL)"
         if not shares_store(open_folder(settings.store_url), mark):
-            return f"it does not see the store {settings.store_url}; mount it there, or use an object store"
+            url = without_password(settings.store_url)
+            return f"it does not see the store {url}; mount it there, or use an object store"
     except (OSError, TrompeError) as error:
         return f"it cannot use the database or the store ({error})"
     return None

@@ -86,19 +86,19 @@ class Dispatcher:
             return 0.0 if self.step() else self._interval
         except DatabaseDownError as error:
             self._heard_since = self._clock()
-            return self._retry(str(error))
+            return self._failed(str(error), RETRY)
         except ServiceError as error:
-            self._abandon(str(error))
-            return self._interval
+            self._abandon()
+            return self._failed(str(error), self._interval)
         except Exception as error:
-            return self._retry(f"the dispatcher failed ({type(error).__name__}: {error})", trace=error)
+            return self._failed(f"the dispatcher failed ({type(error).__name__}: {error})", RETRY, trace=error)
 
-    def _retry(self, fault: str, trace: Exception | None = None) -> float:
-        """Log a new fault. Returns the seconds to wait."""
+    def _failed(self, fault: str, pause: float, trace: Exception | None = None) -> float:
+        """Log a new fault. Returns the seconds to wait, ``pause``."""
         if fault != self.fault:
             logger.error("%s Retrying.", fault, exc_info=trace)
         self.fault = fault
-        return RETRY
+        return pause
 
     def step(self) -> bool:
         """Dispatch once. Returns whether this dispatcher has the lease.
@@ -125,7 +125,8 @@ class Dispatcher:
             self._heard_since = now  # we were frozen, the machine asleep, the database locked or its clock set
         self._ahead = ahead
         if not take_lease(self._claims.engine, DISPATCHER, holder=self._name, seconds=self._silence):
-            self._abandon(None)
+            self._abandon()
+            self.fault = None
             return False
         if self._executor is None:
             logger.info("%s dispatches the jobs", self._name)
@@ -174,11 +175,8 @@ class Dispatcher:
                     executor.cancel(claim)
                     self._end(Ended(claim, reason))
 
-    def _abandon(self, fault: str | None) -> None:
+    def _abandon(self) -> None:
         """Kill what runs: the executor is lost, or another dispatcher has the lease and the jobs."""
-        if fault is not None and fault != self.fault:
-            logger.error("the attack workers are down: %s", fault)
-        self.fault = fault
         self._held, self._round = {}, 0.0
         self._close()
 

@@ -23,16 +23,9 @@ def take_lease(engine: sa.Engine, name: str, *, holder: str, seconds: float) -> 
 
 
 def lease_holder(engine: sa.Engine, name: str) -> str | None:
-    """Who has, or had last, the lease of the work ``name``."""
+    """Who has the lease of the work ``name`` now."""
     with engine.connect() as connection:
-        return connection.scalar(sa.select(leases.c.holder).where(leases.c.name == name))
-
-
-def is_leased(engine: sa.Engine, name: str) -> bool:
-    """Whether anybody has the lease of the work ``name`` now."""
-    with engine.connect() as connection:
-        held = sa.select(leases.c.name).where(leases.c.name == name, leases.c.until > clock())
-        return connection.scalar(held) is not None
+        return connection.scalar(sa.select(leases.c.holder).where(leases.c.name == name, leases.c.until > clock()))
 
 
 def end_lease(engine: sa.Engine, name: str, *, holder: str) -> None:
