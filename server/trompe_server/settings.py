@@ -83,8 +83,3 @@ class Settings(BaseSettings):
     def store_url(self) -> str:
         """URL of the files of jobs and of the library."""
         return self.store or str(self.data.absolute())
-
-    @property
-    def metrics_folder(self) -> Path:
-        """Folder of the metrics of the attack workers, in Prometheus' multi-process format."""
-        return self.data.absolute() / "metrics"

@@ -11,6 +11,7 @@ from typing import Any, Final
 from tests.served import FAKE, Queue, wait_until
 from trompe_server.executor.attempts import Attempts
 from trompe_server.executor.dispatcher import Dispatcher
+from trompe_server.executor.metrics import count
 from trompe_server.executor.port import Ended, Executor, fits, left_in, too_much
 from trompe_server.executor.process import Setup
 from trompe_server.queue.claims import Claim, Claims
@@ -66,7 +67,7 @@ class FakeExecutor:
 
 @cache
 def _attempts(setup: Setup) -> Attempts:
-    return Attempts(setup.settings, setup.renderers)
+    return Attempts(setup.settings, setup.renderers, count_work=count)
 
 
 class Executed(Queue):

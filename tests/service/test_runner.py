@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 from unittest.mock import Mock
 
 import pytest
-from prometheus_client import REGISTRY
 
 from tests.service.records import claim, claims_of, create
+from trompe_server.executor.metrics import WORK, count
 from trompe_server.executor.runner import JobRunner
 from trompe_server.job.protocol import DamagedFileError, OnProgress, PhaseReport
 from trompe_server.queue.claims import Claims, Ending
@@ -197,7 +197,7 @@ def test_a_lost_attempt_tidies_up_after_itself_where_nobody_else_will(
 
 def test_phases_count_their_seconds_and_their_work_by_kind(store: JobStore) -> None:
     def sample(name: str, **labels: str) -> float:
-        return REGISTRY.get_sample_value(f"trompe_{name}_total", labels) or 0.0
+        return WORK.get_sample_value(f"trompe_{name}_total", labels) or 0.0
 
     class Counting(Scripted):
         def run(self, phase: str, on_progress: OnProgress) -> PhaseReport:
@@ -205,7 +205,7 @@ def test_phases_count_their_seconds_and_their_work_by_kind(store: JobStore) -> N
 
     names = [("attack_steps", {}), ("target_renders", {}), ("phase_seconds", {"phase": "attack"})]
     before = [sample(name, **labels) for name, labels in names]
-    run(store, Counting(**{"attack-000": lambda _: time.sleep(0.01), "attack-001": nothing}))
+    run(store, Counting(**{"attack-000": lambda _: time.sleep(0.01), "attack-001": nothing}), count_work=count)
     steps, renders, seconds = (
         sample(*name, **labels) - old for (*name, labels), old in zip(names, before, strict=True)
     )

@@ -168,7 +168,7 @@ def test_workers_of_a_service_are_counted_together_and_those_elsewhere_serve_the
         return {"".join([s.name, *s.labels.values()]): s.value for family in families for s in family.samples}
 
     with Served(tmp_path / "data") as serve:
-        assert scraped(f"{serve.url}/metrics").get("trompe_attack_steps_total", 0) == 0
+        assert scraped(f"{serve.url}/metrics")["trompe_attack_steps_total"] == 0
         done = serve.submit("fine")
         wait_until(lambda: serve.state(done).state.final)
         first = serve.children()["worker"]

@@ -1,15 +1,14 @@
 """State of the service: attack workers, renderer workers, liveness, readiness, metrics."""
 
-from pathlib import Path
 from typing import Final
 
 from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, generate_latest
-from prometheus_client.multiprocess import MultiProcessCollector
 
 from trompe_server.api import examples
 from trompe_server.api.problems import PROBLEMS, RefusedError
 from trompe_server.api.services import ServicesDep
+from trompe_server.executor.metrics import WORK
 from trompe_server.queue.store import JobStore
 from trompe_shared.api import RendererInfo, WorkerInfo
 
@@ -53,12 +52,8 @@ def readiness(services: ServicesDep) -> dict[str, str]:
     responses={200: {"description": "Prometheus text.", "content": {"text/plain": {"example": _EXAMPLE}}}},
 )
 def metrics(services: ServicesDep) -> Response:
-    """Metrics for Prometheus: requests of this process, the queue, and the counters of this machine's workers."""
-    registries = (
-        services.metrics.registry,
-        _of_queue(services.store),
-        _of_workers(services.settings.metrics_folder),
-    )
+    """Metrics for Prometheus: requests of this process, the queue, and the work of its attack workers."""
+    registries = services.metrics.registry, _of_queue(services.store), WORK
     return Response(b"".join(map(generate_latest, registries)), media_type=CONTENT_TYPE_LATEST)
 
 
@@ -69,12 +64,4 @@ def _of_queue(store: JobStore) -> CollectorRegistry:
         jobs.labels(state.value).set(count)
     age = Gauge("trompe_queue_age_seconds", "Wait of the oldest queued job.", registry=registry)
     age.set(store.oldest_queued())
-    return registry
-
-
-def _of_workers(folder: Path) -> CollectorRegistry:
-    """Counters that the workers of this machine write to ``folder`` in Prometheus' multi-process mode."""
-    registry = CollectorRegistry()
-    if folder.is_dir():
-        MultiProcessCollector(registry, path=str(folder))  # type: ignore[no-untyped-call]
     return registry

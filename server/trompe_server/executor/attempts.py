@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from trompe_server.executor.opener import JobOpener, load
-from trompe_server.executor.runner import JobRunner
+from trompe_server.executor.runner import CountWork, JobRunner
 from trompe_server.queue.claims import Claim, Claims
 from trompe_server.queue.leases import DISPATCHER, lease_holder, shares_store
 from trompe_server.queue.store import JobStore
@@ -25,14 +25,14 @@ logger = logging.getLogger(__name__)
 
 
 class Attempts:
-    """Runs attempts with ``settings`` and ``renderers``."""
+    """Runs attempts with ``settings`` and ``renderers``. ``count_work`` takes what each finished phase did."""
 
-    def __init__(self, settings: Settings, renderers: RendererAddresses) -> None:
+    def __init__(self, settings: Settings, renderers: RendererAddresses, count_work: CountWork) -> None:
         log_to_stderr()
         prepare(settings.pipeline)
         opener = JobOpener(settings, open_folder(settings.store_url), renderers)
         self._claims = Claims(JobStore(settings.database_url).engine)
-        self._runner = JobRunner(self._claims, opener.open, opener.tidy)
+        self._runner = JobRunner(self._claims, opener.open, opener.tidy, count_work)
         self._interval = settings.silence / 4
 
     def run(self, claim: Claim) -> str | None:

@@ -3,7 +3,6 @@
 import logging
 import multiprocessing
 import os
-import shutil
 import socket
 import threading
 import time
@@ -12,6 +11,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Final
 
+from trompe_server.executor.metrics import count
 from trompe_server.executor.port import Ended, fits, left_in, too_much
 from trompe_server.executor.process import READY, Setup, ending, fork
 from trompe_server.queue.claims import Claim
@@ -38,8 +38,6 @@ class LocalExecutor:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GIB
         self._room = Needs(cpu=settings.workers, gpu=gpu, memory=memory)
         self._device = settings.device
-        shutil.rmtree(settings.metrics_folder, ignore_errors=True)
-        settings.metrics_folder.mkdir(parents=True)
         host, environment = socket.gethostname(), _environment(settings)
         self._slots = [_Slot(f"{host}-{number}", setup, environment) for number in range(settings.workers)]
 
@@ -138,6 +136,9 @@ class _Slot:
         if said == READY and not self.ready:
             self.ready, self.fault, self._failures = True, None, 0
             return None
+        if isinstance(said, tuple):
+            count(said)
+            return None
         claim, self.claim = self.claim, None
         assert claim is not None
         return Ended(claim, said)
@@ -160,7 +161,4 @@ class _Slot:
 def _environment(settings: Settings) -> dict[str, str]:
     """Variables added to the environment of the processes."""
     threads = max(1, len(os.sched_getaffinity(0)) // settings.workers)
-    return {
-        "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(threads)),
-        "PROMETHEUS_MULTIPROC_DIR": str(settings.metrics_folder),
-    }
+    return {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(threads))}

@@ -45,24 +45,30 @@ def fork(connection: Connection, environment: Mapping[str, str], setup: Setup) -
 
 
 def run_attempts(connection: Connection, environment: Mapping[str, str], setup: Setup) -> None:
-    """Answer ``READY``, then run each claim from ``connection`` and answer why it was lost, until it closes."""
+    """Answer ``READY``, then run each claim from ``connection`` and answer why it was lost, until it closes.
+
+    Before the answer comes a message of ``Work`` for each finished phase.
+    """
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.environ.update(environment)
     from trompe_server.executor.attempts import Attempts
 
-    attempts = Attempts(setup.settings, setup.renderers)
+    def say(message: object) -> None:
+        with suppress(OSError):  # the executor closed, as ``recv`` will tell
+            connection.send(message)
+
+    attempts = Attempts(setup.settings, setup.renderers, count_work=say)
     if torch := sys.modules.get("torch"):  # the fork server has imported it with its own number of threads
         torch.set_num_threads(threads())
-    with suppress(OSError):  # the executor closed, as ``recv`` will tell
-        connection.send(READY)
+    say(READY)
     while True:
         try:
             claim = connection.recv()
         except EOFError:
             os._exit(0)
-        connection.send(attempts.run(claim))
+        say(attempts.run(claim))
 
 
 def ending(status: int | None) -> str:

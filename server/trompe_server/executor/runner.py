@@ -8,9 +8,8 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
-from prometheus_client import Counter
-
 from trompe_server.errors import NotFoundError
+from trompe_server.executor.metrics import Work
 from trompe_server.job.protocol import DamagedFileError, PhasedJob, PhaseReport, number_after
 from trompe_server.queue.claims import Claim, Claims, Ending, LostJobError
 from trompe_server.storage.database import DatabaseDownError
@@ -21,17 +20,6 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-PHASE_SECONDS: Final = Counter("trompe_phase_seconds", "Seconds spent in phases of jobs.", ["phase"])
-COUNTERS: Final = {
-    "attack_steps": Counter("trompe_attack_steps", "Attack steps."),
-    "classifier_images": Counter("trompe_classifier_images", "Images shown to classifiers by attacks."),
-    "target_renders": Counter("trompe_target_renders", "Images rendered by the target."),
-}
-"""Prometheus counters of ``PhaseReport.counts``.
-
-Workers of this machine write them to files in the folder ``PROMETHEUS_MULTIPROC_DIR``, which the API or
-``trompe worker`` sums up. Those of Ray nodes stay there.
-"""
 MAX_DAMAGES: Final = 2
 """Times a phase may find its input damaged and have it made again."""
 
@@ -40,6 +28,8 @@ OpenJob = Callable[[Claim], AbstractContextManager[PhasedJob]]
 """Opens a job, and releases its connection to the renderers. Raises ``TrompeError`` for errors the user can fix."""
 TidyJob = Callable[[Claim, list[str]], None]
 """Deletes all files of an ended job except the named ones."""
+CountWork = Callable[[Work], None]
+"""Takes what a finished phase did."""
 
 
 class _Cancelled(BaseException):
@@ -57,6 +47,7 @@ class JobRunner:
     claims: Claims
     open_job: OpenJob
     tidy_job: TidyJob = lambda _claim, _kept: None
+    count_work: CountWork = lambda _work: None
     progress_interval: float = 1.0
     retry_waits: tuple[float, float] = (0.1, 2.0)
     """Shortest and longest wait before a call of the database is repeated, seconds."""
@@ -170,9 +161,8 @@ class _Phases:
     def _run_once(self, phase: str) -> PhaseReport:
         job, started = self._open(), time.perf_counter()
         report = job.run(phase, self._on_progress)
-        PHASE_SECONDS.labels(phase.partition("-")[0]).inc(time.perf_counter() - started)  # of attack-003: attack
-        for name, amount in report.counts.items():
-            COUNTERS[name].inc(amount)
+        kind = phase.partition("-")[0]  # of attack-003: attack
+        self._runner.count_work((kind, time.perf_counter() - started, dict(report.counts)))
         return report
 
     def _record(self, report: PhaseReport, *, done: int) -> None:

@@ -10,13 +10,12 @@ from typing import Final
 
 import click
 import prometheus_client
-from prometheus_client import CollectorRegistry
-from prometheus_client.multiprocess import MultiProcessCollector
 from sqlalchemy.exc import SQLAlchemyError
 
 from trompe_server.errors import ServiceError
 from trompe_server.executor.dispatcher import Dispatcher, dispatcher_name
 from trompe_server.executor.local import LocalExecutor
+from trompe_server.executor.metrics import WORK
 from trompe_server.executor.port import Executor
 from trompe_server.executor.process import Setup
 from trompe_server.queue.claims import Claims
@@ -97,11 +96,8 @@ def run_worker(settings: Settings, renderers: RendererAddresses) -> None:
 
 
 def _serve_metrics(settings: Settings) -> None:
-    registry = CollectorRegistry()
-    settings.metrics_folder.mkdir(parents=True, exist_ok=True)
-    MultiProcessCollector(registry, path=str(settings.metrics_folder))  # type: ignore[no-untyped-call]
     try:
-        prometheus_client.start_http_server(settings.metrics_port, registry=registry)
+        prometheus_client.start_http_server(settings.metrics_port, registry=WORK)
     except OSError as error:
         raise ServiceError(
             f"Cannot serve metrics on port {settings.metrics_port} ({error}). Choose another TROMPE_METRICS_PORT."
