@@ -28,7 +28,7 @@ class AmbiguousError(TrompeError):
 
 
 class ConflictError(TrompeError):
-    """The state of the job does not allow this."""
+    """The state of the job or of the service does not allow this."""
 
     code = "conflict"
 

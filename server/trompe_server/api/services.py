@@ -9,7 +9,7 @@ from fastapi import Depends, Request
 
 from trompe_server.api.middleware import HttpMetrics
 from trompe_server.api.rate import RateLimit
-from trompe_server.errors import ServiceError
+from trompe_server.errors import ConflictError
 from trompe_server.library import Library
 from trompe_server.library.classification import Networks
 from trompe_server.queue.leases import DISPATCHER, lease_holder, shares_store
@@ -47,11 +47,11 @@ class Services:
         return job_artifacts(self.files, job)
 
     def check_store(self) -> None:
-        """Raises ``ServiceError`` if the jobs are dispatched by a process with another store."""
+        """Raises ``ConflictError`` if the jobs are dispatched by a process with another store."""
         engine, url = self.store.engine, without_password(self.settings.store_url)
         holder = lease_holder(engine, DISPATCHER)
         if holder is not None and not shares_store(self.files, holder):
-            raise ServiceError(
+            raise ConflictError(
                 f"{holder} runs the jobs of this database with another store than this service, which has {url}: it "
                 "would not find the uploads. Start all services and workers of a database with the same --store "
                 "(TROMPE_STORE)."

@@ -50,7 +50,7 @@ def test_no_job_is_queued_for_those_who_run_it_with_another_store(stocked: Api, 
     take_lease(engine, DISPATCHER, holder="elsewhere", seconds=60)
     mark_store(open_folder(tmp_path / "another"), "elsewhere")
     refused = stocked.submit()
-    assert (refused.status_code, refusal in refused.text) == (503, True)
+    assert (refused.status_code, refusal in refused.text) == (409, True)
     assert stocked.get("/v1/jobs").json()["jobs"] == []
     mark_store(stocked.services.files, "elsewhere")
     assert stocked.submit().status_code == 201
