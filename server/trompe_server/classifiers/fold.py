@@ -1,9 +1,9 @@
 """Accelerate an exported network without changing its function.
 
 Batch norm is folded into the preceding convolution. Convolutions run in the ``channels_last`` memory format, except on
-a graphics card, which plans that for seconds in full precision. Where no gradient is asked for, a convolution and its
-activation are one operator of oneDNN on a CPU, as in ``torch.compile``'s own networks. The results are measured: a
-network with different logits stays unchanged.
+a graphics card, which plans that for seconds in full precision. On a CPU a convolution pads its images itself and
+applies the activation after it (``convolution``). The results are measured: a network with different logits stays
+unchanged.
 """
 
 import copy
@@ -15,7 +15,10 @@ from typing import Any, Final
 import torch
 from jaxtyping import Float
 from torch import Tensor, fx, nn
+from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_weights
+
+from trompe_server.classifiers.convolution import ACTIVATIONS, convolved
 
 TOLERANCE: Final = 1e-4
 """Largest allowed difference of a logit, relative to the largest logit."""
@@ -23,41 +26,39 @@ CONVOLUTION: Final = torch.ops.aten.conv2d.default
 CONVOLUTION_DEFAULTS: Final[tuple[Any, ...]] = (None, None, None, [1, 1], [0, 0], [1, 1], 1)
 """Image, weight, bias, stride, padding, dilation, groups."""
 BATCH_NORM: Final = torch.ops.aten.batch_norm.default
-ACTIVATIONS: Final[Mapping[Any, str]] = {
-    torch.ops.aten.hardtanh.default: "hardtanh",
-    torch.ops.aten.relu.default: "relu",
-    torch.ops.aten.hardswish.default: "hardswish",
-}
-"""Activations by their names in oneDNN. Their in-place forms are not in exported networks."""
+NAMES: Final[Mapping[Any, str]] = {activation: name for name, activation in ACTIVATIONS.items()}
+PAD: Final = torch.ops.aten.pad.default
+FEW: Final = 4
+"""Channels that each result of a convolution reads, up to which a larger kernel is cheaper than padded images."""
 
 
 class Formatted(nn.Module):
-    """A network with weights and images in one memory format, for images in any format. ``scoring``: the same function
-    without a gradient."""
+    """A network with weights and images in one memory format, for images in any format."""
 
-    def __init__(
-        self, network: fx.GraphModule, memory_format: torch.memory_format, scoring: fx.GraphModule | None = None
-    ) -> None:
+    def __init__(self, network: nn.Module, memory_format: torch.memory_format) -> None:
         super().__init__()
         self.network = network.to(memory_format=memory_format)  # type: ignore[call-overload]
-        self.scoring = scoring
         self.memory_format = memory_format
 
     def forward(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
         """Logits of sRGB images in [0, 1]."""
-        network = self.network if self.scoring is None or torch.is_grad_enabled() else self.scoring
-        logits: Tensor = network(images.contiguous(memory_format=self.memory_format))
+        logits: Tensor = self.network(images.contiguous(memory_format=self.memory_format))
         return logits
 
 
 def accelerate(network: fx.GraphModule, sample: Float[Tensor, "n 3 H W"]) -> Formatted:
     """The network folded, in the faster memory format, or unchanged if that moves a logit of ``sample`` too far."""
     original = Formatted(network, torch.contiguous_format)
-    memory_format = torch.contiguous_format if sample.is_cuda else torch.channels_last
-    folded = _measured(lambda: Formatted(fold_batch_norm(_copy(network)), memory_format), original, sample)
-    if sample.device.type != "cpu" or not torch.backends.mkldnn.is_available() or folded is original:  # type: ignore[no-untyped-call]
+    faster = fastest_format(sample.device)
+    folded = _measured(lambda: Formatted(fold_batch_norm(_copy(network)), faster), original, sample)
+    if sample.device.type != "cpu" or folded is original:
         return folded
-    return _measured(lambda: Formatted(folded.network, torch.channels_last, _fused(folded.network)), folded, sample)
+    return _measured(lambda: Formatted(_fused(_copy(folded.network)), faster), folded, sample)
+
+
+def fastest_format(device: torch.device) -> torch.memory_format:
+    """Memory format of the images and weights of convolutional networks on ``device``."""
+    return torch.channels_last if device.type == "cpu" else torch.contiguous_format
 
 
 def _measured(make: Callable[[], Formatted], known: Formatted, sample: Float[Tensor, "n 3 H W"]) -> Formatted:
@@ -73,25 +74,49 @@ def _measured(make: Callable[[], Formatted], known: Formatted, sample: Float[Ten
 
 
 def _fused(network: fx.GraphModule) -> fx.GraphModule:
-    """A copy whose convolutions apply the activations that follow them."""
-    fused = _copy(network)
-    for node in list(fused.graph.nodes):
+    """Let convolutions pad their images and apply the activations that follow, in place; return ``network``."""
+    for node in list(network.graph.nodes):
         if node.target is not CONVOLUTION or node.kwargs:
             continue
+        _fuse_padding(network, node)
         following = next(iter(node.users))
-        named = ACTIVATIONS.get(following.target) if len(node.users) == 1 else None
-        given: tuple[Any, ...] = node.args
-        image, weight, bias, stride, padding, dilation, groups = given + CONVOLUTION_DEFAULTS[len(given) :]
-        scalars = list(following.args[1:]) if named else []
-        with fused.graph.inserting_before(node):
-            new = fused.graph.call_function(
-                torch.ops.mkldnn._convolution_pointwise.default,
-                (image, weight, bias, padding, stride, dilation, groups, named or "none", scalars, ""),
-            )
-        (following if named else node).replace_all_uses_with(new)
-    fused.graph.eliminate_dead_code()
-    fused.recompile()
-    return fused
+        if len(node.users) > 1 or following.target not in NAMES:
+            continue
+        named = NAMES[following.target], list(following.args[1:])
+        with network.graph.inserting_before(node):
+            fused = network.graph.call_function(convolved, (*_arguments(node), *named))
+        following.replace_all_uses_with(fused)
+    network.graph.eliminate_dead_code()
+    network.recompile()
+    return network
+
+
+def _arguments(convolution: fx.Node) -> tuple[Any, ...]:
+    """Image, weight, bias, stride, padding, dilation, groups."""
+    given: tuple[Any, ...] = convolution.args
+    return given + CONVOLUTION_DEFAULTS[len(given) :]
+
+
+def _fuse_padding(network: fx.GraphModule, convolution: fx.Node) -> None:
+    """Pad by zeros within a convolution of few weights: equally on both sides, with a kernel enlarged by zeros.
+
+    Networks of TensorFlow pad one side more. An operator of its own copies the images twice.
+    """
+    padded, kernel, bias, stride, padding, dilation, groups = _arguments(convolution)
+    by_zeros = padded.target is PAD and len(padded.args) == 2 and not padded.kwargs
+    if not by_zeros or kernel.op != "get_attr" or [*padding, *dilation] != [0, 0, 1, 1]:
+        return
+    (images, sides), weight = padded.args, _value(network, kernel)
+    if weight is None or weight.shape[1] > FEW or len(sides) != 4 or min(sides) < 0:
+        return
+    left, right, top, bottom = sides
+    wide, high = max(left, right), max(top, bottom)
+    enlarged = F.pad(weight, (wide - left, wide - right, high - top, high - bottom))
+    name = f"{convolution.name}_enlarged_weight"
+    network.register_parameter(name, nn.Parameter(enlarged, requires_grad=False))
+    with network.graph.inserting_before(convolution):
+        node = network.graph.get_attr(name)
+    convolution.args = (images, node, bias, stride, [high, wide], dilation, groups)
 
 
 def _copy(network: fx.GraphModule) -> fx.GraphModule:

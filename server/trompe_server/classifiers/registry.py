@@ -22,13 +22,14 @@ from typing import Final, NamedTuple
 import torch
 
 from trompe_server.classifiers.contract import prepared
+from trompe_server.classifiers.fold import Formatted, fastest_format
 from trompe_server.classifiers.huggingface import huggingface_weights, load_huggingface
 from trompe_server.classifiers.network import NamedNetwork, NetworkClassifier
 from trompe_server.classifiers.onnx import OnnxClassifier, load_onnx
 from trompe_server.classifiers.protocol import Classifier, check_classes
 from trompe_server.classifiers.robustbench_networks import load_robustbench, robustbench_weights
 from trompe_server.classifiers.timm_networks import load_timm, timm_weights
-from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, WEIGHTS, load_tiny
+from trompe_server.classifiers.tiny import CLASSES, IMAGE_SIZE, WEIGHTS, FoldedTinyNet, load_tiny
 from trompe_server.classifiers.vision import load_torchvision, torchvision_weights
 from trompe_shared.errors import ClassifierError
 from trompe_shared.local_files import LOOKED_UP
@@ -96,7 +97,8 @@ def load_classifier(
             ) from error
     if reference == "tiny":
         names = check_classes(classes or CLASSES, len(CLASSES), reference)
-        return NetworkClassifier(name or reference, load_tiny().to(device), IMAGE_SIZE, len(CLASSES), names, device)
+        network = Formatted(FoldedTinyNet(load_tiny()).to(device), fastest_format(torch.device(device)))
+        return NetworkClassifier(name or reference, network, IMAGE_SIZE, len(CLASSES), names, device)
     return _from_file(Path(path_or_name), name, classes, device)
 
 

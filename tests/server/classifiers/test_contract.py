@@ -34,7 +34,8 @@ from trompe_server.classifiers import (
 )
 from trompe_server.classifiers.archive import read_program
 from trompe_server.classifiers.contract import check_contract, sample_images
-from trompe_server.classifiers.fold import BATCH_NORM, CONVOLUTION, Formatted, fold_batch_norm
+from trompe_server.classifiers.convolution import convolved
+from trompe_server.classifiers.fold import BATCH_NORM, NAMES, PAD, Formatted, fold_batch_norm
 from trompe_server.classifiers.onnx import OnnxClassifier, load_onnx
 from trompe_server.classifiers.protocol import AT_ONCE, fit_images
 from trompe_shared.errors import ClassifierError
@@ -308,7 +309,8 @@ def logits_and_gradients(path: str | Path, device: str, count: int) -> list[torc
 def test_another_device_gives_equal_logits_and_gradients(kind: str, pt2: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     device, path = pretend_device(monkeypatch), pt2 if kind == "pt2" else kind
     found = [logits_and_gradients(path, name, 2) for name in ("cpu", device)]
-    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(other, one)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
@@ -363,22 +365,53 @@ def test_a_network_that_does_not_run_channels_last_is_left_as_it_was(tmp_path: P
     torch.testing.assert_close(classifier.logits(images), network(images.contiguous()))
 
 
+def padded_by_channel(net: Any, x: Tensor) -> Tensor:
+    """As networks of TensorFlow do."""
+    weight, bias = net.body[3].weight, net.body[3].bias
+    return nn.functional.conv2d(nn.functional.pad(x, (0, 1, 0, 1)), weight, bias, stride=2, groups=8).relu()
+
+
 @pytest.mark.parametrize(
     "function",
     [
         pytest.param(lambda net, x: nn.functional.relu6(net.body[0](x)).mean((2, 3)), id="an activation with bounds"),
         pytest.param(lambda net, x: net.body[0](x).relu().mean((2, 3)), id="an activation without"),
-        pytest.param(lambda net, x: ((y := net.body[0](x)).relu() + y).mean((2, 3)), id="another reader"),
-        pytest.param(lambda net, x: net.body[0](x).sigmoid().mean((2, 3)), id="another activation"),
+        pytest.param(lambda net, x: nn.functional.hardswish(net.body[0](x)).mean((2, 3)), id="a bent activation"),
+        pytest.param(lambda net, x: net.body[0](nn.functional.pad(x, (2, 1, 0, 3))).mean((2, 3)), id="padding"),
+        pytest.param(lambda net, x: padded_by_channel(net, net.body[0](x)).mean((2, 3)), id="padding of each channel"),
     ],
 )
-def test_logits_without_a_gradient_are_the_same(function: Callable[[Any, Tensor], Tensor], tmp_path: Path) -> None:
-    network = white_box(export(Around(function), tmp_path / "net.pt2"))
+def test_convolutions_pad_and_apply_their_activations_with_equal_logits_and_gradients(
+    function: Callable[[Any, Tensor], Tensor], tmp_path: Path
+) -> None:
+    program = read_program(export(Around(function), tmp_path / "net.pt2")).module(check_guards=False)
+    network = white_box(tmp_path / "net.pt2")
     assert isinstance(network.network, Formatted)
-    assert network.network.scoring is not None
-    assert not [node for node in network.network.scoring.graph.nodes if node.target is CONVOLUTION]
+    assert not [node for node in network.network.network.graph.nodes if node.target in (PAD, *NAMES)]
+    images = fit_images(noise(3), SIZE).requires_grad_()
+    expected, found = program(images), network.logits(images)
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(network.scores(images), found.detach())
+    torch.testing.assert_close(*(torch.autograd.grad(x[:, 0].sum(), images)[0] for x in (found, expected)))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        pytest.param(lambda net, x: ((y := net.body[0](x)).relu() + y).mean((2, 3)), id="another reader"),
+        pytest.param(lambda net, x: net.body[0](x).sigmoid().mean((2, 3)), id="another activation"),
+        pytest.param(
+            lambda net, x: net.body[0](nn.functional.pad(x, (1, 1, 1, 1), value=0.5)).mean((2, 3)), id="padding by grey"
+        ),
+    ],
+)
+def test_other_convolutions_stay(function: Callable[[Any, Tensor], Tensor], tmp_path: Path) -> None:
+    network = white_box(export(Around(function), tmp_path / "net.pt2"))
+    program = read_program(tmp_path / "net.pt2").module(check_guards=False)
+    assert isinstance(network.network, Formatted)
+    assert convolved not in [node.target for node in network.network.network.graph.nodes]
     images = fit_images(noise(3), SIZE)
-    torch.testing.assert_close(network.scores(images), network.logits(images.requires_grad_()).detach())
+    torch.testing.assert_close(network.scores(images), program(images))
 
 
 BREAKING: dict[str, tuple[nn.Module, dict[str, Any], str]] = {
