@@ -128,11 +128,23 @@ def _climbed(best: SamplingModel, score: Score) -> SamplingModel:
     for _ in range(MAX_ROUNDS):
         before = best
         for group in groups:
-            leader = max((best.but(**members) for members in group), key=score)
+            tried = [best.but(**members) for members in group]
+            leader = max([_uphill(each, score) for each in tried] if group is LEVELS else tried, key=score)
             best = leader if score(leader) > score(best) + 0.002 else best
         if best == before:
             break
     return best
+
+
+def _uphill(model: SamplingModel, score: Score) -> SamplingModel:
+    """``model`` with the bias at which the score falls on both sides: it has one peak."""
+    biases = sorted({*BIASES, model.bias})
+    for way in (biases, biases[::-1]):
+        for bias in way[way.index(model.bias) + 1 :]:
+            if score(further := model.but(bias=bias)) <= score(model):
+                break
+            model = further
+    return model
 
 
 MAX_ROUNDS: Final = 4
@@ -147,7 +159,8 @@ BIASES: Final = (0.0, -0.25, 0.25, -0.5, 0.5, -1.0, 1.0)
 
 Group = tuple[dict[str, object], ...]
 
-LEVELS: Final[Group] = tuple({"lod": lod, "bias": bias} for lod in ("longer", "area") for bias in BIASES)
+LEVELS: Final[Group] = {"lod": "longer"}, {"lod": "area"}
+"""Formulas for the level of detail; each is tried with its best bias."""
 
 ALTERNATIVES: Final[tuple[Group, ...]] = (
     ({"encoding": "srgb"}, {"encoding": "power"}),
