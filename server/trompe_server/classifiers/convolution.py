@@ -12,6 +12,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 Images = Float[Tensor, "n c H W"]
+Shape = tuple[Sequence[int], Sequence[int], Sequence[int], int]
+"""Stride, padding, dilation, groups."""
 
 aten = torch.ops.aten
 
@@ -31,37 +33,21 @@ GRADIENTS: Final[Mapping[str, Any]] = {
 
 
 def convolved(
-    images: Images,
-    weight: Tensor,
-    bias: Tensor | None,
-    stride: Sequence[int],
-    padding: Sequence[int],
-    dilation: Sequence[int],
-    groups: int,
-    activation: str,
-    limits: Sequence[float],
+    images: Images, weight: Tensor, bias: Tensor | None, shape: Shape, activation: str, limits: Sequence[float] = ()
 ) -> Images:
-    """``activation`` (of ``limits``, for ``hardtanh``) of the convolution of ``images``. Weights are constant."""
-    shape = stride, padding, dilation, groups
+    """``activation`` (with the ``limits`` of a ``hardtanh``) of a convolution of ``images`` with constant weights."""
     differentiable = torch.is_grad_enabled() and images.requires_grad
     if images.device.type != "cpu" or not ONEDNN or (differentiable and activation not in GRADIENTS):
         result: Tensor = ACTIVATIONS[activation](F.conv2d(images, weight, bias, *shape), *limits)
         return result
     run: Callable[..., Images] = _Convolved.apply if differentiable else _pointwise
-    return run(images, weight, bias, *shape, activation, limits)
+    return run(images, weight, bias, shape, activation, limits)
 
 
 def _pointwise(
-    images: Images,
-    weight: Tensor,
-    bias: Tensor | None,
-    stride: Sequence[int],
-    padding: Sequence[int],
-    dilation: Sequence[int],
-    groups: int,
-    activation: str,
-    limits: Sequence[float],
+    images: Images, weight: Tensor, bias: Tensor | None, shape: Shape, activation: str, limits: Sequence[float]
 ) -> Images:
+    stride, padding, dilation, groups = shape
     run = torch.ops.mkldnn._convolution_pointwise
     result: Tensor = run(images, weight, bias, padding, stride, dilation, groups, activation, limits, "")
     return result
@@ -72,15 +58,15 @@ class _Convolved(torch.autograd.Function):
     def forward(ctx: Any, images: Images, weight: Tensor, *others: Any) -> Images:
         result = _pointwise(images, weight, *others)
         ctx.save_for_backward(images, weight, result)
-        ctx.others = others
+        _, *ctx.others = others
         return result
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> Any:
         images, weight, result = ctx.saved_tensors
-        _, stride, padding, dilation, groups, activation, limits = ctx.others
+        (stride, padding, dilation, groups), activation, limits = ctx.others
         gradient = GRADIENTS[activation](gradients[0], result, *limits)
         shape = stride, padding, dilation, False, [0, 0], groups
         wanted = [True, False, False]  # of images, weight and bias
         found, *_ = aten.convolution_backward(gradient, images, weight, None, *shape, wanted)
-        return found, *[None] * (1 + len(ctx.others))
+        return found, None, None, None, None, None

@@ -82,9 +82,10 @@ def _fused(network: fx.GraphModule) -> fx.GraphModule:
         following = next(iter(node.users))
         if len(node.users) > 1 or following.target not in NAMES:
             continue
-        named = NAMES[following.target], list(following.args[1:])
+        images, weight, bias, *shape = _arguments(node)
+        named = NAMES[following.target], following.args[1:]
         with network.graph.inserting_before(node):
-            fused = network.graph.call_function(convolved, (*_arguments(node), *named))
+            fused = network.graph.call_function(convolved, (images, weight, bias, tuple(shape), *named))
         following.replace_all_uses_with(fused)
     network.graph.eliminate_dead_code()
     network.recompile()

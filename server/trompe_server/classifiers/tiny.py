@@ -59,7 +59,7 @@ class FoldedTinyNet(nn.Module):
         features = (images - MEAN) / SPREAD
         for each in self.convolutions:
             assert isinstance(each, nn.Conv2d)
-            features = convolved(features, each.weight, each.bias, each.stride, (1, 1), (1, 1), 1, "relu", [])
+            features = convolved(features, each.weight, each.bias, (each.stride, (1, 1), (1, 1), 1), "relu")
         logits: Tensor = self.head(features.mean(dim=(2, 3)))
         return logits
 
