@@ -395,6 +395,12 @@ def test_convolutions_pad_and_apply_their_activations_with_equal_logits_and_grad
     torch.testing.assert_close(*(torch.autograd.grad(x[:, 0].sum(), images)[0] for x in (found, expected)))
 
 
+def test_without_onednn_the_shipped_network_gives_equal_logits_and_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = logits_and_gradients("tiny", "cpu", 2)
+    monkeypatch.setattr("trompe_server.classifiers.convolution.ONEDNN", False)
+    torch.testing.assert_close(logits_and_gradients("tiny", "cpu", 2), found)
+
+
 @pytest.mark.parametrize(
     "function",
     [
