@@ -86,19 +86,20 @@ class Dispatcher:
             return 0.0 if self.step() else self._interval
         except DatabaseDownError as error:
             self._heard_since = self._clock()
-            return self._failed(str(error), RETRY)
+            self._report(str(error))
         except ServiceError as error:
             self._abandon()
-            return self._failed(str(error), self._interval)
+            self._report(str(error))
+            return self._interval
         except Exception as error:
-            return self._failed(f"the dispatcher failed ({type(error).__name__}: {error})", RETRY, trace=error)
+            self._report(f"the dispatcher failed ({type(error).__name__}: {error})", trace=error)
+        return RETRY
 
-    def _failed(self, fault: str, pause: float, trace: Exception | None = None) -> float:
-        """Log a new fault. Returns the seconds to wait, ``pause``."""
+    def _report(self, fault: str, trace: Exception | None = None) -> None:
+        """Log a fault, if it is new."""
         if fault != self.fault:
             logger.error("%s Retrying.", fault, exc_info=trace)
         self.fault = fault
-        return pause
 
     def step(self) -> bool:
         """Dispatch once. Returns whether this dispatcher has the lease.

@@ -162,7 +162,7 @@ class _Phases:
         job, started = self._open(), time.perf_counter()
         report = job.run(phase, self._on_progress)
         kind = phase.partition("-")[0]  # of attack-003: attack
-        self._runner.count_work((kind, time.perf_counter() - started, dict(report.counts)))
+        self._runner.count_work((kind, time.perf_counter() - started, report.counts))
         return report
 
     def _record(self, report: PhaseReport, *, done: int) -> None:

@@ -124,7 +124,7 @@ def _climbed(best: SamplingModel, score: Score) -> SamplingModel:
     """The best hypothesis reachable from ``best`` by changing one group of members at a time."""
     groups = FILTERED if best.samples == "grid" else ALTERNATIVES if best.anisotropy == 1 else ELONGATED
     if best.minified != "mipmaps":
-        groups = tuple(group for group in groups if "bias" not in group[0])
+        groups = tuple(group for group in groups if not group[0].keys() & {"lod", "bias"})
     for _ in range(MAX_ROUNDS):
         before = best
         for group in groups:

@@ -23,7 +23,7 @@ def test_jobs_are_counted_by_state_and_the_age_of_the_queue_is_told(stocked: Api
     samples = scrape(stocked)
     assert samples["trompe_jobs", "queued"] == 2
     assert samples["trompe_jobs", "failed"] == 1
-    assert samples["trompe_attack_steps_total",] >= 0, "told before a worker has counted any"
+    assert ("trompe_attack_steps_total",) in samples, "told before a worker has counted any"
     assert {key[1] for key in samples if key[0] == "trompe_jobs"} == {state.value for state in JobState}
     assert 0 < samples["trompe_queue_age_seconds",] < 60
 

@@ -21,11 +21,13 @@ from trompe_server.surrogate import SamplingModel, Surrogate, prepare_geometry, 
 from trompe_server.surrogate.calibration import (
     CALIBRATED_GREYS,
     CURVE_GREYS,
+    FINEST,
     SATISFYING,
     TRIAL_VIEWS,
     Calibration,
     build_surrogate,
     calibrate,
+    find_physics,
     find_sampling,
     painted_grey,
     painted_noise,
@@ -281,6 +283,17 @@ def test_a_bias_between_those_that_are_tried_is_read_off_a_parabola() -> None:
     found = find_sampling(lambda model: 0.99 - 0.2 * (model.bias - 0.38) ** 2)
     assert found.bias == pytest.approx(0.38, abs=0.01)
     assert found.but(bias=0.0) == SamplingModel()
+
+
+def test_where_there_are_no_mip_levels_none_is_looked_for() -> None:
+    tried: list[SamplingModel] = []
+
+    def score(model: SamplingModel) -> float:
+        tried.append(model)
+        return 0.5 + 0.3 * (model.minified == "linear")
+
+    assert find_physics(SamplingModel(), score, (FINEST,)).minified == "linear"
+    assert {model.lod for model in tried if model.minified == "linear"} == {"longer"}
 
 
 @default_sampling()
