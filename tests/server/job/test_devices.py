@@ -25,6 +25,7 @@ from trompe_server.attack import (
     start,
 )
 from trompe_server.classifiers import NetworkClassifier, load_classifier
+from trompe_server.job import setup
 from trompe_server.job.texture_attack import CHUNK
 from trompe_server.library import Library
 from trompe_server.surrogate import SamplingModel, diffuse_surrogate, prepare_geometry, textures_of
@@ -64,6 +65,7 @@ def done(kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *, device: st
 def test_a_job_on_another_device_is_the_same_job(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trompe_server.classifiers.convolution.ONEDNN", False)  # other devices have other operators
     monkeypatch.setattr("trompe_server.classifiers.registry.fastest_format", lambda _: torch.contiguous_format)
+    monkeypatch.setattr(setup, "_loaded", setup._loaded.__wrapped__)  # other tests may have loaded it already
     expected = done(kind, tmp_path / "cpu", monkeypatch, device="cpu")
     found = done(kind, tmp_path / "other", monkeypatch, device=pretend_device(monkeypatch))
     files, others = found.lasting(), expected.lasting()
