@@ -6,6 +6,7 @@ surrogate's canvas.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial, reduce
 from typing import NamedTuple
 
 import torch
@@ -13,14 +14,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from trompe_server.attack.goal import Goal
-from trompe_server.classifiers import WhiteBoxClassifier
+from trompe_server.classifiers import ScoreBasedClassifier, WhiteBoxClassifier
 from trompe_server.classifiers.protocol import AT_ONCE
 from trompe_server.image_pipelines import Drawn
 from trompe_server.surrogate import AnyCanvas, AnySurrogate
+from trompe_server.system.threads import in_parts
 from trompe_shared.errors import SpecError
 
 Textures = Mapping[str, Float[Tensor, "H W 3"]]
 Flat = Float[Tensor, "texels 3"]
+Rows = Mapping[int, Int[Tensor, " _"]]
+"""Rows of each batch that has any."""
 
 
 def members_of(
@@ -58,12 +62,23 @@ class Score(NamedTuple):
     loss: float
 
 
+class _Part(NamedTuple):
+    """Gradient of the texels that are read, summed loss, fooled and settled views, and images of some groups."""
+
+    gradient: Float[Tensor, "reads 3"]
+    loss: float
+    won: int
+    settled: Int[Tensor, " _"]
+    images: int
+
+
 @dataclass(frozen=True)
 class Objective:
     """Expected loss of a goal over a surrogate's views, averaged over the classifiers.
 
     masks: pixels (saliency) that pass gradients; all by default. canvas: the texels that may move. pipeline: what
-    happens to the images before the classifiers; nothing by default. Raises ``SpecError`` if a classifier's image
+    happens to the images before the classifiers; nothing by default. settling: most images are expected to be safely
+    won; saves time, changes nothing else. Raises ``SpecError`` if a classifier's image
     size differs from the surrogate's.
     """
 
@@ -74,6 +89,7 @@ class Objective:
     masks: Bool[Tensor, "views H W"] | None
     canvas: AnyCanvas
     pipeline: Drawn | None = None
+    settling: bool = False
 
     def __post_init__(self) -> None:
         size = self.surrogate.size
@@ -110,34 +126,52 @@ class Objective:
         """
         leaf = (self.source + change).requires_grad_()
         texels = self.canvas.read(leaf)
-        read = texels.detach().requires_grad_()
-        losses, won, settled, images = 0.0, 0, [], 0
-        for group in self._groups(batches):
-            found = {batch: active[views.start : views.stop].nonzero()[:, 0] for batch, views in group.items()}
-            chosen = {batch: some for batch, some in found.items() if len(some)}
-            skipped = sum(map(len, group.values())) - sum(map(len, chosen.values()))
-            losses, won = losses + skipped * self.goal.safe, won + skipped
-            if chosen:
-                numbers = torch.cat([some + group[batch].start for batch, some in chosen.items()])
-                loss, reached, safe = self._add_gradient(read, chosen, numbers)
-                losses, won, images = losses + loss, won + reached, images + len(numbers)
-                settled.append(numbers[safe])
-        count = sum(len(self.surrogate.batches[batch]) for batch in batches)
+        chosen = [rows for group in self._groups(batches) if (rows := _chosen(group, active))]
+        part = partial(self._part, texels.detach())
+        parts = (
+            in_parts(part, chosen) if self._on_cpu and not self.estimated else [part(some) for some in [chosen] if some]
+        )
+        count, images = sum(len(self.surrogate.batches[batch]) for batch in batches), sum(part.images for part in parts)
         gradient = torch.zeros_like(leaf)
-        if read.grad is not None:
-            gradient = torch.autograd.grad(texels, leaf, read.grad)[0].nan_to_num_(0, 0, 0)
+        if images:
+            at_texels = reduce(torch.add, (part.gradient for part in parts))
+            gradient = torch.autograd.grad(texels, leaf, at_texels)[0].nan_to_num_(0, 0, 0)
+        skipped = count - images
         return Evaluation(
             gradient,
-            losses / count,
-            won / count,
-            torch.cat(settled) if settled else active.new_zeros(0, dtype=torch.long),
+            (sum(part.loss for part in parts) + skipped * self.goal.safe) / count,
+            (sum(part.won for part in parts) + skipped) / count,
+            torch.cat([active.new_zeros(0, dtype=torch.long), *(part.settled for part in parts)]),
             images,
         )
+
+    @property
+    def estimated(self) -> bool:
+        """Whether any gradient is estimated from many scores."""
+        return any(isinstance(member, ScoreBasedClassifier) for member in self.members)
+
+    @property
+    def _on_cpu(self) -> bool:
+        return self.source.device.type == "cpu"
+
+    def _part(self, texels: Float[Tensor, "reads 3"], groups: Sequence[Rows]) -> _Part:
+        """Loss and gradient of ``texels`` over some groups of views, one after the other."""
+        read, loss, won = texels.detach().requires_grad_(), 0.0, 0
+        numbers = [
+            torch.cat([some + self.surrogate.batches[batch].start for batch, some in rows.items()]) for rows in groups
+        ]
+        settled = []
+        for rows, views in zip(groups, numbers, strict=True):
+            its_loss, reached, safe = self._add_gradient(read, rows, views)
+            loss, won = loss + its_loss, won + reached
+            settled.append(views[safe])
+        gradient = torch.zeros_like(texels) if read.grad is None else read.grad
+        return _Part(gradient, loss, won, torch.cat(settled), sum(map(len, numbers)))
 
     def _groups(self, batches: Sequence[int]) -> Iterator[dict[int, range]]:
         """The views of ``batches`` by batch: on a CPU each batch alone, elsewhere as many as one pass of a network
         takes."""
-        most, group = 1 if self.source.device.type == "cpu" else AT_ONCE, dict[int, range]()
+        most, group = 1 if self._on_cpu else AT_ONCE, dict[int, range]()
         for batch in batches:
             views = self.surrogate.batches[batch]
             if group and sum(map(len, group.values())) + len(views) > most:
@@ -148,7 +182,7 @@ class Objective:
             yield group
 
     def _add_gradient(
-        self, read: Float[Tensor, "reads 3"], chosen: Mapping[int, Int[Tensor, " _"]], numbers: Int[Tensor, " chosen"]
+        self, read: Float[Tensor, "reads 3"], chosen: Rows, numbers: Int[Tensor, " chosen"]
     ) -> tuple[float, int, Bool[Tensor, " chosen"]]:
         """Add the gradient of the ``chosen`` views of some batches, the views ``numbers`` of all, to ``read.grad``.
 
@@ -169,13 +203,29 @@ class Objective:
     def _of_member(self, member: WhiteBoxClassifier, images: Tensor) -> tuple[Tensor, float, Tensor, Tensor]:
         """Gradient of the summed loss of one classifier, the loss, and masks of reached and settled images.
 
-        Each has its own graph: the activations of one network are most of an attack's memory.
+        Each has its own graph: the activations of one network are most of an attack's memory. If most images are
+        expected to be settled, their logits come first, and a graph only for those with a gradient.
         """
+        if self.settling and self._on_cpu and not self.estimated:
+            with torch.no_grad():
+                logits = member.logits(images)
+            rows = (~self.goal.settled(logits)).nonzero()[:, 0]
+            gradient = (
+                _placed(self._gradient(member, _rows(images, rows))[0], images, rows)
+                if len(rows)
+                else torch.zeros_like(images)
+            )
+        else:
+            gradient, logits = self._gradient(member, images)
+        loss = float(self.goal.losses(logits).sum())
+        return gradient, loss, self.goal.reached(logits), self.goal.settled(logits)
+
+    def _gradient(self, member: WhiteBoxClassifier, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient of the summed loss of one classifier, and its logits."""
         images.requires_grad_()
         logits = member.logits(images)
-        loss = self.goal.losses(logits).sum()
-        (gradient,) = torch.autograd.grad(loss, images)
-        return gradient, float(loss.detach()), self.goal.reached(logits), self.goal.settled(logits)
+        (gradient,) = torch.autograd.grad(self.goal.losses(logits).sum(), images)
+        return gradient, logits.detach()
 
     @torch.no_grad()
     def score(self, change: Flat) -> Score:
@@ -187,6 +237,12 @@ class Objective:
             won += int(torch.stack([self.goal.reached(each) for each in logits]).all(0).sum())
             total += float(torch.stack([self.goal.losses(each).sum() for each in logits]).mean())
         return Score(won / self.surrogate.n_views, total / self.surrogate.n_views)
+
+
+def _chosen(group: Mapping[int, range], active: Bool[Tensor, " views"]) -> Rows:
+    """The active views of a group."""
+    rows = {batch: active[views.start : views.stop].nonzero()[:, 0] for batch, views in group.items()}
+    return {batch: some for batch, some in rows.items() if len(some)}
 
 
 def _rows(images: Float[Tensor, "n 3 H W"], chosen: Int[Tensor, " chosen"]) -> Float[Tensor, "chosen 3 H W"]:

@@ -52,5 +52,10 @@ class NetworkClassifier:
 
     def predict(self, images: Images) -> Logits:
         """Logits (N, n_classes), all finite, of uint8 images (N, H, W, 3) of any size."""
-        batch = BATCH if torch.device(self.device).type == "cpu" else AT_ONCE
-        return predicted(self.scores, images, self.image_size, self.n_classes, batch=batch, device=self.device)
+        cpu = torch.device(self.device).type == "cpu"
+        return predicted(
+            *(self.scores, images, self.image_size, self.n_classes),
+            batch=BATCH if cpu else AT_ONCE,
+            device=self.device,
+            in_threads=cpu,
+        )

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from trompe_server.spec.checks import Classes
+from trompe_server.system.threads import side_by_side
 from trompe_shared.errors import ClassifierError
 
 BATCH: Final = 10
@@ -46,7 +47,7 @@ class Classifier(Classes, Protocol):
 
 @runtime_checkable
 class WhiteBoxClassifier(Classifier, Protocol):
-    """A classifier with logits differentiable in the images."""
+    """A classifier with logits differentiable in the images. An attack calls it from two threads at once."""
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
         """Logits of sRGB images in [0, 1] of size ``image_size``; the parameters are frozen."""
@@ -83,8 +84,10 @@ def predicted(
     *,
     batch: int = BATCH,
     device: str = "cpu",
+    in_threads: bool = False,
 ) -> Logits:
-    """Logits (N, n_classes), all finite, of images of any size, by a network of ``size`` (H, W) on ``device``.
+    """Logits (N, n_classes), all finite, of images of any size, by a network of ``size`` (H, W) on ``device``;
+    ``in_threads``: some images at once.
 
     Raises ``ClassifierError`` unless the images are (N, H, W, 3) uint8.
     """
@@ -93,10 +96,13 @@ def predicted(
             f"Images of shape {images.shape} and type {images.dtype} cannot be classified; "
             "pass (N, H, W, 3) uint8, sRGB."
         )
-    chunks = [np.zeros((0, n_classes), np.float32)]
-    for start in range(0, len(images), batch):
-        chunks.append(finite(logits(fit_images(images[start : start + batch], size, device))).cpu().numpy())
-    return np.concatenate(chunks)
+
+    def of(start: int) -> Logits:
+        return finite(logits(fit_images(images[start : start + batch], size, device))).cpu().numpy()
+
+    starts = range(0, len(images), batch)
+    chunks = side_by_side(of, starts) if in_threads else list(map(of, starts))
+    return np.concatenate([np.zeros((0, n_classes), np.float32), *chunks])
 
 
 def finite(logits: Float[Tensor, "n classes"]) -> Float[Tensor, "n classes"]:

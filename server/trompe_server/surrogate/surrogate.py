@@ -31,6 +31,7 @@ from trompe_server.surrogate.rasterize import Mesh, Visibility, mesh_of, project
 from trompe_server.surrogate.sampling import FilteredGather, Gather, SamplingModel, Taps, fragments_of, taps_of
 from trompe_server.surrogate.shading import Chord, CurveShading, DiffuseShading, decode, encode, fit_curve, lambert
 from trompe_server.surrogate.tone import ToneMap, ToneShading, fit_tone
+from trompe_server.system.threads import side_by_side
 from trompe_shared.geometry import Camera, View, spherical
 from trompe_shared.object3d import Object3D
 
@@ -178,7 +179,10 @@ def prepare_geometry(
             known[camera] = _visible(mesh, None, camera, size, sampling)
         return known[camera]
 
-    prepared = [_prepare_view(mesh, layout, opacities, view, visible(view.camera), size, sampling) for view in views]
+    def prepare(view: View) -> _View:
+        return _prepare_view(mesh, layout, opacities, view, visible(view.camera), size, sampling)
+
+    prepared = side_by_side(prepare, views) if torch.device(device).type == "cpu" else list(map(prepare, views))
     reads = _in_order_of_reading([view.taps.index for view in prepared], layout)
     starts = itertools.chain.from_iterable(layout.starts)
     texels = torch.cat([level + start for level, start in zip(reads, starts, strict=True)])

@@ -1,5 +1,6 @@
 """The attack loop on a small scene: ascent, budget, resumption, skipped views, safe margin, odd classifiers."""
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -411,6 +412,38 @@ def test_only_active_views_are_evaluated() -> None:
     none = objective.evaluate(change, BATCHES, torch.zeros(12, dtype=torch.bool))
     assert (none.images, none.loss, none.fooled) == (0, SAFE_MARGIN, 1.0)
     assert not none.gradient.any()
+
+
+def test_logits_before_gradients_change_nothing() -> None:
+    objective, change, active = objective_of(), torch.zeros(512, 3), torch.ones(12, dtype=torch.bool)
+    with torch.no_grad():
+        margins = objective.goal.margins(objective.members[0].logits(SURROGATE.render_all(objective.texels(change))))
+    objective = replace(objective, goal=replace(objective.goal, safe=float(margins.sort().values[5:7].mean())))
+    at_once, after = (
+        replace(objective, settling=settling).evaluate(change, BATCHES, active) for settling in (False, True)
+    )
+    assert 0 < len(at_once.settled) < 12
+    torch.testing.assert_close(after.gradient, at_once.gradient, atol=1e-6, rtol=1e-4)
+    assert after.settled.tolist() == at_once.settled.tolist()
+    assert (after.fooled, after.images) == (at_once.fooled, 12)
+    assert after.loss == pytest.approx(at_once.loss)
+
+
+def test_gradients_are_asked_of_unsettled_images_alone_once_most_are_settled(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_graph: list[int] = []
+    classifier = fooled_classifier()
+    logits = type(classifier).logits
+
+    def counted(self: NetworkClassifier, images: Tensor) -> Tensor:
+        with_graph.append(len(images) if torch.is_grad_enabled() else 0)
+        return logits(self, images)
+
+    monkeypatch.setattr(type(classifier), "logits", counted)
+    state = run(classifier=classifier, budget=Budget(0.1, 0.1), steps=1, total_steps=5)
+    assert sum(with_graph) == 12
+    with_graph.clear()
+    run(state=state, classifier=classifier, budget=Budget(0.1, 0.1), steps=4)
+    assert with_graph == [0] * len(with_graph) != []
 
 
 # The safe margin, and the end of a search
