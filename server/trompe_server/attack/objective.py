@@ -78,8 +78,8 @@ class Objective:
 
     masks: pixels (saliency) that pass gradients; all by default. canvas: the texels that may move. pipeline: what
     happens to the images before the classifiers; nothing by default. settling: most images are expected to be safely
-    won; saves time, changes nothing else. Raises ``SpecError`` if a classifier's image
-    size differs from the surrogate's.
+    won; saves time, changes nothing else. Raises ``SpecError`` if a classifier's image size differs from the
+    surrogate's.
     """
 
     textures: Textures
@@ -128,9 +128,7 @@ class Objective:
         texels = self.canvas.read(leaf)
         chosen = [rows for group in self._groups(batches) if (rows := _chosen(group, active))]
         part = partial(self._part, texels.detach())
-        parts = (
-            in_parts(part, chosen) if self._on_cpu and not self.estimated else [part(some) for some in [chosen] if some]
-        )
+        parts = in_parts(part, chosen) if self._plain else [part(some) for some in [chosen] if some]
         count, images = sum(len(self.surrogate.batches[batch]) for batch in batches), sum(part.images for part in parts)
         gradient = torch.zeros_like(leaf)
         if images:
@@ -153,6 +151,11 @@ class Objective:
     @property
     def _on_cpu(self) -> bool:
         return self.source.device.type == "cpu"
+
+    @property
+    def _plain(self) -> bool:
+        """Whether the work may be split as suits a processor, and an image be shown twice."""
+        return self._on_cpu and not self.estimated
 
     def _part(self, texels: Float[Tensor, "reads 3"], groups: Sequence[Rows]) -> _Part:
         """Loss and gradient of ``texels`` over some groups of views, one after the other."""
@@ -206,15 +209,12 @@ class Objective:
         Each has its own graph: the activations of one network are most of an attack's memory. If most images are
         expected to be settled, their logits come first, and a graph only for those with a gradient.
         """
-        if self.settling and self._on_cpu and not self.estimated:
+        if self.settling and self._plain:
             with torch.no_grad():
                 logits = member.logits(images)
-            rows = (~self.goal.settled(logits)).nonzero()[:, 0]
-            gradient = (
-                _placed(self._gradient(member, _rows(images, rows))[0], images, rows)
-                if len(rows)
-                else torch.zeros_like(images)
-            )
+            rows, gradient = (~self.goal.settled(logits)).nonzero()[:, 0], torch.zeros_like(images)
+            if len(rows):
+                gradient.index_copy_(0, rows, self._gradient(member, _rows(images, rows))[0])
         else:
             gradient, logits = self._gradient(member, images)
         loss = float(self.goal.losses(logits).sum())
