@@ -128,7 +128,7 @@ class Objective:
         texels = self.canvas.read(leaf)
         chosen = [rows for group in self._groups(batches) if (rows := _chosen(group, active))]
         part = partial(self._part, texels.detach())
-        parts = in_parts(part, chosen) if self._plain else [part(some) for some in [chosen] if some]
+        parts = in_parts(part, chosen, split=self._plain)
         count, images = sum(len(self.surrogate.batches[batch]) for batch in batches), sum(part.images for part in parts)
         gradient = torch.zeros_like(leaf)
         if images:

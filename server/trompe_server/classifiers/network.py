@@ -57,5 +57,5 @@ class NetworkClassifier:
             *(self.scores, images, self.image_size, self.n_classes),
             batch=BATCH if cpu else AT_ONCE,
             device=self.device,
-            in_threads=cpu,
+            split=cpu,
         )

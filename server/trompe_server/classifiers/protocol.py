@@ -84,10 +84,10 @@ def predicted(
     *,
     batch: int = BATCH,
     device: str = "cpu",
-    in_threads: bool = False,
+    split: bool = False,
 ) -> Logits:
     """Logits (N, n_classes), all finite, of images of any size, by a network of ``size`` (H, W) on ``device``;
-    ``in_threads``: some images at once.
+    ``split``: in parts of torch's threads.
 
     Raises ``ClassifierError`` unless the images are (N, H, W, 3) uint8.
     """
@@ -101,7 +101,7 @@ def predicted(
         return finite(logits(fit_images(images[start : start + batch], size, device))).cpu().numpy()
 
     starts = range(0, len(images), batch)
-    chunks = side_by_side(of, starts) if in_threads else list(map(of, starts))
+    chunks = side_by_side(of, starts, split=split)
     return np.concatenate([np.zeros((0, n_classes), np.float32), *chunks])
 
 

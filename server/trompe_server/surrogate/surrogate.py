@@ -182,7 +182,7 @@ def prepare_geometry(
     def prepare(view: View) -> _View:
         return _prepare_view(mesh, layout, opacities, view, visible(view.camera), size, sampling)
 
-    prepared = side_by_side(prepare, views) if torch.device(device).type == "cpu" else list(map(prepare, views))
+    prepared = side_by_side(prepare, views, split=torch.device(device).type == "cpu")
     reads = _in_order_of_reading([view.taps.index for view in prepared], layout)
     starts = itertools.chain.from_iterable(layout.starts)
     texels = torch.cat([level + start for level, start in zip(reads, starts, strict=True)])

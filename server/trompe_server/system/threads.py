@@ -48,15 +48,17 @@ def in_threads(make: Callable[..., T], *items: Iterable[Any]) -> list[T]:
         return list(executor.map(lambda row: make(*row), rows))
 
 
-def in_parts(work: Callable[[Sequence[S]], T], items: Sequence[S]) -> list[T]:
-    """``work`` of each second of the ``items``, and of the others: side by side, each with half of torch's threads.
+def in_parts(work: Callable[[Sequence[S]], T], items: Sequence[S], *, split: bool = True) -> list[T]:
+    """``work`` of each second of the ``items``, and of the others: side by side, each with half of torch's threads;
+    of all at once unless ``split``.
 
     Two small batches at once wait less for each other and for Python than one batch on twice as many threads. The parts
     are the same for any number of threads, and so are sums over them. ``work`` begins with gradients enabled.
     """
     import torch  # reads the settings above once
 
-    parts, count = [items[first::PARTS] for first in range(min(PARTS, len(items)))], torch.get_num_threads()
+    step, count = PARTS if split else 1, torch.get_num_threads()
+    parts = [items[first::step] for first in range(min(step, len(items)))]
     if len(parts) < PARTS or count < PARTS or threading.current_thread().name.startswith(IN_PARTS):
         return [work(part) for part in parts]
     return list(_parts(os.getpid(), count).map(work, parts))
@@ -79,9 +81,9 @@ def _parts(process: int, count: int) -> ThreadPoolExecutor:
     return executor
 
 
-def side_by_side(work: Callable[[S], T], items: Sequence[S]) -> list[T]:
+def side_by_side(work: Callable[[S], T], items: Sequence[S], *, split: bool = True) -> list[T]:
     """``work`` of each item, in parts."""
-    parts = in_parts(lambda part: list(map(work, part)), items)
+    parts = in_parts(lambda part: list(map(work, part)), items, split=split)
     return [parts[number % len(parts)][number // len(parts)] for number in range(len(items))]
 
 

@@ -48,6 +48,7 @@ def test_an_error_comes_through(count: int) -> None:
 def test_parts_and_results_are_the_same_for_any_number_of_threads(torch_threads: int, count: int) -> None:
     parts = [list(part) for part in (range(0, count, 2), range(1, count, 2)) if part]
     assert in_parts(list, range(count)) == parts
+    assert in_parts(list, range(count), split=False) == [list(range(count))] * bool(count)
     assert side_by_side(lambda k: k * k, range(count)) == [k * k for k in range(count)]
 
 
