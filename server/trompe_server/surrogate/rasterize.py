@@ -46,6 +46,9 @@ micrometres, below the resolution of depth buffers, too.
 MARGIN = 1
 """Pixels around the image with triangles, for samples up to a pixel outside of their own."""
 
+ROUNDING = 2.0**-20
+"""Error of a barycentric in single precision, relative to its largest term; a few times more than there is."""
+
 LAYERS = 8
 """Most blended triangles in front of each other at one sample; the rest behind them is ignored."""
 
@@ -217,7 +220,7 @@ def rasterize(
     else:
         nearest = torch.cat(_peeled(planes, size, samples, drawn, blended), 1)
     pixel = (nearest >= 0).any(1).nonzero()[:, 0]
-    keys = nearest[pixel]
+    keys = nearest.index_select(0, pixel)
     row = torch.where(keys >= 0, 0xFFFFFFFF - (keys & 0xFFFFFFFF), -1)
     return Visibility(planes, pixel, row)
 
@@ -260,34 +263,64 @@ def _nearest(
     height, width = size
     nearest = torch.full((height * width * len(samples),), -1, dtype=torch.int64, device=planes.face.device)
     extent = (planes.box[:, 2:] - planes.box[:, :2] + 1).clamp(min=0)
-    counts = extent[:, 0] * extent[:, 1]
+    coefficients = planes.edges.flatten(1).T.contiguous()
 
     def draw(start: int, stop: int) -> None:
-        """Test triangles ``start:stop`` against the pixels of their boxes."""
-        row, within = numbered(counts[start:stop])
+        """Test triangles ``start:stop`` against the pixels that they may cover."""
+        row, x, y = _reached(planes.box[start:stop], _bounds(planes.edges[start:stop], size, samples))
         row += start
-        box = planes.box[row]
-        columns = box[:, 2] - box[:, 0] + 1
-        x, y = box[:, 0] + within % columns, box[:, 1] + within // columns
         if drawn is not None:
             row, x, y = (values[drawn(row, x, y)] for values in (row, x, y))
-        edges = planes.edges[row]
-        at_corner = edges[:, 0] * x[:, None] + edges[:, 1] * y[:, None] + edges[:, 2]
+        across, down, constant = coefficients.index_select(1, row).view(3, 3, -1)
+        at_corner = across * x + down * y + constant
         base = (y * width + x) * len(samples)
         for index, (sx, sy) in enumerate(samples):
-            value = at_corner + edges[:, 0] * sx + edges[:, 1] * sy
-            inverse_depth = value.sum(1)
+            value = at_corner + across * sx + down * sy
+            inverse_depth = value.sum(0)
             seen = _inside(value, inverse_depth, planes.near).nonzero()[:, 0]
-            bits = inverse_depth[seen].contiguous().view(torch.int32).long() & ~TIE
-            keys, place = (bits << 32) | (0xFFFFFFFF - row[seen]), base[seen] + index
+            bits = inverse_depth.index_select(0, seen).view(torch.int32).long() & ~TIE
+            keys = (bits << 32) | (0xFFFFFFFF - row.index_select(0, seen))
+            place = base.index_select(0, seen) + index
             if between is not None:
                 inside = (keys > between[0][place]) & (keys < between[1][place])
                 keys, place = keys[inside], place[inside]
             nearest.scatter_reduce_(0, place, keys, "amax")
 
-    for run in chunks(counts):
+    for run in chunks(extent[:, 0] * extent[:, 1]):
         draw(*run)
     return nearest.view(-1, len(samples))
+
+
+def _bounds(
+    edges: Float[Tensor, "n 3 3"], size: tuple[int, int], samples: Samples
+) -> Float[Tensor, "coefficients corners n"]:
+    """Linear functions of the pixel that are negative only where a corner's barycentric is negative at all samples."""
+    edges = edges.double().permute(1, 2, 0)
+    most = torch.stack([edges[0] * sx + edges[1] * sy for sx, sy in samples]).amax(0)
+    side = torch.tensor([size[1] + 2 * MARGIN, size[0] + 2 * MARGIN, 1], device=edges.device)
+    rounding = (edges.abs() * side[:, None, None]).sum(0) * ROUNDING
+    return torch.stack([edges[0], edges[1], edges[2] + most + rounding])
+
+
+def _reached(
+    box: Int[Tensor, "n 4"], bounds: Float[Tensor, "coefficients corners n"]
+) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"], Int[Tensor, " m"]]:
+    """Triangles with the pixels (x, y) of their boxes where none of their ``bounds`` is negative: a span of each row.
+
+    The box of a long diagonal triangle has ten times as many pixels.
+    """
+    first, top, last, bottom = box.unbind(1)
+    owner, line = numbered(torch.where(last >= first, bottom - top + 1, 0).clamp(min=0))
+    y = top.index_select(0, owner) + line
+    across, down, constant = bounds.flatten(0, 1).index_select(1, owner).view(3, 3, -1)
+    rest = down * y + constant
+    crossing = -rest / across
+    left = torch.where(across > 0, crossing, -math.inf).amax(0).ceil().maximum(first.index_select(0, owner))
+    right = torch.where(across < 0, crossing, math.inf).amin(0).floor().minimum(last.index_select(0, owner))
+    none = ((across == 0) & (rest < 0)).any(0)
+    counts = torch.where(none, 0, right - left + 1).clamp(min=0).nan_to_num(0.0).long()
+    place, within = numbered(counts)
+    return owner.index_select(0, place), left.long().index_select(0, place) + within, y.index_select(0, place)
 
 
 def _candidates(box: Int[Tensor, "n 4"], size: tuple[int, int], samples: Samples) -> Int[Tensor, "n 4"]:
@@ -315,7 +348,8 @@ def chunks(counts: Int[Tensor, " n"]) -> list[tuple[int, int]]:
 def numbered(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
     """(Item, number within the item) of all candidates, ``counts`` of each item."""
     item = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
-    return item, torch.arange(len(item), device=counts.device) - (counts.cumsum(0) - counts)[item]
+    start = (counts.cumsum(0) - counts).index_select(0, item)
+    return item, torch.arange(len(item), device=counts.device) - start
 
 
 def covered(
@@ -324,8 +358,8 @@ def covered(
     """Whether triangles cover each sample of the pixels (x, y)."""
     edges = planes.edges[row]
     values = [edges[:, 0] * (x + sx)[:, None] + edges[:, 1] * (y + sy)[:, None] + edges[:, 2] for sx, sy in samples]
-    return torch.stack([_inside(value, value.sum(1), planes.near) for value in values], 1)
+    return torch.stack([_inside(value.T, value.sum(1), planes.near) for value in values], 1)
 
 
-def _inside(over_depth: Float[Tensor, "n 3"], inverse_depth: Float[Tensor, " n"], near: float) -> Bool[Tensor, " n"]:
-    return (over_depth >= 0).all(1) & (inverse_depth > 0) & (inverse_depth < 1 / near)
+def _inside(over_depth: Float[Tensor, "3 n"], inverse_depth: Float[Tensor, " n"], near: float) -> Bool[Tensor, " n"]:
+    return (over_depth >= 0).all(0) & (inverse_depth > 0) & (inverse_depth < 1 / near)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -131,10 +132,12 @@ def fragments_of(
     share = same[entry, slot].float()
     row = rows[entry, slot]
     offset = shading_point(share, samples * (n_slots // len(samples)), shade_at)
-    pixel = visibility.pixel[entry]
+    pixel = visibility.pixel.index_select(0, entry)
     point = torch.stack([pixel % width, pixel // width], 1) + offset
     uv, duv, barycentric = texture_coordinates(visibility.planes, mesh, row, point)
-    found = Fragments(visibility.planes.face[row], entry, share.sum(1) / len(samples), uv, duv, barycentric)
+    found = Fragments(
+        visibility.planes.face.index_select(0, row), entry, share.sum(1) / len(samples), uv, duv, barycentric
+    )
     if alpha is None:
         return found
     seen = _composited(entry, share, alpha(found), (len(rows), n_slots // len(samples), len(samples)))
@@ -165,11 +168,11 @@ def texture_coordinates(
     planes: Planes, mesh: Mesh, row: Int[Tensor, " n"], point: Float[Tensor, "n 2"]
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, "n 3"]]:
     """UV, its derivatives by the pixel position, and barycentrics at ``point`` of triangle ``row``."""
-    edges = planes.edges[row]  # (n, abc, corner)
+    edges = planes.edges.index_select(0, row)  # (n, abc, corner)
     over_depth = edges[:, 0] * point[:, :1] + edges[:, 1] * point[:, 1:] + edges[:, 2]
     inverse_depth = over_depth.sum(1, keepdim=True)
     barycentric = over_depth / inverse_depth
-    uvs = mesh.uvs[planes.face[row]]
+    uvs = mesh.uvs.index_select(0, planes.face.index_select(0, row))
     uv = (barycentric[..., None] * uvs).sum(1)
     slope = torch.einsum("nic,ncu->nui", edges[:, :2], uvs) - uv[..., None] * edges[:, :2].sum(2)[:, None, :]
     return uv, slope / inverse_depth[..., None], barycentric
@@ -263,11 +266,13 @@ def taps_of(fragments: Fragments, n_pixels: int, mesh: Mesh, layout: MipLayout, 
     share = fragments.weight / coverage[fragments.entry]
     for texture in range(len(layout.sizes)):
         mine = (mesh.texture[fragments.face] == texture).nonzero()[:, 0]
-        uv, duv, entry, part = fragments.uv[mine], fragments.duv[mine], fragments.entry[mine], share[mine]
+        uv, duv, entry, part = (
+            values.index_select(0, mine) for values in (fragments.uv, fragments.duv, fragments.entry, share)
+        )
         for used, index, weight, blend in reads_of(uv, duv, layout.levels(texture, uv.device), model):
-            entries.append(entry[used, None].expand_as(index).reshape(-1))
+            entries.append(entry.index_select(0, used)[:, None].expand_as(index).reshape(-1))
             indices.append(index.reshape(-1))
-            weights.append((weight * (blend * part[used])[:, None]).reshape(-1))
+            weights.append((weight * (blend * part.index_select(0, used))[:, None]).reshape(-1))
     return _merged(torch.cat(entries), torch.cat(indices), torch.cat(weights), layout.total)
 
 
@@ -369,7 +374,8 @@ def _trilinear(uv: Float[Tensor, "n 2"], level: Float[Tensor, " n"], levels: Lev
     for step in (0, 1):
         blend = (level - lower) if step else 1 - (level - lower)
         used = (blend > 0).nonzero()[:, 0]
-        yield used, *_bilinear(uv[used], lower[used].long() + step, levels), blend[used]
+        near, mip = uv.index_select(0, used), lower.index_select(0, used).long() + step
+        yield used, *_bilinear(near, mip, levels), blend.index_select(0, used)
 
 
 def _finest(uv: Float[Tensor, "n 2"], levels: Levels, *, nearest: bool) -> Reads:
@@ -391,7 +397,7 @@ def _bilinear(
     uv: Float[Tensor, "n 2"], level: Int[Tensor, " n"], levels: Levels
 ) -> tuple[Int[Tensor, "n 4"], Float[Tensor, "n 4"]]:
     """Flat indices and weights of the four texels around ``uv`` at a mip level; textures repeat."""
-    height, width, start = levels[level].unbind(1)
+    height, width, start = levels.index_select(0, level).unbind(1)
     u = uv[:, 0].nan_to_num(0.0).remainder(1.0)
     v = (1 - uv[:, 1].nan_to_num(0.0)).remainder(1.0)
     x, y = u * width - 0.5, v * height - 0.5
@@ -409,7 +415,17 @@ def _merged(
 ) -> Taps:
     """Sorted taps without negligible weights, equal pairs merged."""
     used = (weight > 1e-6).nonzero()[:, 0]
-    pair, order = (entry[used] * n_texels + index[used]).sort(stable=True)
-    pair, which = torch.unique_consecutive(pair, return_inverse=True)
-    total = torch.zeros(len(pair), device=weight.device).index_add_(0, which, weight[used][order].float())
-    return Taps((pair // n_texels).int(), (pair % n_texels).int(), total)
+    pairs = entry.index_select(0, used) * n_texels + index.index_select(0, used)
+    order = _order_of_runs(pairs)
+    pair, which = torch.unique_consecutive(pairs.index_select(0, order), return_inverse=True)
+    ordered = weight.index_select(0, used.index_select(0, order)).float()
+    total = torch.zeros(len(pair), device=weight.device).index_add_(0, which, ordered)
+    pixel = pair // n_texels
+    return Taps(pixel.int(), (pair - pixel * n_texels).int(), total)
+
+
+def _order_of_runs(keys: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
+    """The stable order of ``keys`` in ascending runs, for which numpy's merge sort takes an eighth of torch's time."""
+    if keys.device.type != "cpu":
+        return keys.argsort(stable=True)
+    return torch.from_numpy(np.argsort(keys.numpy(), kind="stable"))

@@ -253,7 +253,7 @@ def _prepare_view(
     alpha = None if opacities is None or opacities.blended is None else opacities.of_fragments
     fragments = fragments_of(visibility, mesh, width, samples=samples, shade_at=sampling.shade_at, alpha=alpha)
     n_pixels = len(visibility.pixel)
-    normals = (fragments.barycentric.clamp(0, 1)[..., None] * mesh.normals[fragments.face]).sum(1)
+    normals = (fragments.barycentric.clamp(0, 1)[..., None] * mesh.normals.index_select(0, fragments.face)).sum(1)
     towards = torch.from_numpy(spherical(view.light.azimuth, view.light.elevation)).float().to(normals.device)
     shade = torch.zeros(n_pixels, 1, device=normals.device)
     shade.index_add_(0, fragments.entry, lambert(normals, towards) * fragments.weight[:, None])

@@ -263,6 +263,31 @@ def test_drawing_in_small_portions_gives_the_same_picture(
     assert (whole >= 0).any()
 
 
+SLIVERS = st.builds(
+    lambda soup, axis, flat: soup * np.where(np.arange(3) == axis, flat, 1.0),
+    triangle_soups(),
+    st.integers(0, 2),
+    st.sampled_from([1e-1, 1e-3, 1e-6, 0.0]),
+)
+OUTSIDE = tuple((x + 0.75, y - 0.9) for x, y in MSAA4)
+EDGE_ON_A_PIXELS_CENTRE = np.array([[[-0.5, 0, -0.5], [0.5, 0, -0.5], [0.5, 0, 0.5]]])
+
+
+@given(SLIVERS, CAMERAS, st.sampled_from([CENTRE, MSAA4, OUTSIDE]))
+@example(EDGE_ON_A_PIXELS_CENTRE, Camera(1, 0, 90), CENTRE)
+@example(EDGE_ON_A_PIXELS_CENTRE, Camera(1, 90, 90), CENTRE)
+@example(EDGE_ON_A_PIXELS_CENTRE, Camera(1, 45, 90), CENTRE)
+@settings(max_examples=200)
+def test_no_sample_of_a_triangle_lies_outside_of_the_spans_that_are_tested(
+    soup: Floats, camera: Camera, samples: Samples
+) -> None:
+    mesh, size = mesh_from(soup), (64, 80)
+    seen = seen_faces(mesh, camera, samples=samples, size=size)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "ROUNDING", 1e12)  # the whole boxes
+        assert (seen_faces(mesh, camera, samples=samples, size=size) == seen).all()
+
+
 def test_a_mesh_keeps_the_order_of_its_parts_and_says_what_each_face_is_painted_with() -> None:
     quads = [quad(np.full((2, 2, 3), k, np.uint8), z=float(k)) for k in range(2)]
     mesh = mesh_of(object_of(*quads))
