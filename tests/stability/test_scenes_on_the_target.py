@@ -141,6 +141,11 @@ def thin_textures() -> Object3D:
     return object_of(*front, reverse(front[2], noise(1, 5)))
 
 
+def odd_textures() -> Object3D:
+    front = [quad(noise(301, 147, seed=1), half=0.05, z=0.06), quad(noise(333, 259), half=0.1)]
+    return object_of(*front, reverse(front[1], noise(121, 118)))
+
+
 def awkward() -> Object3D:
     points = [
         [[-0.2, 0.11, 0.01], [0.2, 0.11, 0.01], [0.2, 0.11 + 1e-6, 0.01]],  # a needle
@@ -190,6 +195,7 @@ SCENES = [
     pytest.param(several_materials, AROUND, 0.98, id="several materials and texture sizes"),
     pytest.param(shared_texture, AROUND, 0.98, id="a texture that two parts share", marks=pytest.mark.thorough),
     pytest.param(thin_textures, AROUND, 0.90, id="textures of one texel, row or column"),
+    pytest.param(odd_textures, AROUND, 0.97, id="minified textures of odd sizes"),
     pytest.param(awkward, AROUND[:4], 0.98, id="needles, points, lines and faces behind the camera"),
     pytest.param(cut_out, AROUND, 0.98, id="an alpha-tested sheet before another"),
     pytest.param(glazed, AROUND, 0.98, id="a blended sheet before another", marks=pytest.mark.thorough),

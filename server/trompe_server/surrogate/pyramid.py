@@ -221,14 +221,15 @@ class _Strip:
 
 
 def halved(level: Float[Tensor, "H W channels"], *, rounded: bool) -> Float[Tensor, "h w channels"]:
-    """The next mip level: means of columns, then rows, in pairs (overlapping triples for odd sides)."""
+    """The next mip level: means of columns, then rows, in pairs; of odd sides weighted means of triples."""
     for axis in (1, 0):
         if level.shape[axis] > 1:
-            windows = _windows(level, axis)
-            level = windows[0] + windows[1]
-            for window in windows[2:]:
-                level += window
-            level.div_(len(windows))
+            first, second, *third = _windows(level, axis)
+            if not third:
+                level = (first + second).div_(2)
+            else:
+                one, two, three = _weights(level, axis)
+                level = (first * one).addcmul_(second, two).addcmul_(third[0], three)
             if rounded:
                 round_level_(level)
     return level
@@ -244,6 +245,17 @@ def _windows(level: Float[Tensor, "H W channels"], axis: int) -> list[Tensor]:
     side = level.shape[axis]
     steps = [slice(k, k + side // 2 * 2 - 1, 2) for k in range(2 + side % 2)]
     return [level[step] if axis == 0 else level[:, step] for step in steps]
+
+
+def _weights(level: Float[Tensor, "H W channels"], axis: int) -> list[Tensor]:
+    """Weights of the ``_windows`` of an odd side: bilinear at the centre of each new texel, as drivers scale a level.
+
+    A new texel lies anywhere from between the first two texels to between the last two, in order along the side.
+    """
+    half = level.shape[axis] // 2
+    place = (torch.arange(half, device=level.device, dtype=level.dtype) + 0.5) / half
+    place = place.view(-1, *[1] * (2 - axis))
+    return [(0.5 - place).clamp(min=0), 1 - (place - 0.5).abs(), (place - 0.5).clamp(min=0)]
 
 
 def _doubled(
@@ -268,7 +280,7 @@ def _shared(total: Float[Tensor, "h w channels"], side: int, axis: int) -> Tenso
         return torch.stack([half := total / 2, half], axis + 1).flatten(axis, axis + 1)
     shape = list(total.shape)
     shape[axis] = side
-    wide, third = total.new_zeros(shape), total / 3
-    for window in _windows(wide, axis):
-        window += third
+    wide = total.new_zeros(shape)
+    for window, weight in zip(_windows(wide, axis), _weights(wide, axis), strict=True):
+        window += total * weight
     return wide
