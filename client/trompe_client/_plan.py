@@ -164,7 +164,8 @@ def object_source(source: Source) -> Upload | str:
     """
     path = Path(source)
     is_path = isinstance(source, Path) or path.is_file() or path.suffix.lower() in {".zip", *MODEL_SUFFIXES}
-    return object_upload(path) if is_path or (path.is_dir() and models_in(path)) else str(source)
+    is_folder = path.is_dir() and (len(path.parts) > 1 or bool(models_in(path)))
+    return object_upload(path) if is_path or is_folder else str(source)
 
 
 def object_upload(path: Path, *, name: str | None = None) -> Upload:

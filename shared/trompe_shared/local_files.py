@@ -24,6 +24,9 @@ PICTURED_SUFFIXES: Final = {".fbx", ".ply"}
 MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, *PICTURED_SUFFIXES, ".glb", ".stl"}
 PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".gif"}
 """Of the formats of textures (``object3d.IMAGE_FORMATS``)."""
+_BESIDE: Final = {*MODEL_SUFFIXES, *PICTURE_SUFFIXES, ".mtl", ".json", ".bin"}
+_BELOW: Final = ("*/*", "*/*/*")
+"""Patterns of files one and two folders below."""
 _MTLLIB: Final = re.compile(r"mtllib(?<![^\r\n]mtllib)[ \t]+([^\r\n]+)")
 """The literal comes first: 50 times as fast as the check for the start of a line."""
 _MAP: Final = re.compile(r"map_|(?:bump|norm|disp|decal|refl)$", re.IGNORECASE)
@@ -79,14 +82,19 @@ def _zip_folder(folder: Path) -> bytes:
     models = models_in(folder)
     if not models:
         raise ObjectError(f"The folder {str(folder)!r} holds no .obj, .gltf or other model file.")
+    if models[0].parent != folder:
+        below = (str(file.relative_to(folder)) for file in folder.rglob("*") if file.suffix.lower() in _BESIDE)
+        return _zip_files(folder, [file for file in below if _spelled(folder, file)])
     files = [file.name for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
     split = [model for model in models if is_split(model)]
     return _zip_files(folder, [*files, *(name for model in split for name in files_of(model))])
 
 
 def models_in(folder: Path) -> list[Path]:
-    """The model files in a folder."""
-    return [file for file in folder.iterdir() if file.suffix.lower() in MODEL_SUFFIXES]
+    """The model files in a folder; if there is none, those one or two folders below."""
+    patterns = ("*", *_BELOW)
+    found = ([file for file in sorted(folder.glob(each)) if file.suffix.lower() in MODEL_SUFFIXES] for each in patterns)
+    return next((files for files in found if files), [])
 
 
 def files_of(mesh: Path) -> list[str]:
@@ -128,13 +136,23 @@ def _maps(folder: Path, mtl: str) -> Iterator[str]:
 
 
 def _found(folder: Path, names: Collection[str], *, beside: str = "") -> list[str]:
-    """The files that ``names`` mean, by path below ``folder``: relative to it or to ``beside``, else by last part."""
+    """The files that ``names`` mean, by path below ``folder``.
+
+    Relative to it or to ``beside``, else by last part, there or in the only folder below that has one.
+    """
     found = []
     for name in (name.replace("\\", "/") for name in names):
         paths = [posixpath.join(base, each) for each in (name, posixpath.basename(name)) for base in (beside, "")]
         files = (_spelled(folder, posixpath.normpath(path)) for path in paths)
-        found += [file for file in files if file is not None][:1]
+        file = next((file for file in files if file is not None), None) or _below(folder, posixpath.basename(name))
+        found += [] if file is None else [file]
     return found
+
+
+def _below(folder: Path, name: str) -> str | None:
+    """The only file of a name one or two folders below ``folder``, in any capitals."""
+    alike = [file for each in _BELOW for file in folder.glob(each) if spelling(file.name) == spelling(name)]
+    return _spelled(folder, str(alike[0].relative_to(folder))) if len(alike) == 1 else None
 
 
 def _spelled(folder: Path, path: str) -> str | None:

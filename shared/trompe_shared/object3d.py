@@ -13,7 +13,7 @@ import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -39,6 +39,8 @@ MAX_RATIO: Final = 200
 MUCH: Final = 64 * 2**20
 UTF_8: Final = 0x800
 """Flag of a zip's member whose name is UTF-8, not code page 437."""
+COARSEST: Final = 1e-3
+"""Largest distance of neighbouring numbers at an object's place, as a share of its extent."""
 SPHERE_STEPS: Final = 100
 """Steps of the search for the smallest sphere around an object; the error falls with their number."""
 PLAIN_ROUGHNESS: Final = 0.9
@@ -333,6 +335,7 @@ def object_from_files(files: Mapping[str, bytes]) -> Object3D:
     parts = parse_obj(text_of(files[mesh]), mesh)
     if not any(np.ptp(part.vertices, axis=0).any() for part in parts):
         raise ObjectError(f"{mesh!r} has no extent: all its corners are in one place.")
+    _refuse_remote(parts, mesh)
     materials = _materials(files, parts)
     for part in parts:
         if part.material not in materials:
@@ -350,6 +353,17 @@ def object_from_files(files: Mapping[str, bytes]) -> Object3D:
     if obj.n_texels > MAX_TEXELS:
         raise ObjectError(f"The albedo textures have {obj.n_texels} texels; at most {MAX_TEXELS} are read.")
     return obj
+
+
+def _refuse_remote(parts: Sequence[Part], mesh: str) -> None:
+    """Raise ``ObjectError`` for an object so far from the origin that single precision distorts it."""
+    corners = np.concatenate([part.vertices for part in parts])
+    extent, step = np.ptp(corners, axis=0).max(), np.spacing(np.abs(corners).max())
+    if step > COARSEST * extent:
+        raise ObjectError(
+            f"{mesh!r} is {extent:.2g} m large and up to {np.abs(corners).max():.3g} m from the origin, where single "
+            f"precision only has positions {step:.2g} m apart. Move it to the origin."
+        )
 
 
 def _without_idle_blending(material: Material, files: Mapping[str, bytes]) -> Material:
@@ -370,7 +384,12 @@ def _mesh_name(files: Mapping[str, bytes]) -> str:
 
 def _member(files: Mapping[str, bytes], name: str) -> bytes:
     if name not in files:
-        raise ObjectError(f"The texture {name!r} is named by a material but is not in the archive; add the file.")
+        remedy = "add the file"
+        if "<UDIM>" in name.upper():
+            remedy = "UDIM tiles are not supported, so bake them to one picture"
+        elif not name.isascii():
+            remedy += ", or save the material file in UTF-8 if its name is spelled differently"
+        raise ObjectError(f"The texture {name!r} is named by a material but is not in the archive; {remedy}.")
     return files[name]
 
 

@@ -62,6 +62,22 @@ def test_a_model_without_pictures_beside_it_is_sent_as_it_is(tmp_path: Path, suf
     assert not is_split(Path(f"stored{suffix}"))
 
 
+def test_a_picture_of_another_machine_is_found_where_only_one_folder_has_it(tmp_path: Path) -> None:
+    files = {"m.obj": "mtllib m.mtl", "m.mtl": "map_Kd C:\\work\\tex\\Base.png", "pictures/2k/base.png": ""}
+    written(tmp_path, files)
+    assert packed(tmp_path / "m.obj") == files.keys()
+    written(tmp_path, {"old/base.png": ""})
+    assert packed(tmp_path / "m.obj") == {"m.obj", "m.mtl"}, "which of the two?"
+
+
+def test_a_model_below_the_folder_is_sent_with_the_pictures_of_all_folders(tmp_path: Path) -> None:
+    files = {"source/m.obj": "mtllib m.mtl", "source/m.mtl": "map_Kd ../textures/a.png", "textures/a.png": ""}
+    written(tmp_path / "download", files | {"notes.doc": ""})
+    (tmp_path / "key.png").write_text("")
+    (tmp_path / "download/textures/link.png").symlink_to(tmp_path / "key.png")
+    assert packed(tmp_path / "download") == files.keys()
+
+
 def test_no_file_outside_of_the_models_folder_is_packed(tmp_path: Path) -> None:
     uris = ["../key.png", str(tmp_path / "key.png"), "link.png", "linked/key.png", "own.png"]
     document = json.dumps({"images": [{"uri": uri} for uri in uris]})

@@ -63,7 +63,10 @@ def painted_object(stem: str, surface: Surface) -> Object3D:
 def check_numbers(values: NDArray[np.floating], what: str) -> None:
     """Raise ``ObjectError`` for positions or texture coordinates that are not finite or beyond ``LARGEST``."""
     if not np.isfinite(values).all() or (values.size and np.abs(values).max() > LARGEST):
-        raise ObjectError(f"{what} has numbers that are not finite or beyond {LARGEST:g}; positions are in metres.")
+        raise ObjectError(
+            f"{what} has numbers that are not finite or beyond {LARGEST:g}; positions are metres, objects lie near the "
+            "origin."
+        )
 
 
 def assemble(

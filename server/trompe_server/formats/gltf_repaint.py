@@ -28,6 +28,9 @@ from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
 from trompe_shared.object3d import Object3D, decode_alpha, with_alpha_of
 
+_TYPES: Final = {"EXT_texture_webp": "image/webp", "EXT_texture_avif": "image/avif", "KHR_texture_basisu": "image/ktx2"}
+"""Types of images that extensions of textures allow."""
+
 
 def repaint(upload: Upload, painted: Object3D) -> Upload:
     """``upload`` with the textures of ``painted``. Raises ``ObjectError``."""
@@ -222,11 +225,16 @@ class _Editor(Writer):
         self.drop_extension(DRACO, primitive, [each for mesh in self.document["meshes"] for each in mesh["primitives"]])
 
     def drop_extension(self, name: str, entry: Json, alike: list[Json]) -> None:
-        """Remove an extension from ``entry``, and from the file's lists if then none of ``alike`` has it."""
+        """Remove an extension from ``entry``, and from the file's lists if then none of ``alike`` has it.
+
+        An image of its type stays, and the extension among those used.
+        """
         if _extensions(entry).pop(name, None) is not None:
             _keep(entry, "extensions", entry["extensions"])
             if not any(name in _extensions(each) for each in alike):
-                for key in {"extensionsUsed", "extensionsRequired"} & self.document.keys():
+                types = {image.get("mimeType") for image in self.document.get("images", [])}
+                keys = {"extensionsRequired"} if _TYPES.get(name) in types else {"extensionsRequired", "extensionsUsed"}
+                for key in keys & self.document.keys():
                     _keep(self.document, key, [used for used in self.document[key] if used != name])
 
     def _gather(self, index: int, source: NDArray[np.int64]) -> int:

@@ -113,6 +113,6 @@ def _in_archive(files: Mapping[str, bytes]) -> tuple[Upload, Format]:
             raise ObjectError(f"The archive contains several models, {meshes[:8]}; send them one by one.")
         if meshes:
             return Upload(meshes[0], files, packed=True), format
-    raise ObjectError(
-        f"The archive contains no model, only {sorted(files)[:8]}; zip an .obj, .gltf, .glb, .fbx or .ply."
-    )
+    inner = next((path for path in sorted(files) if path.lower().endswith(".zip")), None)
+    remedy = "zip an .obj, .gltf, .glb, .fbx or .ply" if inner is None else f"unpack {inner!r} and send that model"
+    raise ObjectError(f"The archive contains no model, only {sorted(files)[:8]}; {remedy}.")

@@ -2,7 +2,6 @@
 
 import posixpath
 import warnings
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -55,23 +54,27 @@ class Upload:
         return alike[0] if len(alike) == 1 else None
 
     def flat(self) -> dict[str, bytes]:
-        """The files by name without folders, but litter and equal names of files that are not read.
+        """The files by name without folders, but litter and equal names of different files that are not read.
 
         Raises ``ObjectError`` if the names of two others are equal.
         """
-        paths = [path for path in self.files if not is_litter(path)]
-        count = Counter(map(base_name, paths))
-        equal = [path for path in paths if count[base_name(path)] > 1]
-        if read := [path for path in equal if path.lower().endswith(_FLAT)]:
-            raise ObjectError(f"{read[0]!r} and {read[1]!r} have the same name; rename one of them.")
-        return {base_name(path): self.files[path] for path in paths if path not in equal}
+        first: dict[str, str] = {}
+        differ = set[str]()
+        for path in (path for path in self.files if not is_litter(path)):
+            other = first.setdefault(base_name(path), path)
+            if self.files[other] == self.files[path]:
+                continue
+            if path.lower().endswith(_FLAT):
+                raise ObjectError(f"{other!r} and {path!r} have the same name; rename one of them.")
+            differ.add(base_name(path))
+        return {name: self.files[path] for name, path in first.items() if name not in differ}
 
     def with_flat(self, files: Mapping[str, bytes]) -> "Upload":
         """The upload with files replaced, by name without folders; new ones go beside the mesh."""
-        places = {base_name(path): path for path in self.files}
+        kept = {path: files.get(base_name(path), data) for path, data in self.files.items()}
+        new = files.keys() - set(map(base_name, self.files))
         folder = posixpath.dirname(self.main)
-        new = {places.get(name, posixpath.join(folder, name)): data for name, data in files.items()}
-        return replace(self, files={**self.files, **new})
+        return replace(self, files=kept | {posixpath.join(folder, name): files[name] for name in sorted(new)})
 
     def to_bytes(self) -> bytes:
         """The bytes to send back: the mesh file if it came and stays alone, otherwise a zip."""

@@ -53,6 +53,30 @@ def ball() -> trimesh.Trimesh:
     return trimesh.creation.icosphere(subdivisions=1)
 
 
+def test_equal_copies_of_a_picture_are_one_and_both_are_repainted() -> None:
+    files = {"m.obj": OBJ.encode(), "t.mtl": b"newmtl red\nmap_Kd tex/a.png", "tex/a.png": encode_png(PICTURE)}
+    out = unpack(comes_back(pack_zip(files | {"old/a.png": files["tex/a.png"]}), "m.zip")[1])
+    assert out["tex/a.png"] == out["old/a.png"] != files["tex/a.png"]
+    others = {"b.png": b"1", "c/b.png": b"1", "d/b.png": b"2"}
+    with pytest.raises(ObjectError, match=r"'b\.png' and 'd/b\.png' have the same name"):
+        read_object(pack_zip(files | others), name="m.zip")
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({"m.obj": OBJ, "t.mtl": "newmtl red\nmap_Kd a.<UDIM>.png"}, "bake them to one picture"),
+        ({"m.obj": OBJ, "t.mtl": "newmtl red\nmap_Kd \u8272.png", "a.png": ""}, "save the material file in UTF-8"),
+        ({"m.obj": re.sub("v (.) ", r"v 5000\g<1> ", OBJ), "t.mtl": MTL}, "Move it to the origin"),
+        ({"source/m.zip": "", "readme.txt": ""}, "unpack 'source/m.zip' and send that model"),
+    ],
+    ids=["UDIM", "code page", "far away", "zip in a zip"],
+)
+def test_a_refusal_says_what_to_do(files: dict[str, str], words: str) -> None:
+    with pytest.raises(ObjectError, match=re.escape(words)):
+        read_object(pack_zip({name: text.encode() for name, text in files.items()}), name="m.zip")
+
+
 # SAILenv and OBJ
 
 

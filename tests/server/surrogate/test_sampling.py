@@ -74,8 +74,10 @@ def scaled(level: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.floa
     """``level`` read linearly at the centres of the new texels."""
     for axis, count in enumerate(size):
         side = level.shape[axis]
-        centres = (np.arange(count) + 0.5) * side / count - 0.5
-        level = np.apply_along_axis(lambda line, at=centres: np.interp(at, np.arange(len(line)), line), axis, level)
+        at = ((np.arange(count) + 0.5) * side / count - 0.5).clip(0, side - 1)
+        first, second = (np.take(level, index.astype(int), axis) for index in (np.floor(at), np.ceil(at)))
+        share = np.expand_dims(at % 1, [k for k in range(level.ndim) if k != axis])
+        level = first * (1 - share) + second * share
     return level
 
 
