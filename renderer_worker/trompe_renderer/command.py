@@ -67,7 +67,7 @@ def _pairs(_context: click.Context, _option: click.Parameter, given: tuple[str, 
     is_flag=False,
     flag_value="",
     metavar="[HOST:PORT]",
-    help="Check the engine, or a running renderer (SAILenv, too), with 30 pictures and exit; status 1 means a fault.",
+    help="Check the engine, or a running renderer (SAILenv, too), with 40 pictures and exit; status 1 means a fault.",
 )
 @click.option("--verbose", is_flag=True, help="Log agents that connect and leave.")
 def render(

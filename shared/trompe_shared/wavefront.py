@@ -195,8 +195,8 @@ def parse_surfaces(text: str, file: str) -> tuple[Surface, ...]:
             raise ObjectError(f"{file!r} has a {kind!r} statement with a number that is not finite.")
         if values.size and np.abs(values).max() > LARGEST:
             raise ObjectError(
-                f"{file!r} has a {kind!r} statement with a number beyond {LARGEST:g}; positions are metres, objects lie "
-                "near the origin."
+                f"{file!r} has a {kind!r} statement with a number beyond {LARGEST:g}; positions are metres, objects "
+                "lie near the origin."
             )
     if "colour" in arrays:
         arrays["colour"] = in_unit(arrays["colour"])

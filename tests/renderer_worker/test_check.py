@@ -143,11 +143,74 @@ def read(change: Callable[[Levels], Levels]) -> Fault:
     def moved(part: Part) -> Part:
         return replace(part, uvs=change(part.uvs.astype(float)).astype(np.float32))
 
-    def other(each: Instance) -> Instance:
-        obj = replace(each.model.obj, parts=tuple(map(moved, each.model.obj.parts)))
-        return replace(each, model=replace(each.model, shape=f"{each.model.shape} {id(change)}", obj=obj))
+    return showing(lambda each: of_parts(each, map(moved, each.model.obj.parts), f"read {id(change)}"))
 
-    return showing(other)
+
+def of_parts(each: Instance, parts: Iterable[Part], shape: str) -> Instance:
+    """The instance with other parts, called ``shape`` in its key."""
+    obj = replace(each.model.obj, parts=tuple(parts))
+    return replace(each, model=replace(each.model, shape=f"{each.model.shape} {shape}", obj=obj))
+
+
+def reshaped(change: Callable[[Levels, Levels], Levels]) -> Fault:
+    """Corners (faces, 3, 3) of each part changed in the camera's coordinates; also given their depth at the origin."""
+
+    def aim(world: Snapshot, *_: int) -> Snapshot:
+        to_world, to_camera = world.camera, np.linalg.inv(world.camera)
+
+        def moved(part: Part) -> Part:
+            corners = part.vertices[part.faces].astype(float) @ to_camera[:3, :3].T + to_camera[:3, 3]
+            corners = change(corners, to_camera[2, 3]) @ to_world[:3, :3].T + to_world[:3, 3]
+            flat = part.faces.ravel()
+            return Part(
+                part.material,
+                corners.reshape(-1, 3).astype(np.float32),
+                part.normals[flat],
+                part.uvs[flat],
+                np.arange(len(flat), dtype=np.int32).reshape(-1, 3),
+            )
+
+        shown = [
+            of_parts(each, map(moved, each.model.obj.parts), f"{change.__name__} {to_world}")
+            for each in world.instances
+        ]
+        return replace(world, instances=tuple(shown))
+
+    return aimed(aim)
+
+
+def parallel(corners: Levels, depth: Levels) -> Levels:
+    """What a perspective camera sees as another one without perspective sees it."""
+    return np.asarray(corners * np.concatenate([np.repeat(corners[..., 2:] / depth, 2, -1), corners[..., 2:] ** 0], -1))
+
+
+def later_is_nearer(corners: Levels, _: Levels) -> Levels:
+    """Each of the eight faces of ``probes.layers`` moves towards the camera along its rays, the last one farthest."""
+    return np.asarray(corners * np.linspace(1, 0.5, 8)[:, None, None]) if len(corners) == 8 else corners
+
+
+def back_to_front(each: Instance) -> Instance:
+    parts = (replace(part, faces=part.faces[:, ::-1]) for part in each.model.obj.parts)
+    return of_parts(each, parts, "inside out")
+
+
+def first_texture(each: Instance) -> Instance:
+    obj = each.model.obj
+    first = obj.textures[min(obj.textures)]
+    return replace(each, model=model_of(obj.with_textures(dict.fromkeys(obj.textures, first))))
+
+
+def on_a_floor(picture: Levels, _: Snapshot) -> Levels:
+    picture[-len(picture) // 6 :] = 90
+    return picture
+
+
+def labelled(picture: Levels, _: Snapshot) -> Levels:
+    picture[2:9, 2:14] = 255 - picture[2:9, 2:14]
+    return picture
+
+
+BEHIND = WorldLight((0.0, 0.0, 1.0), 0.5)
 
 
 def turned_world(matrix: list[list[int]]) -> Fault:
@@ -372,6 +435,14 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "from behind": ("axes", turned_world([[-1, 0, 0], [0, 1, 0], [0, 0, -1]])),
     "left-handed world": ("axes", turned_world([[-1, 0, 0], [0, 1, 0], [0, 0, 1]])),
     "looks at the origin": ("camera", aimed(upright)),
+    "no perspective": ("orthographic", reshaped(parallel)),
+    "no depth test": ("depth", reshaped(later_is_nearer)),
+    "culls the front": ("inside out", showing(back_to_front)),
+    "one texture for all parts": ("parts", showing(first_texture)),
+    "the first part alone": ("parts", showing(lambda each: of_parts(each, each.model.obj.parts[:1], "first"))),
+    "a floor": ("extra object", seen(on_a_floor)),
+    "a label": ("extra object", seen(labelled)),
+    "a lamp behind": ("extra light", aimed(lambda world, *_: replace(world, lights=(*world.lights, BEHIND)))),
     "nothing": ("invisible", aimed(lambda world, *_: replace(world, instances=()))),
 }
 """Name in the check, and fault, of wrong adapters."""
@@ -456,6 +527,7 @@ RIGHT: dict[str, Fault] = {
     "film with grain": grained,
     "edges mixed in linear light": composited_in_light,
     "gamma 2.0": seen(on_object(lambda picture: 255 * (picture / 255) ** (2.2 / 2.0))),
+    "a warm tint": seen(on_object(lambda picture: picture * [1, 0.9, 0.75])),
     "60.3 degrees": wide(60.3),
     "0.15 pixels": shifted(0.15, -0.15),
 }

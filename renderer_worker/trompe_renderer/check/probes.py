@@ -48,11 +48,26 @@ def plate(half: float, texture: Colours, *, corner: tuple[int, int] = (0, 0)) ->
     return _object([replace(face, vertices=flat, uvs=uvs)], {TEXTURE: texture})
 
 
-def disc(radius: float, texture: Colours, *, corners: int = 90) -> Object3D:
-    """A regular polygon that faces +z; its circumscribed square is the texture's."""
+def layers(half: float, texture: Colours) -> Object3D:
+    """Two pairs of squares that face +z, at the left and right; in each, one hides the other, 0.1 m behind.
+
+    The front ones have the texture's first and last quarter, the others its middle. The left pair is drawn from the
+    front, the right one from the back.
+    """
+    square = _face((0, 0, 1), (0, 1, 0), half, "paint")
+    places = ((-1.2, 0.1, 0.0), (-1.2, 0.0, 0.25), (1.2, 0.0, 0.5), (1.2, 0.1, 0.75))
+    points = [square.vertices * [1, 1, 0] + [x * half, 0, z] for x, z, _ in places]
+    uvs = [square.uvs * [0.25, 1] + [u, 0] for _, _, u in places]
+    faces = [square.faces + k * len(square.vertices) for k in range(len(places))]
+    part = _part("paint", np.concatenate(points), [0, 0, 1], np.concatenate(uvs), np.concatenate(faces))
+    return _object([part], {TEXTURE: texture})
+
+
+def disc(radius: float, texture: Colours, *, corners: int = 90, z: float = 0.0) -> Object3D:
+    """A regular polygon that faces +z, at a height ``z``; its circumscribed square is the texture's."""
     angles = np.arange(corners) * 2 * np.pi / corners
     points = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
-    points = np.concatenate([np.zeros((1, 3)), points])
+    points = np.concatenate([np.zeros((1, 3)), points]) + np.array([0, 0, z / radius])
     rim = np.arange(1, corners + 1)
     faces = np.stack([0 * rim, rim, np.roll(rim, -1)], axis=1)
     return _object([_part("paint", radius * points, [0, 0, 1], 0.5 + 0.5 * points[:, :2], faces)], {TEXTURE: texture})

@@ -7,10 +7,11 @@ from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from trompe_renderer.check.findings import FINAL, Finding, fault, ok, warning
 from trompe_renderer.check.measures import FAINT, Blob, Picture, blob, border, level, median, patterns, positions
-from trompe_renderer.check.probes import FACES, RINGS, TEXTURE, ball, chart, cube, disc, plain, plate
+from trompe_renderer.check.probes import FACES, RINGS, TEXTURE, ball, chart, cube, disc, layers, plain, plate
 from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import FIELD_OF_VIEW, Camera, Light, View, spherical
 from trompe_shared.object3d import Object3D
@@ -51,7 +52,7 @@ class Render(Protocol):
 
 
 def check(render: Render, info: EngineInfo) -> Findings:
-    """Ask a renderer for about 30 pictures and say, question by question, whether it keeps Trompe's conventions.
+    """Ask a renderer for about 40 pictures and say, question by question, whether it keeps Trompe's conventions.
 
     ``info``: what it says of itself. After a fault that leaves other questions without an answer, these are not asked.
     """
@@ -166,13 +167,23 @@ def _colourful(colour: NDArray[np.float64]) -> bool:
 
 
 def background(look: _Look, _: EngineInfo) -> Findings:
-    """Three colours around the ball."""
-    worst, told = 0.0, "every level as asked"
+    """Three colours around the ball, and nothing else."""
+    worst, told, alone = 0.0, "every level as asked", True
     for asked in ((0, 0, 0), (255, 255, 255), (200, 130, 50)):
-        got = border(look.at(ORANGE, replace(FRONT, background=asked)))
+        picture = look.at(ORANGE, replace(FRONT, background=asked))
+        got = border(picture)
+        alone = alone and _alone(np.abs(ndimage.uniform_filter(picture - got, (5, 5, 0))).max(axis=-1) > FAINT)
         if (off := float(np.abs(got - asked).max())) > worst:
             worst, told = off, f"{asked} comes as {tuple(got.round().astype(int).tolist())}"
     yield fault("background", f"A background of {told}.") if worst > 1 else ok("background", f"{told}.")
+    if not alone:
+        yield fault("extra object", "Around a ball there is something else than a plain background.")
+
+
+def _alone(differs: NDArray[np.bool_]) -> bool:
+    """Whether a picture of the ball ``differs`` from its background near the middle row or column alone."""
+    near = np.abs(np.arange(SQUARE[0]) + 0.5 - SQUARE[0] / 2) < 2 * _pixels(0.15, SQUARE)
+    return not differs[~near].any() or not differs[:, ~near].any()
 
 
 def objects(look: _Look, _: EngineInfo) -> Findings:
@@ -181,7 +192,7 @@ def objects(look: _Look, _: EngineInfo) -> Findings:
     blobs = map(blob, pictures)
     before, now = (np.zeros(SQUARE, bool) if there is None else there.mask for there in blobs)
     kept = (before & now).sum() / max(int(before.sum()), 1)
-    orange = now.any() and _colourful(median(pictures[1], now))
+    orange = now.any() and _alike(median(pictures[1], now), median(pictures[0], before))
     if kept >= 0.5 and (now & ~before).sum() >= 0.5 * before.sum():
         yield fault("stale scene", "The object of an earlier request is still in the picture.")
     elif kept >= 0.5 and orange:
@@ -192,6 +203,12 @@ def objects(look: _Look, _: EngineInfo) -> Findings:
         yield fault("stale texture", "A white object has the orange texture of the one before it.")
     else:
         yield ok("objects", "nothing is left of an earlier request.")
+
+
+def _alike(colour: NDArray[np.float64], orange: NDArray[np.float64]) -> bool:
+    """Whether a colour is rather ``orange`` than white, at any brightness."""
+    own, other = (each / max(each.max(), 1.0) for each in (colour, orange))
+    return bool(np.linalg.norm(own - other) < np.linalg.norm(own - 1))
 
 
 HALF: Final = 0.25
@@ -212,8 +229,10 @@ def orientation(look: _Look, _: EngineInfo) -> Findings:
     seen = _faces(look, first)
     found = next((flips for flips in FLIPS if _distance(seen, _expected(first, flips)) < 6), None)
     if found is None:
-        there = _named(_expected(first))
-        yield fault("axes", f"From azimuth 35, elevation 25 one sees {_named(seen)}, not {there}.")
+        there = _expected(first)
+        opposite = {7 - kind for kind in there}
+        name = "inside out" if seen.keys() == opposite else "parts" if len(seen) == 1 else "axes"
+        yield fault(name, f"From azimuth 35, elevation 25 one sees {_named(seen)}, not {_named(there)}.")
         return
     look.flips = found
     if found[0] < 0:
@@ -306,6 +325,9 @@ def _quarters(look: _Look, obj: Object3D) -> NDArray[np.int64] | None:
 RADIUS: Final = 0.28
 """Of the disc by which the lens is measured, and of the chart, metres."""
 DISC: Final = disc(RADIUS, plain(190, 190, 190))
+CLOSER: Final = 0.3
+CLOSER_DISC: Final = disc(RADIUS * (1 - CLOSER), plain(190, 190, 190), corners=70, z=CLOSER)
+"""Looks as large as the other one, if what is nearer looks larger."""
 CHART: Final = chart(RADIUS)
 
 
@@ -323,6 +345,9 @@ def lens(look: _Look, _: EngineInfo) -> Findings:
     look.scale = square.spread
     yield from _field_of_view((square.spread[1] + white.spread[1]) / 2)
     yield from _aspect(shots)
+    closer = _ellipse(look, FRONT, LENS["square"], CLOSER_DISC)
+    if closer is None or closer.spread[1] < (1 - CLOSER / 2) * square.spread[1]:
+        yield fault("orthographic", "A disc that is nearer looks no larger.")
     x, y = np.mean([square.centre, white.centre], axis=0)
     ways = [(x, "right" if x > 0 else "left"), (y, "down" if y > 0 else "up")]
     if off := [f"{abs(pixels):.2f} pixels too far {way}" for pixels, way in ways if abs(pixels) > SHIFT]:
@@ -331,9 +356,9 @@ def lens(look: _Look, _: EngineInfo) -> Findings:
         yield ok("centre", f"off by {np.hypot(x, y):.2f} pixels.")
 
 
-def _ellipse(look: _Look, view: View, size: Size) -> Blob | None:
+def _ellipse(look: _Look, view: View, size: Size, obj: Object3D = DISC) -> Blob | None:
     """The disc, with its spread over the expected one."""
-    shape = blob(look.at(DISC, view, size=size))
+    shape = blob(look.at(obj, view, size=size))
     expected = _pixels(RADIUS, size) / 2
     return shape and replace(shape, spread=(shape.spread[0] / expected, shape.spread[1] / expected))
 
@@ -412,6 +437,7 @@ def exposure(look: _Look, _: EngineInfo) -> Findings:
 
 SUN: Final = Light(azimuth=60, elevation=35, intensity=1.0, ambient=0.0)
 SIDES: Final = (Camera(2.0, 0, 0), Camera(2.0, 110, 10))
+BEHIND: Final = Camera(2.0, 180, -10)
 BALL_RADIUS: Final = 0.38
 BALL: Final = ball(BALL_RADIUS, plain(230, 230, 230))
 TOLERANCE: Final = 30.0
@@ -427,10 +453,15 @@ FAINT_LIGHT: Final = 0.001
 
 
 def light(look: _Look, _: EngineInfo) -> Findings:
-    """A white ball in ambient light alone, in none, and in directional light alone from two sides."""
-    soft, faint, unlit = (
-        look.at(BALL, _lit(Light(intensity=intensity, ambient=ambient), SIDES[0]))
-        for intensity, ambient in ((FAINT_LIGHT, AMBIENT), (FAINT_LIGHT, 0.0), (0.0, 0.0))
+    """A white ball in ambient light alone, in none from two sides, and in directional light alone from two sides."""
+    soft, faint, *unlit = (
+        look.at(BALL, _lit(Light(intensity=intensity, ambient=ambient), camera))
+        for intensity, ambient, camera in (
+            (FAINT_LIGHT, AMBIENT, SIDES[0]),
+            (FAINT_LIGHT, 0.0, SIDES[0]),
+            (0.0, 0.0, SIDES[0]),
+            (0.0, 0.0, BEHIND),
+        )
     )
     rows, columns = np.indices(SQUARE) + 0.5 - SQUARE[0] / 2
     x, y = (places / _pixels(BALL_RADIUS, SQUARE, 2.0) for places in (columns, -rows))
@@ -438,9 +469,11 @@ def light(look: _Look, _: EngineInfo) -> Findings:
     normals = np.stack([x, y, np.sqrt(np.clip(1 - x**2 - y**2, 0, None))], axis=-1)[inside]
     if level(soft, inside) < 20:
         yield fault("ambient missing", "A white ball in ambient light alone is dark.")
-    if (seen := level(unlit, inside)) > 20:
-        look.dims = level(faint, inside) <= 20
-        name, also = ("not shaded", ", in faint light hardly any") if look.dims else ("extra light", "")
+    if (seen := max(float(np.percentile(picture[inside], 95)) for picture in unlit)) > 20:
+        shown = level(unlit[0], inside) > 20
+        look.dims = not shown or level(faint, inside) <= 20
+        faded = shown and look.dims
+        name, also = ("not shaded", ", in faint light hardly any") if faded else ("extra light", "")
         yield fault(name, f"A white ball without light has a brightness of {seen:.0f} of 255{also}.")
     hard = [look.at(BALL, _lit(SUN, side)) for side in SIDES]
     if max(float(np.percentile(picture[inside], 95)) for picture in hard) < 20:
@@ -542,8 +575,17 @@ NEAR_AND_FAR: Final = {0.11: plate(0.03, plain(240, 240, 240)), 9.9: plate(2.7, 
 """A square at each distance."""
 
 
+RED, BLUE = (230, 25, 25), (25, 25, 230)
+LAYERS: Final = layers(0.12, np.array([[RED, BLUE, BLUE, RED]], np.uint8).repeat(16, axis=0).repeat(4, axis=1))
+"""Red before blue."""
+
+
 def depths(look: _Look, _: EngineInfo) -> Findings:
-    """A near object and a far one."""
+    """A near object and a far one, and one part before another."""
+    picture, off = look.at(LAYERS), round(_pixels(0.144, SQUARE, 0.95))
+    spots = [picture[46:50, 48 + x - 2 : 48 + x + 2].reshape(-1, 3) for x in (-off, off)]
+    if (patterns(np.median(spots, axis=1)) != 4).any():
+        yield fault("depth", "A square is seen through another one before it.")
     for distance, obj in NEAR_AND_FAR.items():
         if blob(look.at(obj, _lit(LIGHT, Camera(distance, 0, 0)))) is None:
             yield fault("clipped", f"A square {distance} m before the camera is missing.")

@@ -132,6 +132,7 @@ class RenderThread:
         try:
             self._engine.render(EMPTY, width=8, height=8)
         except (Exception, SystemExit) as second:
+            log.error("a picture failed", exc_info=error)
             self._lost(f"{error!r}, and then {second!r} on an empty picture")
 
     def _watch(self) -> None:

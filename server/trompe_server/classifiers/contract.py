@@ -58,6 +58,8 @@ def check_contract(network: nn.Module, sample: Float[Tensor, "2 3 H W"], file: s
         raise broken(file, f"it does not run on two images ({str(error)[:300]})") from error
     if not isinstance(logits, Tensor) or logits.ndim != 2 or len(logits) != 2 or not logits.is_floating_point():
         raise broken(file, f"its output for two images is {describe_value(logits)}")
+    if logits.shape[1] < 2:
+        raise broken(file, "it gives one score: return one of each class, torch.cat([-z, z], 1) of a binary network")
     if not torch.isfinite(logits).all():
         raise broken(file, "its output is not finite")
     with torch.no_grad():

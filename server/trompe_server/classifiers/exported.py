@@ -12,6 +12,7 @@ from trompe_server.classifiers.archive import read_program
 from trompe_server.classifiers.contract import broken, check_contract, describe_value, sample_images
 from trompe_server.classifiers.fold import accelerate
 from trompe_server.classifiers.network import NetworkClassifier
+from trompe_server.classifiers.protocol import AT_ONCE, BATCH
 
 
 def load_exported(path: Path, device: str) -> NetworkClassifier:
@@ -21,7 +22,7 @@ def load_exported(path: Path, device: str) -> NetworkClassifier:
     Raises ``ClassifierError`` if it breaks the contract.
     """
     program = read_program(path)
-    size = _image_size(program, path.name)
+    size = _image_size(program, path.name, at_once=BATCH if device == "cpu" else AT_ONCE)
     if device != "cpu":
         program = move_to_device_pass(program, device)
     network = program.module(check_guards=False).requires_grad_(False)
@@ -30,8 +31,8 @@ def load_exported(path: Path, device: str) -> NetworkClassifier:
     return NetworkClassifier(path.stem, accelerate(network, sample), size, n_classes, device=device)
 
 
-def _image_size(program: ExportedProgram, file: str) -> tuple[int, int]:
-    """(H, W) of the one image input. Raises ``ClassifierError``."""
+def _image_size(program: ExportedProgram, file: str, *, at_once: int) -> tuple[int, int]:
+    """(H, W) of the one image input, ``at_once`` images a batch. Raises ``ClassifierError``."""
     inputs = program.graph_signature.user_inputs
     if len(inputs) != 1:
         raise broken(file, f"it takes {len(inputs)} inputs")
@@ -44,4 +45,7 @@ def _image_size(program: ExportedProgram, file: str) -> tuple[int, int]:
         raise broken(file, "its input has no fixed height and width")
     if isinstance(batch, int):
         raise broken(file, f"its batch is fixed to {batch}: pass dynamic_shapes=({{0: torch.export.Dim.DYNAMIC}},)")
+    limits = program.range_constraints.get(batch.node.expr)
+    if limits is not None and limits.upper < at_once:
+        raise broken(file, f"its batch is limited to {limits.upper}: pass torch.export.Dim.DYNAMIC without a maximum")
     return height, width

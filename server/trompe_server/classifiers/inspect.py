@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import torch
 
-from trompe_server.classifiers.protocol import WhiteBoxClassifier
+from trompe_server.classifiers.protocol import WhiteBoxClassifier, refusing
 from trompe_server.classifiers.registry import load_classifier
 from trompe_shared.errors import ClassifierError
 
@@ -18,7 +18,8 @@ from trompe_shared.errors import ClassifierError
 def main(arguments: Sequence[str]) -> int:
     """Print the JSON line for the file or name in ``arguments``; return the exit code."""
     try:
-        classifier = load_classifier(arguments[0])
+        with refusing("It cannot be read", remedy=". Export it again, to .pt2 (torch.export) or .onnx."):
+            classifier = load_classifier(arguments[0])
     except ClassifierError as error:
         found: dict[str, object] = {"error": str(error)}
     else:

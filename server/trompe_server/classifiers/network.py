@@ -2,13 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
+from torch.nn.modules.dropout import _DropoutNd
 
 from trompe_server.classifiers.protocol import AT_ONCE, BATCH, Images, Logits, predicted
+from trompe_shared.errors import ClassifierError
+
+_IN_TRAINING: Final = (_BatchNorm, _DropoutNd)
 
 
 class NamedNetwork(NamedTuple):
@@ -21,7 +26,10 @@ class NamedNetwork(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkClassifier:
-    """A network (N, 3, H, W) in [0, 1] -> logits (N, n_classes) on ``device``; freezes its parameters."""
+    """A network (N, 3, H, W) in [0, 1] -> logits (N, n_classes) on ``device``; freezes its parameters.
+
+    Raises ``ClassifierError`` for a network in training, where an image's logits hang on chance or on its batch.
+    """
 
     name: str
     network: nn.Module
@@ -32,6 +40,8 @@ class NetworkClassifier:
 
     def __post_init__(self) -> None:
         self.network.requires_grad_(False)
+        if any(each.training for each in self.network.modules() if isinstance(each, _IN_TRAINING)):
+            raise ClassifierError(f"The network {self.name!r} is in training: call eval() on it first.")
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
         """Float32 logits of sRGB images in [0, 1] of size ``image_size``, differentiable in them and on their device.
@@ -43,6 +53,10 @@ class NetworkClassifier:
         if given.is_cuda and 0 < len(given) < AT_ONCE:
             given = torch.cat([given, given.new_zeros(AT_ONCE - len(given), *given.shape[1:])])
         logits: Tensor = self.network(given)[: len(images)]
+        if logits.shape[1:] != (self.n_classes,):
+            raise ClassifierError(
+                f"The network {self.name!r} gives {tuple(logits.shape[1:])} scores an image, not {self.n_classes}."
+            )
         return logits.to(images.device, torch.float32)
 
     @torch.no_grad()

@@ -60,6 +60,8 @@ def load_onnx(path: Path, device: str = "cpu") -> OnnxClassifier:
         raise broken(path.name, f"it does not run on one image ({str(error)[:300]})") from error
     if logits.ndim != 2 or logits.dtype != np.float32 or len(logits) != 1:
         raise broken(path.name, f"its output for one image is {logits.dtype} {logits.shape}")
+    if logits.shape[1] < 2:
+        raise broken(path.name, "it gives one score: export one of each class, (-z, z) of a binary network")
     if not np.isfinite(logits).all():
         raise broken(path.name, "its output is not finite")
     if not _alike(_run(session, images[1:], fixed_batch), logits):
@@ -103,7 +105,11 @@ def _input(session: Any, file: str) -> tuple[int | None, tuple[int, int]]:
     inputs, outputs = session.get_inputs(), session.get_outputs()
     if len(inputs) != 1 or len(outputs) != 1:
         raise broken(file, f"it has {_listed('input', inputs)} and {_listed('output', outputs)}, expected one of each")
+    if not outputs[0].type.startswith("tensor("):
+        raise broken(file, f"its output is {outputs[0].type} (scikit-learn's ZipMap): export the raw scores alone")
     shape, kind = inputs[0].shape, inputs[0].type
+    if len(shape) == 4 and shape[3] == 3 and shape[1] != 3:
+        raise broken(file, f"its input {shape} has channels last: put a Transpose before it")
     if len(shape) != 4 or (isinstance(shape[1], int) and shape[1] != 3) or kind != "tensor(float)":
         raise broken(file, f"its input is {kind} {shape}")
     batch, _, height, width = shape

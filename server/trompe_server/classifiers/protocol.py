@@ -89,7 +89,7 @@ def predicted(
     """Logits (N, n_classes), all finite, of images of any size, by a network of ``size`` (H, W) on ``device``;
     ``split``: in parts of torch's threads.
 
-    Raises ``ClassifierError`` unless the images are (N, H, W, 3) uint8.
+    Raises ``ClassifierError`` unless the images are (N, H, W, 3) uint8, and for a NaN.
     """
     if images.ndim != 4 or images.shape[3] != 3 or images.dtype != np.uint8:
         raise ClassifierError(
@@ -98,7 +98,13 @@ def predicted(
         )
 
     def of(start: int) -> Logits:
-        return finite(logits(fit_images(images[start : start + batch], size, device))).cpu().numpy()
+        found = logits(fit_images(images[start : start + batch], size, device))
+        if found.isnan().any():
+            raise ClassifierError(
+                f"The classifier gives NaN for {int(found.isnan().any(dim=1).sum())} of {len(found)} images, so they "
+                "have no class. Half precision may overflow: export it in float32."
+            )
+        return finite(found).cpu().numpy()
 
     starts = range(0, len(images), batch)
     chunks = side_by_side(of, starts, split=split)

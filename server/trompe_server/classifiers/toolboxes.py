@@ -33,17 +33,26 @@ def from_foolbox(
 ) -> NetworkClassifier:
     """foolbox's ``PyTorchModel`` as a white box for images of ``image_size`` (H, W), on the model's device.
 
-    Raises ``ClassifierError`` if it breaks the contract of a white box.
+    Raises ``ClassifierError`` for a model of another kind, and if it breaks the contract of a white box.
     """
+    if not (callable(model) and hasattr(model, "bounds") and hasattr(model, "device")):
+        raise ClassifierError(f"Expected foolbox's PyTorchModel, got {type(model).__name__}; wrap the network in one.")
     return _adapted(model, tuple(model.bounds), image_size, classes, name, str(model.device))
 
 
 def from_art(model: Any, *, classes: Sequence[str] | None = None, name: str = "art") -> NetworkClassifier:
     """ART's ``PyTorchClassifier`` as a white box for images of its ``input_shape``, on its device.
 
-    Raises ``ClassifierError`` if its images are not (3, H, W) with ``clip_values`` of two numbers, or if it breaks the
-    contract of a white box.
+    Raises ``ClassifierError`` if its images are not (3, H, W) with ``clip_values`` of two numbers, if it changes scores
+    (``postprocessing_defences``) or is of another kind, and if it breaks the contract of a white box.
     """
+    if not (hasattr(model, "clip_values") and isinstance(getattr(model, "model", None), nn.Module)):
+        raise ClassifierError(f"Expected ART's PyTorchClassifier, got {type(model).__name__}; wrap the network in one.")
+    if model.postprocessing_defences:
+        raise ClassifierError(
+            f"The ART classifier changes scores by {model.postprocessing_defences}, which cannot be attacked; leave "
+            "them out."
+        )
     shape, bounds = tuple(model.input_shape), model.clip_values
     if len(shape) != 3 or shape[0] != 3 or bounds is None or any(getattr(end, "ndim", 0) for end in bounds):
         raise ClassifierError(
@@ -68,6 +77,6 @@ def _adapted(
     name: str,
     device: str,
 ) -> NetworkClassifier:
-    network = _Rescaled(logits, bounds)
+    network = _Rescaled(logits, bounds).eval()
     n_classes = check_contract(network, sample_images(size).to(device), name)
     return NetworkClassifier(name, network, size, n_classes, check_classes(classes, n_classes, name), device)

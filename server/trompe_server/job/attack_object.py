@@ -25,6 +25,7 @@ from trompe_server.spec.framing import framing_of
 from trompe_server.spec.labels import resolve_labels
 from trompe_server.surrogate import textures_of
 from trompe_server.surrogate.calibration import build_surrogate, calibrate
+from trompe_server.surrogate.fidelity import Fidelity
 from trompe_shared.api import Accuracy, PipelineName, ViewOptions
 from trompe_shared.errors import ClassifierError, SpecError
 from trompe_shared.geometry import View
@@ -37,9 +38,13 @@ VIEWS: Final = 40
 
 @dataclass(frozen=True)
 class AttackedObject:
-    """A repainted object, and its accuracies in the surrogate, in the target and, if any, on its held-out views."""
+    """A repainted object, and its accuracies in the surrogate, in the target and, if any, on its held-out views.
+
+    fidelity: of the surrogate to the target; unless ``fidelity.good_enough`` the attack was made on wrong images.
+    """
 
     painted: Object3D
+    fidelity: Fidelity
     surrogate: Accuracy
     target: Accuracy
     held_out: Accuracy | None = None
@@ -125,7 +130,7 @@ def attack_object(
     if unseen:
         images.append([ask(each, unseen) for each in (obj, painted)])
     judged = [accuracy(network.predict(before), network.predict(after), goal.labels) for before, after in images]
-    return AttackedObject(painted, *judged)
+    return AttackedObject(painted, calibration.fidelity, *judged)
 
 
 def _load(source: str | Path) -> Object3D:

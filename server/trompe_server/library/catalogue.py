@@ -1,15 +1,20 @@
 """Catalogue of things of one kind: uploaded ones in a folder, shipped ones in the package."""
 
 import hashlib
+import logging
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Generic, TypeVar
 
+from pydantic import ValidationError
+
 from trompe_server.errors import AmbiguousError, NotFoundError
 from trompe_server.storage.folders import Folder
 from trompe_shared.api import BackgroundInfo, ClassifierInfo, ObjectInfo
+
+logger = logging.getLogger(__name__)
 
 _INFO: Final = "info.json"
 _ID: Final = re.compile(r"[0-9a-f]{64}")
@@ -76,16 +81,19 @@ class Catalogue(Generic[Info]):
         return folder.read(name)
 
     def put(self, info: Info, name: str, data: bytes | Path) -> Info:
-        """Store bytes or a file as ``name``. If the same bytes are stored already, only the info is replaced."""
-        folder = self.folder.within(info.id)
-        if not folder.exists(_INFO):
+        """Store bytes or a file as ``name``. If they are stored already, in full, only the info is replaced."""
+        folder, size = self.folder.within(info.id), len(data) if isinstance(data, bytes) else data.stat().st_size
+        if not (folder.exists(name) and folder.size(name) == size):
             folder.write(name, data)
         folder.write(_INFO, info.model_dump_json().encode())
         return info
 
     def stored(self, identity: str) -> Info | None:
-        """The upload with exactly this id."""
+        """The upload with exactly this id; ``None`` also for a damaged one, which can be sent again."""
         try:
             return self.model.model_validate_json(self.folder.within(identity).read(_INFO))
         except FileNotFoundError:
+            return None
+        except ValidationError:
+            logger.warning("the %s %s is left out: its %s is damaged; send its file again", self.kind, identity, _INFO)
             return None

@@ -161,7 +161,10 @@ class Library:
             payload = folder / f"data{suffix}"
             identity = _copy(file, payload)
             before = self.classifiers.stored(identity)
-            found = self._inspect(str(payload)) if before is None else before.model_dump()
+            try:
+                found = self._inspect(str(payload)) if before is None else before.model_dump()
+            except ClassifierError as error:
+                raise ClassifierError(str(error).replace(repr(payload.name), repr(filename))) from error
             if classes is None:
                 classes = found.get("classes")  # type: ignore[assignment]
             elif len(classes) != found["n_classes"]:

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import logging
 import re
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -13,6 +14,7 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Form, Query, Request
 from fastapi import Path as PathParam
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from pydantic import ValidationError
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from trompe_server.api.guard import COOKIE
@@ -38,6 +40,8 @@ from trompe_server.storage.tokens import hash_secret
 from trompe_shared.api import JOB_RESULT, MANIFEST_PAGE, Job, JobSpec, JobState, Result, in_parts
 from trompe_shared.presets import PRESETS
 from trompe_shared.shipped import shipped_objects
+
+logger = logging.getLogger(__name__)
 
 router = APIRouter(include_in_schema=False)
 
@@ -355,6 +359,9 @@ def _result(services: Services, job: Job) -> Result | None:
     try:
         return Result.model_validate_json(services.artifacts(job.id).read(RESULT))
     except FileNotFoundError:
+        return None
+    except ValidationError:
+        logger.warning("job %s is shown without its result: %s is damaged", job.id, RESULT)
         return None
 
 

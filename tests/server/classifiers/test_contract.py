@@ -99,9 +99,11 @@ def export(
     shape: tuple[int, ...] = (2, 3, *SIZE),
     dtype: torch.dtype = torch.float32,
     dynamic: bool = True,
+    most: int | None = None,
 ) -> Path:
     image = torch.rand(shape).to(dtype)
-    batch = ({0: torch.export.Dim.DYNAMIC},) if dynamic else None
+    many = torch.export.Dim.DYNAMIC if most is None else torch.export.Dim("batch", max=most)
+    batch = ({0: many},) if dynamic else None
     torch.export.save(torch.export.export(trained(network), (image,), dynamic_shapes=batch), path)
     return path
 
@@ -217,12 +219,16 @@ def test_images_of_another_form_are_refused(classifier: Classifier, images: np.n
         classifier.predict(images)
 
 
-def test_what_a_classifier_says_is_finite_whatever_its_network_says() -> None:
+def test_what_a_classifier_says_is_finite_and_nan_is_no_class() -> None:
     session = Mock(get_inputs=lambda: [Mock()])
-    session.run.return_value = [np.array([[np.nan, np.inf, -np.inf, 2.0]], np.float32)]
-    (logits,) = OnnxClassifier("odd", session, (8, 8), 4, None).predict(np.zeros((1, 8, 8, 3), np.uint8))
+    session.run.return_value = [np.array([[0.0, np.inf, -np.inf, 2.0]], np.float32)]
+    classifier, image = OnnxClassifier("odd", session, (8, 8), 4, None), np.zeros((1, 8, 8, 3), np.uint8)
+    (logits,) = classifier.predict(image)
     assert np.isfinite(logits).all()
     assert np.argsort(logits).tolist() == [2, 0, 3, 1]
+    session.run.return_value[0][0, 0] = np.nan
+    with pytest.raises(ClassifierError, match="gives NaN for 1 of 1 images"):
+        classifier.predict(image)
 
 
 def test_resizing_averages_what_it_shrinks() -> None:
@@ -422,6 +428,8 @@ def test_other_convolutions_stay(function: Callable[[Any, Tensor], Tensor], tmp_
 
 BREAKING: dict[str, tuple[nn.Module, dict[str, Any], str]] = {
     "fixed batch": (Net(), {"dynamic": False}, "batch is fixed to 2"),
+    "few at once": (Net(), {"most": 8}, "batch is limited to 8: pass torch.export.Dim.DYNAMIC"),
+    "one score": (Net(1), {}, "it gives one score"),
     "no image": (nn.Flatten(), {"shape": (2, 3, 8)}, r"its input is torch.float32 \(s"),
     "uint8 input": (nn.Flatten(), {"dtype": torch.uint8}, "its input is torch.uint8"),
     "maps, not logits": (nn.Conv2d(3, 4, 3), {}, r"its output for two images is torch.float32 \(2, 4,"),
@@ -443,6 +451,13 @@ def test_an_exported_network_that_breaks_the_contract_is_refused(
 ) -> None:
     with pytest.raises(ClassifierError, match=message):
         load_classifier(export(network, tmp_path / "net.pt2", **options))
+
+
+def test_a_network_in_training_or_of_other_classes_is_refused() -> None:
+    with pytest.raises(ClassifierError, match=r"'mine' is in training: call eval\(\)"):
+        NetworkClassifier("mine", Net().train(), SIZE, 7)
+    with pytest.raises(ClassifierError, match=r"gives \(7,\) scores an image, not 10"):
+        NetworkClassifier("mine", Net().eval(), SIZE, 10).predict(noise(2))
 
 
 def test_a_network_with_two_inputs_is_refused(tmp_path: Path) -> None:
@@ -573,6 +588,8 @@ def test_cut_and_foreign_files_are_refused(pt2: Path, tmp_path: Path) -> None:
         pytest.param({"last": "Softmax"}, "ends in a softmax", id="probabilities"),
         pytest.param({"last": "Shape"}, "onnxruntime cannot read it|its output for one image", id="no logits"),
         pytest.param({"last": "Log"}, "not finite", id="not finite"),
+        pytest.param({"channels": "h", "size": ("w", 3)}, "channels last: put a Transpose", id="channels last"),
+        pytest.param({"n_classes": 1}, "it gives one score", id="one score"),
         pytest.param({"last": "RandomNormalLike"}, "depend on chance", id="chance"),
         pytest.param({"last": "LpNormalization", "axis": 0, "batch": 4}, "others of its batch of 4", id="mixed batch"),
     ],
@@ -580,6 +597,19 @@ def test_cut_and_foreign_files_are_refused(pt2: Path, tmp_path: Path) -> None:
 def test_an_onnx_network_against_the_contract_is_refused(options: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(ClassifierError, match=message):
         load_onnx(write_onnx(tmp_path / "net.onnx", **options))
+
+
+def test_an_onnx_network_whose_output_is_a_table_is_refused(tmp_path: Path) -> None:
+    """As scikit-learn's converter makes it."""
+    model = onnx.load(write_onnx(tmp_path / "net.onnx"))
+    row = helper.make_map_type_proto(TensorProto.INT64, helper.make_tensor_type_proto(TensorProto.FLOAT, []))
+    table = helper.make_value_info("table", helper.make_sequence_type_proto(row))
+    zipped = helper.make_node("ZipMap", ["logits"], ["table"], domain="ai.onnx.ml", classlabels_int64s=range(7))
+    graph = helper.make_graph([*model.graph.node, zipped], "g", model.graph.input, [table], model.graph.initializer)
+    opsets = [helper.make_opsetid("", 18), helper.make_opsetid("ai.onnx.ml", 3)]
+    onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=10), tmp_path / "table.onnx")
+    with pytest.raises(ClassifierError, match=r"its output is seq\(map.*export the raw scores alone"):
+        load_onnx(tmp_path / "table.onnx")
 
 
 def test_a_network_that_onnxruntime_runs_leaves_nothing_in_the_home_folder(tmp_path: Path) -> None:

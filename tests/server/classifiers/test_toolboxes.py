@@ -73,6 +73,20 @@ def test_our_networks_are_classifiers_of_foolbox_and_art() -> None:
     torch.testing.assert_close(torch.from_numpy(model.predict(images.numpy())), classifier.scores(images))
 
 
+def test_what_is_no_classifier_of_torch_is_refused() -> None:
+    network = fake_classifier().network.eval()
+    with pytest.raises(ClassifierError, match="Expected foolbox's PyTorchModel, got "):
+        from_foolbox(network, image_size=(32, 32))
+    with pytest.raises(ClassifierError, match="Expected ART's PyTorchClassifier, got "):
+        from_art(network)
+
+
+def test_an_art_classifier_that_changes_its_scores_is_refused() -> None:
+    defences = pytest.importorskip("art.defences.postprocessor")
+    with pytest.raises(ClassifierError, match=r"changes scores by .*ReverseSigmoid"):
+        of_art(fake_classifier().network.eval(), postprocessing_defences=defences.ReverseSigmoid())
+
+
 @pytest.mark.parametrize("options", [{"clip_values": None}, {"input_shape": (28, 28)}])
 def test_an_art_classifier_of_other_images_is_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ClassifierError, match=r"expected \(3, H, W\) and two numbers"):

@@ -10,6 +10,7 @@ import pytest
 from tests.job_runs import CHAIR, Recorder
 from trompe_server import attack_object
 from trompe_server.attack import ViewDistribution
+from trompe_server.renderers import SailenvTarget
 from trompe_shared.engine import EngineInfo
 from trompe_shared.errors import RendererError, SpecError
 
@@ -45,6 +46,13 @@ class Changed(Recorder):
 
     def render(self, *args: Any, **options: Any) -> Any:
         return self.change(super().render(*args, **options))  # type: ignore[attr-defined]
+
+
+def test_it_says_whether_the_surrogate_knew_the_target(target: SailenvTarget) -> None:
+    views = ViewDistribution(0.3, (10, 40)).sample(3, generator=np.random.default_rng(0))
+    known = attack_object("mug", "tiny", label="mug", target=target, views=views, held_out=[], steps=1)
+    assert known.fidelity.good_enough
+    assert not attack_object(CHAIR, "tiny", target=Recorder(), **OPTIONS).fidelity.good_enough  # no renderer at all
 
 
 def test_a_targets_images_may_lie_in_memory_as_they_like() -> None:

@@ -52,6 +52,25 @@ def test_an_object_has_the_given_name_or_the_stem_of_its_file(
     assert Library(tmp_path).objects.find(expected) == info
 
 
+@pytest.mark.parametrize("damaged", ["info.json", "data.zip"])
+def test_a_damaged_upload_is_left_out_or_repaired_by_the_same_file(tmp_path: Path, damaged: str) -> None:
+    library = Library(tmp_path)
+    kept = library.add_background(encode_png(np.zeros((4, 4, 3), np.uint8)), "kept.png")
+    info = library.add_object(io.BytesIO(triangle_zip()), "triangle.zip")
+    file = tmp_path / "objects" / info.id / damaged
+    file.write_bytes(file.read_bytes()[:20])
+    assert (info in library.objects.all()) == (damaged == "data.zip")
+    assert library.backgrounds.all() == [kept]
+    assert Library(tmp_path).add_object(io.BytesIO(triangle_zip()), "triangle.zip") == info
+    assert library.object_bytes("triangle") == triangle_zip()
+
+
+def test_a_refused_classifier_is_called_by_its_own_name(tmp_path: Path) -> None:
+    library = Library(tmp_path, inspect=Mock(side_effect=ClassifierError("'data.pt2': its output is a tuple.")))
+    with pytest.raises(ClassifierError, match=r"'mine v2\.pt2': its output is a tuple"):
+        library.add_classifier(io.BytesIO(b"?"), "mine v2.pt2")
+
+
 @pytest.mark.parametrize("filename", ["photo.été", "photo." + "x" * 300, "photo", "photo.\udce9"])
 def test_a_background_is_stored_under_any_file_name(tmp_path: Path, filename: str) -> None:
     data = encode_png(np.zeros((4, 4, 3), np.uint8))

@@ -116,7 +116,9 @@ def _fidelity(data: ReportData) -> Iterator[str]:
     if calibration is None or calibration.model == "diffuse" or calibration.fidelity.good_enough:
         return
     mean, automatic = calibration.fidelity.mean(), data.spec.search.surrogate == "auto"
-    told = "`trompe render --check` tells whether the renderer keeps the conventions."
+    told = (
+        "`trompe render --check` tells whether the renderer keeps the conventions; if it does, look for blur or noise."
+    )
     yield (
         f"The surrogate is outside its tolerance: mean error {mean['error'] * 255:.1f}/255 "
         f"(at most {MAX_ERROR * 255:.1f}), {mean['explained']:.0%} of a random repaint's effect explained "
