@@ -1,6 +1,7 @@
 """Model files and classifiers on this machine, as a user names them, and the files that a model names."""
 
 import io
+import itertools
 import json
 import os
 import posixpath
@@ -27,6 +28,8 @@ PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".t
 _BESIDE: Final = {*MODEL_SUFFIXES, *PICTURE_SUFFIXES, ".mtl", ".json", ".bin"}
 _BELOW: Final = ("*/*", "*/*/*")
 """Patterns of files one and two folders below."""
+MANY: Final = 10_000
+"""Files that are looked at for a lost picture: a larger folder holds more than a model."""
 _MTLLIB: Final = re.compile(r"mtllib(?<![^\r\n]mtllib)[ \t]+([^\r\n]+)")
 """The literal comes first: 50 times as fast as the check for the start of a line."""
 _MAP: Final = re.compile(r"map_|(?:bump|norm|disp|decal|refl)$", re.IGNORECASE)
@@ -151,7 +154,8 @@ def _found(folder: Path, names: Collection[str], *, beside: str = "") -> list[st
 
 def _below(folder: Path, name: str) -> str | None:
     """The only file of a name one or two folders below ``folder``, in any capitals."""
-    alike = [file for each in _BELOW for file in folder.glob(each) if spelling(file.name) == spelling(name)]
+    files = itertools.islice((file for each in _BELOW for file in folder.glob(each)), MANY)
+    alike = [file for file in files if spelling(file.name) == spelling(name)]
     return _spelled(folder, str(alike[0].relative_to(folder))) if len(alike) == 1 else None
 
 

@@ -31,7 +31,7 @@ from trompe_renderer.engines.pyrender import PyrenderEngine, PyrenderOptions
 from trompe_server.classifiers import NetworkClassifier, WhiteBoxClassifier, load_classifier
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.api import Job, JobRequest, JobSpec, JobState, Result
-from trompe_shared.errors import ObjectError, SpecError
+from trompe_shared.errors import ClassifierError, ObjectError, SpecError
 from trompe_shared.geometry import Camera, View
 from trompe_shared.object3d import Object3D, load_object
 
@@ -110,14 +110,22 @@ class Overflowing(torch.nn.Module):
         return self.inner(images).masked_fill(last, self.odd)  # type: ignore[no-any-return]
 
 
-@pytest.mark.parametrize("odd", [float("nan"), float("inf"), -float("inf")])
-def test_a_result_can_be_read_where_the_network_says_what_is_no_number(tmp_path: Path, odd: float) -> None:
+def attacked_by(odd: float, folder: Path) -> Result:
     def overflowing(classifier: WhiteBoxClassifier) -> WhiteBoxClassifier:
         assert isinstance(classifier, NetworkClassifier)
         return replace(classifier, network=Overflowing(classifier.network, odd))
 
-    spec = JobSpec.of("chair", label="chair", **SMALL)
-    result = run_job(spec, FakeTarget(), tmp_path, change=overflowing).result
+    return run_job(JobSpec.of("chair", label="chair", **SMALL), FakeTarget(), folder, change=overflowing).result
+
+
+def test_a_network_that_says_what_is_no_number_has_no_result(tmp_path: Path) -> None:
+    with pytest.raises(ClassifierError, match="gives NaN for 1 of 2 images"):
+        attacked_by(float("nan"), tmp_path)
+
+
+@pytest.mark.parametrize("odd", [float("inf"), -float("inf")])
+def test_a_result_can_be_read_where_the_network_says_what_is_beyond_all_numbers(tmp_path: Path, odd: float) -> None:
+    result = attacked_by(odd, tmp_path)
     assert [view.before_confidence for view in result.views[-1:]] == pytest.approx([1 / 8])
     assert result.target.a_before == 0.5
     assert 0 <= result.views[0].before_confidence <= 1
