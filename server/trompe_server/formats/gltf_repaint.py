@@ -232,8 +232,9 @@ class _Editor(Writer):
         if _extensions(entry).pop(name, None) is not None:
             _keep(entry, "extensions", entry["extensions"])
             if not any(name in _extensions(each) for each in alike):
-                types = {image.get("mimeType") for image in self.document.get("images", [])}
-                keys = {"extensionsRequired"} if _TYPES.get(name) in types else {"extensionsRequired", "extensionsUsed"}
+                types = [image.get("mimeType") for image in self.document.get("images", [])]
+                is_used = name in _TYPES and _TYPES[name] in types
+                keys = {"extensionsRequired"} if is_used else {"extensionsRequired", "extensionsUsed"}
                 for key in keys & self.document.keys():
                     _keep(self.document, key, [used for used in self.document[key] if used != name])
 

@@ -423,6 +423,7 @@ def test_colours_of_the_older_kind_go_with_the_first_paint() -> None:
     older = "KHR_materials_pbrSpecularGlossiness"
     scene = textured(extensions={older: {"diffuseTexture": {"index": 0}}, "other": {}})
     scene.document["extensionsUsed"] = [older, "other"]
+    scene.add("images", {"uri": "data:image/png;base64,"})  # needs no type
     document, _ = contents(painted_over(scene)[1])
     assert document["materials"][0]["extensions"] == {"other": {}}
     assert document["extensionsUsed"] == ["other"]
