@@ -26,6 +26,7 @@ MODEL_SUFFIXES: Final = {*SPLIT_SUFFIXES, *PICTURED_SUFFIXES, ".glb", ".stl"}
 PICTURE_SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".gif"}
 """Of the formats of textures (``object3d.IMAGE_FORMATS``)."""
 _BESIDE: Final = {*MODEL_SUFFIXES, *PICTURE_SUFFIXES, ".mtl", ".json", ".bin"}
+"""Of the files of a model."""
 _BELOW: Final = ("*/*", "*/*/*")
 """Patterns of files one and two folders below."""
 MANY: Final = 10_000
@@ -86,8 +87,9 @@ def _zip_folder(folder: Path) -> bytes:
     if not models:
         raise ObjectError(f"The folder {str(folder)!r} holds no .obj, .gltf or other model file.")
     if models[0].parent != folder:
-        below = (str(file.relative_to(folder)) for file in folder.rglob("*") if file.suffix.lower() in _BESIDE)
-        return _zip_files(folder, [file for file in below if _spelled(folder, file)])
+        below = (file.relative_to(folder) for file in folder.rglob("*") if file.suffix.lower() in _BESIDE)
+        shown = [str(file) for file in below if not any(part.startswith(".") for part in file.parts)]
+        return _zip_files(folder, [file for file in shown if _spelled(folder, file)])
     files = [file.name for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
     split = [model for model in models if is_split(model)]
     return _zip_files(folder, [*files, *(name for model in split for name in files_of(model))])

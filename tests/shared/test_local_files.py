@@ -72,7 +72,7 @@ def test_a_picture_of_another_machine_is_found_where_only_one_folder_has_it(tmp_
 
 def test_a_model_below_the_folder_is_sent_with_the_pictures_of_all_folders(tmp_path: Path) -> None:
     files = {"source/m.obj": "mtllib m.mtl", "source/m.mtl": "map_Kd ../textures/a.png", "textures/a.png": ""}
-    written(tmp_path / "download", files | {"notes.doc": ""})
+    written(tmp_path / "download", files | dict.fromkeys(("notes.doc", "textures/._a.png", ".git/b.png"), ""))
     (tmp_path / "key.png").write_text("")
     (tmp_path / "download/textures/link.png").symlink_to(tmp_path / "key.png")
     assert packed(tmp_path / "download") == files.keys()
