@@ -9,6 +9,7 @@ callables: ``read(n)`` returns exactly n bytes, or raises ``EOFError`` or ``OSEr
 """
 
 import codecs
+import contextlib
 import gzip
 import json
 import struct
@@ -16,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
-from trompe_shared.errors import ProtocolError, RendererError
+from trompe_shared.errors import ProtocolError, RendererError, RendererLostError
 from trompe_shared.object3d import MAX_TEXTURE_SIDE
 
 MAX_TEXT: Final = 64 * 2**10
@@ -37,6 +38,8 @@ identity (``EngineInfo.to_text``); any other SAILenv answers that the light does
 MAIN_LIGHT: Final = "Main Light"
 RIM_LIGHT: Final = "Rim Light"
 LIGHT_NOT_FOUND: Final = "light_not_found"
+LOST: Final = "lost: "
+"""Begins the status of a renderer that ends after it: another one may succeed."""
 
 VIEW_FLAGS: Final[Mapping[str, int]] = {"main": 1, "category": 4, "object": 8, "optical": 16, "depth": 32}
 """Bit of each view in FRAME's flags, in the order of the reply."""
@@ -388,8 +391,13 @@ def encode_status(refusal: str | None = None) -> bytes:
 
 
 def take_status(read: Reader, asked: str) -> None:
-    """Read the status of the command ``asked``. Raises ``RendererError`` with the server's reason for any but "ok"."""
-    if (status := _SERVER_TEXT.take(read)) != "ok":
+    """Read the status of the command ``asked``. Raises ``RendererError`` with the server's reason for any but "ok", and
+    ``RendererLostError`` after the end of a renderer that is lost."""
+    if (status := _SERVER_TEXT.take(read)).startswith(LOST):
+        with contextlib.suppress(EOFError, OSError):
+            read(1)  # until its end nobody may connect again
+        raise RendererLostError(status.removeprefix(LOST))
+    if status != "ok":
         raise RendererError(f"The renderer refused {asked}: {status}")
 
 

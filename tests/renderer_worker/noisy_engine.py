@@ -28,3 +28,10 @@ class Talkative(Noisy):
         super().__init__()
         os.write(1, "Grün ".encode("latin-1"))
         subprocess.Popen(["sleep", "600"])
+
+
+class Failing(Noisy):
+    """Draws nothing."""
+
+    def render(self, world: Snapshot, *, width: int, height: int) -> NDArray[np.uint8]:
+        raise ValueError("no shader")

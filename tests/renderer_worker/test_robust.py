@@ -21,7 +21,7 @@ import pytest
 
 from tests.served import repeating, reserved_port, wait_until
 from tests.wire import ORIGIN, Wire, boxes
-from tests.worker_process import Worker
+from tests.worker_process import Worker, started
 from trompe_renderer.engines.render_thread import FairQueue, RenderThread
 from trompe_renderer.protocol.limits import MIB, Limits, MemoryBudget
 from trompe_renderer.protocol.link import Link
@@ -31,8 +31,8 @@ from trompe_renderer.world.snapshot import Snapshot
 from trompe_server.service.supervisor import LISTENING
 from trompe_shared.addresses import host_and_port
 from trompe_shared.engine import EngineInfo
-from trompe_shared.errors import ProtocolError, RendererError
-from trompe_shared.geometry import Camera
+from trompe_shared.errors import ProtocolError, RendererError, RendererLostError
+from trompe_shared.geometry import Camera, View
 from trompe_shared.sailenv import MAX_VIEWS, REGISTER, decode_frame, take_status
 from trompe_shared.sailenv_client import SailenvTarget
 
@@ -226,13 +226,13 @@ def test_a_crash_ends_the_worker_with_its_signal_and_a_line_in_the_log(own_worke
     assert "Fatal Python error: Segmentation fault" in (tmp_path / "worker.log").read_text()
 
 
-def test_a_worker_without_its_engine_ends_with_a_status_and_a_reason() -> None:
-    """``RenderThread`` has lost its engine: the default of ``lost``."""
-    script = "from trompe_renderer.engines.render_thread import _exit_process; _exit_process('context lost')"
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=240, check=False)
-    assert ended.returncode == os.EX_TEMPFAIL
-    assert "The engine is lost" in ended.stderr
-    assert "context lost" in ended.stderr
+def test_a_worker_whose_engine_always_fails_tells_the_reason_and_ends(tmp_path: Path) -> None:
+    log = tmp_path / "worker.log"
+    with log.open("w") as file, started("--engine", "tests.renderer_worker.noisy_engine:Failing", log=file) as worker:
+        with closing(SailenvTarget(*worker.address)) as target, pytest.raises(RendererLostError, match="no shader"):
+            target.render(boxes(), [View(Camera(1.0, 0.0, 0.0))], size=(8, 8))
+        assert worker.process.wait(120) == os.EX_TEMPFAIL
+    assert "The engine is lost" in log.read_text()
 
 
 ENGINE = EngineInfo("test", "1")
@@ -272,8 +272,9 @@ def test_an_engine_counts_as_lost_when_not_even_an_empty_picture_can_be_drawn(fa
         assert draw(thread).result().shape == (4, 4, 3)
     assert lost == []
     engine.broken = True
-    with pytest.raises(RuntimeError, match="out of memory"):
+    with pytest.raises(RendererLostError, match=r"out of memory.*context lost"):
         draw(thread, fails=True).result()
+    thread.run(lambda _: None, agent=Session).result()  # begins after the end of the turn before
     assert "context lost" in lost[0]
 
 

@@ -18,10 +18,13 @@ import numpy as np
 from trompe_renderer.engines.engine import Engine
 from trompe_renderer.world.snapshot import Snapshot
 from trompe_shared.engine import EngineInfo
-from trompe_shared.errors import TrompeError
+from trompe_shared.errors import RendererLostError, TrompeError
 
 TURN_LIMIT: Final = 120.0
 """Seconds after which a picture, and the engine with it, counts as hung."""
+
+LAST_WORDS: Final = 0.2
+"""Seconds in which the agent can still be told that the engine is lost."""
 
 EMPTY: Final = Snapshot((), np.eye(4), (), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
@@ -82,6 +85,7 @@ class RenderThread:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="render")
         self._lost, self._limit = lost, turn_limit
         self._since: float | None = None
+        self._failure: str | None = None
         self._queue = FairQueue()
         self._engine = self._thread.submit(engine).result()
         threading.Thread(target=self._watch, name="watch", daemon=True).start()
@@ -110,6 +114,9 @@ class RenderThread:
         started = time.monotonic()
         fulfil()
         self._queue.charge(agent, time.monotonic() - started)
+        if self._failure is not None:
+            time.sleep(LAST_WORDS)
+            self._lost(self._failure)
 
     def _watched(self, work: Callable[[Engine], T]) -> T:
         self._since = time.monotonic()
@@ -128,12 +135,13 @@ class RenderThread:
             self._since = None
 
     def _check_engine(self, error: Exception) -> None:
-        """After a failure, find its cause: the engine is lost if not even an empty picture can be drawn."""
+        """Raise ``RendererLostError`` if after a failure not even an empty picture can be drawn."""
         try:
             self._engine.render(EMPTY, width=8, height=8)
         except (Exception, SystemExit) as second:
             log.error("a picture failed", exc_info=error)
-            self._lost(f"{error!r}, and then {second!r} on an empty picture")
+            self._failure = f"{error!r}, and then {second!r} on an empty picture"
+            raise RendererLostError(f"the engine {self.info.name} failed: {self._failure}") from error
 
     def _watch(self) -> None:
         while True:

@@ -23,9 +23,10 @@ from trompe_renderer.protocol.session import Session
 from trompe_renderer.protocol.upload import ModelCache
 from trompe_renderer.world.scenes import SCENES
 from trompe_renderer.world.snapshot import Snapshot
-from trompe_shared.errors import ProtocolError, RendererError, TrompeError
+from trompe_shared.errors import ProtocolError, RendererError, RendererLostError, TrompeError
 from trompe_shared.sailenv import (
     COMMANDS,
+    LOST,
     MAX_SIDE,
     REGISTER,
     Command,
@@ -183,7 +184,8 @@ class Agent:
         try:
             picture = drawn.result()
         except Exception as error:
-            self._link.send(encode_status(self._note("render_views", error)))
+            told = self._note("render_views", error)
+            self._link.send(encode_status(LOST + told if isinstance(error, RendererLostError) else told))
             return False
         self._link.send(encode_status(), picture.data.cast("B"))
         return True
