@@ -5,6 +5,7 @@
         ├── ServerUnreachable        no answer at the server's address, or a broken connection
         ├── EmbeddedServerError      the embedded service failed to start, or died
         ├── BrokenDownload           wrong checksum
+        ├── NotWritten               the disk is full, or the file cannot be written
         ├── ContractError            unreadable answer: another version, or not a Trompe server
         ├── APIError                 refusal by the server: has status, problem, retry_after
         │   ├── BadRequest           400, 413, 415, 422: invalid request
@@ -65,6 +66,10 @@ class EmbeddedServerError(ClientError):
 
 class BrokenDownload(ClientError):  # noqa: N818
     """The checksum of a downloaded file differs from the server's."""
+
+
+class NotWritten(ClientError):  # noqa: N818
+    """A downloaded file cannot be written, for example to a full disk."""
 
 
 class ContractError(ClientError):

@@ -180,8 +180,9 @@ def _headline(result: Result) -> str:
     names = result.label_names or []
     label = _either([f"{name} ({k})" for name, k in zip(names, result.labels, strict=False)] or result.labels)
     tau = "none" if result.tau is None else f"{result.tau:g}"
-    keep = "" if spec.paint.keep is None else f", keep {spec.paint.keep:g}"
-    budget = f"epsilon {result.epsilon:g}, alpha {result.alpha:g}, tau {tau}{keep}"
+    others = [("epsilon_view", spec.paint.epsilon_view), ("keep", spec.paint.keep)]
+    given = "".join(f", {name} {value:g}" for name, value in others if value is not None)
+    budget = f"epsilon {result.epsilon:g}, alpha {result.alpha:g}, tau {tau}{given}"
     through = " and ".join([result.classifier, *map(_short, spec.victim.ensemble)])
     return (
         f"{result.object}, class {label}, attacked through {through}: {budget}, {result.steps} steps, "
@@ -211,7 +212,9 @@ def _facts(result: Result, seconds: Mapping[str, float]) -> Iterator[tuple[str, 
     yield "max view change", _figure(result.max_view_change, LEVELS)
     if result.views_beyond_epsilon is not None and result.pixels_beyond_epsilon is not None:
         views, pixels = _figure(result.views_beyond_epsilon, PERCENT), f"{result.pixels_beyond_epsilon:.2%}"
-        yield "above epsilon", f"{views} of the target views ({pixels} of the object's pixels); epsilon bounds texels"
+        name = "epsilon" if result.spec.paint.epsilon_view is None else "epsilon_view"
+        bounded = {"epsilon": "texels", "epsilon_view": "the surrogate's views"}[name]
+        yield f"above {name}", f"{views} of the target views ({pixels} of the object's pixels); {name} bounds {bounded}"
     if result.ssim is not None and result.noticed is not None:
         yield "visibility", f"{result.noticed} SSIM {result.ssim:.3f}"
     for name, each in result.by_renderer:

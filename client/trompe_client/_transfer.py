@@ -4,12 +4,13 @@ Bytes go to ``.NAME.SUM.part`` beside the file. SUM is the checksum in the serve
 the part. A file appears under its name once its checksum is right.
 """
 
+import contextlib
 import glob
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Mapping
-from contextlib import aclosing
+from collections.abc import AsyncIterator, Iterable, Mapping
+from contextlib import aclosing, asynccontextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -17,14 +18,22 @@ from typing import Final
 
 from trompe_client import _core
 from trompe_client._core import Request
-from trompe_client._errors import BrokenDownload, ClientError, ContractError
+from trompe_client._errors import BrokenDownload, ClientError, ContractError, NotWritten
 from trompe_client._operations import check, send
 from trompe_client._port import Answer, Port
 from trompe_shared.api import Job
 
+try:
+    import fcntl
+except ImportError:  # elsewhere than on Unix
+    fcntl = None  # type: ignore[assignment]
+
 ETAG: Final = re.compile(r'(?:W/)?"([0-9a-f]{64})"')
 SUM: Final = re.compile(r"\.([0-9a-f]{64})\.part$")
 PARTIAL, UNCHANGED, UNSATISFIABLE = 206, 304, 416
+
+WAIT: Final = 0.2
+"""Seconds between two looks whether another download into the same folder has ended."""
 
 
 def check_inside(folder: Path, names: Iterable[str]) -> None:
@@ -45,10 +54,51 @@ async def fetch_all(port: Port, job_id: str, folder: Path) -> tuple[Job, list[Pa
 
 
 async def fetch(port: Port, request: Request[bytes], path: Path) -> Path:
-    """Download one file to ``path``, in place of an older one. Requests missing bytes only.
+    """Download one file to ``path``, in place of an older one. Requests missing bytes only, after other downloads into
+    the same folder.
 
-    Raises ``BrokenDownload`` if the checksum stays wrong.
+    Raises ``BrokenDownload`` if the checksum stays wrong, ``NotWritten`` e.g. for a full disk.
     """
+    try:
+        async with _alone(port, path.parent):
+            return await _fetch(port, request, path)
+    except OSError as error:
+        raise NotWritten(
+            f"{path} cannot be written ({error.strerror or error}). The server keeps it: make room or choose another "
+            "folder, and download again."
+        ) from error
+
+
+@asynccontextmanager
+async def _alone(port: Port, folder: Path) -> AsyncIterator[None]:
+    """Only one download at a time, of all processes, writes into ``folder``, which is made."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        while not _locked(handle):
+            await port.sleep(WAIT)
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_UN)  # a forked process may hold the file, too
+        os.close(handle)
+
+
+def _locked(handle: int) -> bool:
+    """Whether the folder is locked now, or cannot be, as in some network file systems."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+async def _fetch(port: Port, request: Request[bytes], path: Path) -> Path:
     attempt = 0
     while True:
         part = await port.off(partial(_Part.beside, path))
@@ -75,7 +125,6 @@ class _Part:
     @classmethod
     def beside(cls, path: Path) -> "_Part":
         """The part of an earlier attempt, or an empty one."""
-        path.parent.mkdir(parents=True, exist_ok=True)
         for file in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
             if match := SUM.search(file.name):
                 return cls(path, match[1], file.stat().st_size)

@@ -1,12 +1,13 @@
 """Files come whole or not at all, and no byte of them twice."""
 
 import hashlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from tests.client.conftest import SPEC, FakeServer
-from trompe_client import BrokenDownload, Client, JobHandle, ServerUnreachable
+from trompe_client import BrokenDownload, Client, JobHandle, NotWritten, ServerUnreachable
 
 DATA = bytes(range(256)) * 4000
 
@@ -95,3 +96,17 @@ def test_an_archive_comes_under_the_name_it_is_given(job: JobHandle, tmp_path: P
     path = job.archive(tmp_path / "deep" / "all.zip")
     assert path.read_bytes()[:2] == b"PK"
     assert [file.name for file in path.parent.iterdir()] == ["all.zip"]
+
+
+def test_threads_download_the_same_job_into_the_same_folder(job: JobHandle, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(8) as threads:
+        found = list(threads.map(lambda _: job.download(tmp_path), range(16)))
+    assert all(paths == found[0] for paths in found)
+    assert all(path.is_file() for path in found[0])
+    assert not list(tmp_path.glob(".*.part"))
+
+
+def test_a_file_that_cannot_be_written_says_where_it_still_is(job: JobHandle, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(NotWritten, match=r"taken.*cannot be written \(Not a directory\)\. The server keeps it"):
+        job.download(tmp_path / "taken" / "results")

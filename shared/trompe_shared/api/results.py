@@ -158,7 +158,8 @@ class Visibility(Schema):
         default=None, description="largest |change| of a pixel of a target view, [0, 1] units"
     )
     pixels_beyond_epsilon: float | None = Field(
-        default=None, description="share of the object's pixels in target views that changed by more than epsilon"
+        default=None,
+        description="share of the object's pixels in target views that changed by more than epsilon, or epsilon_view",
     )
     views_beyond_epsilon: float | None = Field(default=None, description="share of target views with such a pixel")
     ssim: float | None = Field(

@@ -107,7 +107,11 @@ def test_the_view_constraint_holds_in_the_surrogate_and_is_measured_in_the_targe
     assert plain.max_view_change is not None
     assert bound.max_view_change is not None
     assert bound.max_view_change < plain.max_view_change
-    assert plain.views_beyond_epsilon is not None
+    assert plain.pixels_beyond_epsilon is not None
+    assert bound.pixels_beyond_epsilon is not None
+    assert (
+        bound.pixels_beyond_epsilon > plain.pixels_beyond_epsilon
+    )  # a smaller change, but of a bound of 0.02, not 0.1
 
 
 @pytest.mark.usefixtures("pictures")

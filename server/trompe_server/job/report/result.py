@@ -191,10 +191,10 @@ def _visibility(data: ReportData) -> Visibility:
     """Over all target views."""
     if data.after is None or data.painted is None:
         return Visibility()
-    setup = data.setup
+    setup, paint = data.setup, data.spec.paint
     before, after = (np.concatenate([each["own"], each["held_out"]]) for each in (data.before, data.after))
     return visibility_of(
         *(setup.obj.textures, data.painted.textures),
         *(before, after, behind([*setup.views, *setup.held_out], setup.backdrops, setup.size)),
-        epsilon=data.spec.paint.epsilon,
+        epsilon=paint.epsilon if paint.epsilon_view is None else paint.epsilon_view,
     )
