@@ -6,6 +6,7 @@ import signal
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -23,7 +24,7 @@ from trompe_server.queue.tables import events, jobs
 from trompe_server.renderers.discovery import RendererAddresses
 from trompe_server.settings import Settings
 from trompe_server.storage.database import DatabaseDownError, write
-from trompe_shared.api import JobState
+from trompe_shared.api import JobState, Needs
 
 
 class Clock:
@@ -216,6 +217,20 @@ def test_a_process_that_dies_before_it_is_ready_is_a_fault_and_is_tried_again(tm
         wait_until(lambda: executor.ended(0.1) == [] and "2 times" in str(executor.workers()[0].fault))
     finally:
         executor.close()
+
+
+def test_a_process_that_finds_no_file_descriptor_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    executor = LocalExecutor(Setup(Settings(data=tmp_path), RendererAddresses()))
+    with closing(executor), monkeypatch.context() as patched:
+        wait_until(lambda: executor.ended(0.1) == [] and executor.place(Needs()) is not None)
+        patched.setattr("multiprocessing.Pipe", Mock(side_effect=OSError(errno.EMFILE, "Too many open files")))
+        (worker,) = workers_of(os.getpid())
+        os.kill(worker, signal.SIGKILL)
+        wait_until(lambda: executor.ended(0.1) == [] and "Too many open files" in str(executor.workers()[0].fault))
+        patched.undo()
+        wait_until(lambda: executor.ended(0.1) == [] and executor.workers()[0].fault is None)
 
 
 def test_a_fork_server_that_dies_is_told_in_one_line(

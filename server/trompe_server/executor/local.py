@@ -53,7 +53,7 @@ class LocalExecutor:
         for slot in self._slots:
             if slot.claim == claim:
                 slot.kill()
-                slot.start()
+                slot.restart()
 
     def ended(self, timeout: float) -> list[Ended]:
         for slot in self._slots:
@@ -84,10 +84,10 @@ class _Slot:
 
     def start(self) -> None:
         """Start the process without waiting for the fork server. ``ready`` once it takes attempts."""
+        self.connection, theirs = multiprocessing.Pipe()
         self.claim: Claim | None = None
         self.ready, self._restart = False, 0.0
         self._process: BaseProcess | None = None
-        self.connection, theirs = multiprocessing.Pipe()
         self._starting = threading.Thread(target=self._start, args=(theirs,), daemon=True)
         self._starting.start()
 
@@ -119,13 +119,21 @@ class _Slot:
 
     @property
     def resting(self) -> bool:
-        """Whether there is no process: it died before it was ready, and starts again later."""
+        """Whether there is no process: it did not get ready, and starts again later."""
         return self._restart > 0
 
     def restart_if_due(self) -> None:
         """Start the process again after its rest."""
         if self.resting and time.monotonic() > self._restart:
+            self.restart()
+
+    def restart(self) -> None:
+        """Start the process again, after a rest if that is not possible now."""
+        try:
             self.start()
+        except OSError as error:  # no file descriptor is left
+            logger.warning("worker %s cannot start: %s", self.name, error)
+            self._rest(f"{self.name} cannot start ({error})")
 
     def listen(self) -> Ended | None:
         """Read what the process said; replace a dead one. Returns an attempt that ended."""
@@ -148,14 +156,18 @@ class _Slot:
         self.kill()
         reason = f"{self.name} died ({ending(None if self._process is None else self._process.exitcode)})"
         logger.warning("%s", reason)
-        claim, was_ready = self.claim, self.ready
-        if was_ready:
-            self.start()
+        claim = self.claim
+        if self.ready:
+            self.restart()
         else:
-            self._failures += 1
-            self.fault = f"{reason} before it was ready, {self._failures} times; its messages are in the service's log"
-            self._restart = time.monotonic() + min(2.0 ** (self._failures - 1), LONGEST_WAIT)
+            self._rest(f"{reason} before it was ready")
         return None if claim is None else Ended(claim, reason)
+
+    def _rest(self, reason: str) -> None:
+        self.ready, self.claim = False, None
+        self._failures += 1
+        self.fault = f"{reason}, {self._failures} times; its messages are in the service's log"
+        self._restart = time.monotonic() + min(2.0 ** (self._failures - 1), LONGEST_WAIT)
 
 
 def _environment(settings: Settings) -> dict[str, str]:
