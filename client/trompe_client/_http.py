@@ -199,7 +199,12 @@ def _translated(url: str) -> Iterator[None]:
         raise ServerUnreachable(
             f"No Trompe server answers at {url} ({error or type(error).__name__}). {remedy}"
         ) from error
+    except httpx.ReadTimeout as error:
+        raise ServerUnreachable(
+            f"{url} is connected but does not answer. Check that it is a Trompe server, and its log: it may be frozen."
+        ) from error
     except (httpx.RequestError, httpx.InvalidURL) as error:
         raise ServerUnreachable(
-            f"The connection to {url} broke ({type(error).__name__}: {error}). Check the server's log."
+            f"The connection to {url} broke ({type(error).__name__}: {error}). Check that it is a Trompe server, and "
+            "its log."
         ) from error

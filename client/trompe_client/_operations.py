@@ -1,7 +1,9 @@
 """Requests with retries, and operations of several requests. Coroutines over a ``Port``."""
 
+import logging
+import time
 from collections.abc import AsyncGenerator, Callable
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from trompe_client import _core
 from trompe_client._core import Request
@@ -10,19 +12,30 @@ from trompe_client._plan import Plan, R, Upload
 from trompe_client._port import Answer, Port
 from trompe_shared.api import Job
 
+LONG: Final = 5.0
+"""Seconds of a vain attempt from which its repetition is told."""
+
 T = TypeVar("T")
+
+logger = logging.getLogger("trompe_client")
 
 
 async def send(port: Port, request: Request[T]) -> T:
-    """Send a request, with retries, and parse its answer. Raises ``ClientError``."""
+    """Send a request, with retries, and parse its answer. Raises ``ClientError``.
+
+    Logs a warning, by default to standard error, before each repetition of an attempt that took long.
+    """
     attempt = 0
     while True:
+        began = time.monotonic()
         try:
             return await send_once(port, request)
         except ClientError as error:
             pause = port.retries.pause(error, attempt=attempt)
             if pause is None:
                 raise
+            if time.monotonic() - began > LONG:
+                logger.warning("%s Trying again.", error)
         await port.sleep(pause)
         attempt += 1
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import pytest
@@ -126,5 +127,16 @@ def test_a_server_that_says_nothing_is_given_up_but_may_read_an_upload_for_long(
         raise httpx.ReadTimeout("nothing", request=request)
 
     client = Client(server.url, timeout=patience, transport=httpx.MockTransport(silence))
-    with client, pytest.raises(ServerUnreachable, match="ReadTimeout"):
+    with client, pytest.raises(ServerUnreachable, match="does not answer"):
         send(client, tmp_path / "net.onnx")
+
+
+@pytest.mark.usefixtures("slept")
+def test_a_vain_attempt_that_took_long_is_told(
+    client: Client, server: FakeServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock = iter([0.0, 60.0, 60.0, 61.0, 61.0])  # two vain attempts and one more
+    monkeypatch.setattr("trompe_client._operations.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    server.refusals = [(503, {})] * 2
+    assert client.objects()
+    assert [record.getMessage().endswith("Trying again.") for record in caplog.records] == [True]
