@@ -203,7 +203,10 @@ def load_experiment(source: str | Path) -> Experiment:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise SpecError(f"{str(path)!r} is not YAML: {error}") from error
     if not isinstance(read, Mapping):
-        raise SpecError(f"{str(path)!r} must be a table with name, objects and grid; see docs/experiments.md.")
+        raise SpecError(
+            f"{str(path)!r} must be a table with name, objects and grid, such as "
+            "{name: mine, objects: {mug: {}}, grid: {epsilon: [0.02, 0.05]}}."
+        )
     try:
         return Experiment.model_validate({**read, "folder": path.parent.absolute()})
     except ValidationError as error:

@@ -168,6 +168,11 @@ def test_every_field_reaches_its_option_and_shows_its_fault(service: Service, pa
     page.locator("[name='paint.tau']").blur()
     expect(page.locator('[data-error="paint.tau"]')).to_contain_text("less than 1")
     faults.clear()  # browsers report answers of 422 on the console
+    page.fill("[name='paint.tau']", "")
+    page.locator("[name='search.seed']").fill("")
+    page.locator("[name='search.seed']").press_sequentially("1e")
+    page.get_by_role("button", name="Submit").click()
+    expect(page.locator(".error:visible")).to_have_text(["This is not a number."])
 
 
 def test_the_divider_is_dragged_and_views_are_chosen_by_key_and_map(service: Service, page: Page, done: str) -> None:

@@ -93,6 +93,8 @@ def _judge_here(spec: JudgementSpec, out: Path) -> None:
             click.echo(f"\nFinished work is kept in {out}. The same command goes on with it.", err=True)
             raise
     say(manifest, lambda: judgement_report(manifest, [out / MANIFEST, out / MANIFEST_PAGE]))
+    if all(cell.accuracy is None for cell in manifest.cells):
+        raise SpecError("The judgement has no figures; the lines above say why.")
 
 
 def _here(name: str) -> Callable[..., Any]:

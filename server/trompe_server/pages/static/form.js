@@ -69,8 +69,13 @@ function posted(request, path, body, onShare) {
   });
 }
 
-export const send = (path, body, headers = {}) =>
-  ask(path, { method: "POST", body, headers: { "Content-Type": "application/json", ...headers } });
+// Post a request, unless a field holds what its browser cannot read as a number: its value would be empty.
+export async function send(path, body, headers = {}) {
+  const errors = [...form.elements].filter((each) => each.validity?.badInput)
+    .map((each) => ({ field: each.name, message: "This is not a number." }));
+  if (errors.length) throw Object.assign(new Error(errors[0].message), { problem: { errors } });
+  return ask(path, { method: "POST", body, headers: { "Content-Type": "application/json", ...headers } });
+}
 
 // Submit what `request` gives as JSON, and go to the job. Until then the button is disabled: the form has no address.
 export function submits(path, request) {
