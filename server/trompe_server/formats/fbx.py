@@ -25,6 +25,7 @@ from trompe_server.formats.wavefront import complete, dissolved
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import base_name, named
 from trompe_shared.object3d import Object3D, decode_alpha, object_from_files, with_alpha_of
+from trompe_shared.wavefront import Part
 
 CENTIMETRE: Final = 0.01
 """Metres of FBX's default unit."""
@@ -120,7 +121,16 @@ def read(upload: Upload) -> Object3D:
         for part in obj.parts
     ]
     images = {name: obj.files[name] for m in obj.materials.values() for name in (m.albedo, m.normal) if name}
-    return assemble(safe_name(upload.stem), parts, obj.materials, images)
+    return assemble(safe_name(upload.stem), [_turned(part) for part in parts], obj.materials, images)
+
+
+def _turned(part: Part) -> Part:
+    """``part`` with the corners of each face in the order that its normals tell: assimp mirrors those of a mirrored
+    node, but leaves their order."""
+    corners, normals = part.vertices[part.faces], part.normals[part.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    against = (np.einsum("fk,fck->fc", across, normals) < 0).all(axis=1)
+    return replace(part, faces=np.where(against[:, None], part.faces[:, ::-1], part.faces))
 
 
 def _refuse_equal_names(converted: Mapping[str, bytes]) -> None:

@@ -358,6 +358,25 @@ def test_an_fbx_stands_upright_whatever_its_axes(kind: str, tmp_path: Path) -> N
 
 
 @needs_assimp
+@pytest.mark.parametrize("scale", [(1, 1, 1), (-1, 1, 1), (-1, -1, 1), (-1, -1, -1), (2, -0.5, 1)])
+def test_faces_of_a_mirrored_node_of_an_fbx_face_where_their_normals_do(
+    scale: tuple[float, ...], tmp_path: Path
+) -> None:
+    upright = OBJ.replace("usemtl", "vn 0 0 1\nusemtl").replace("f 1/1 2/2 3/3 4/4", "f 1/1/1 2/2/1 3/3/1 4/4/1")
+    data = fbx_of("newmtl red\n", tmp_path, mesh=upright)
+    node = rb'("Mesh" \{\s+Version: 232\s+Properties70:  \{)'
+    scaling = b'P: "Lcl Scaling", "Lcl Scaling", "", "A", %g, %g, %g' % scale
+    data, count = re.subn(node, rb"\g<1>\n" + scaling, data)
+    (part,) = read_object(data, name="t.fbx").obj.parts
+    first, second, third = np.moveaxis(part.vertices[part.faces], 1, 0)
+    across = np.cross(second - first, third - first)
+    assert count == 1
+    assert np.ptp(part.vertices[:, 0]) == pytest.approx(abs(scale[0]) * unit(data))
+    assert (across[:, 2] * np.sign(scale[2]) > 0).all()
+    assert (np.einsum("fk,fck->fc", across, part.normals[part.faces]) > 0).all()
+
+
+@needs_assimp
 @pytest.mark.parametrize("kind", ["fbxa", "fbx"])
 @pytest.mark.parametrize("name", ["Maya|baseColor", "3dsMax|main|base_color_map", "Maya|TEX_color_map|file"])
 def test_the_base_colour_of_a_physical_material_in_an_fbx_is_read(name: str, kind: str, tmp_path: Path) -> None:
