@@ -299,6 +299,11 @@ def parse_mtl(text: str) -> dict[str, dict[str, str]]:
                     f"The MTL scales or moves the texture {name!r} ({words[1].strip()[:80]}), which is not supported; "
                     "apply that to the texture coordinates in a modelling program."
                 )
+            if words[0].lower() == "map_kd" and _brightens(options):
+                raise ObjectError(
+                    f"The MTL changes the levels of the texture {name!r} ({words[1].strip()[:80]}), which is not "
+                    "supported; change the picture itself."
+                )
             current[keys[words[0].lower()]] = base_name(name)
             if words[0].lower() == "map_kd" and re.search(r"-clamp\s+on\s", options.lower()):
                 current["clamp"] = "on"
@@ -319,6 +324,12 @@ def _moves(options: str) -> bool:
     """Whether the options of a map change its scale (``-s``, by default 1 1 1) or its place (``-o``, 0 0 0)."""
     given = re.findall(rf"-([so])((?:\s+{_NUMBER})+)", options.lower())
     return any(float(number) != (flag == "s") for flag, numbers in given for number in numbers.split())
+
+
+def _brightens(options: str) -> bool:
+    """Whether the options of a map give its levels a base (``-mm``, by default 0) or a gain (1)."""
+    given = re.findall(rf"-mm\s+({_NUMBER})\s+({_NUMBER})", options.lower())
+    return any((float(base), float(gain)) != (0, 1) for base, gain in given)
 
 
 def dissolve(maps: Mapping[str, str], material: str) -> float | None:

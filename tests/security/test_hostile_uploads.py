@@ -282,6 +282,7 @@ GLTFS = {
     ),
     "a place beyond all bounds": (lambda: changed(nodes=[{"mesh": 0, "translation": [1e11, 0, 0]}]), "beyond 1e+06"),
     "compressed meshes": (lambda: changed(extensionsRequired=["EXT_meshopt_compression"]), "meshopt"),
+    "instances of an extension": (lambda: changed(extensionsUsed=["EXT_mesh_gpu_instancing"]), "gpu_instancing"),
     "meshes that Draco did not compress": (lambda: draco(), "cannot be decompressed by Draco"),
     "a skin that is not there": (lambda: changed(nodes=[{"mesh": 0, "skin": 0}]), "names skin 0, but has 0"),
     "lists where there should be names": (lambda: changed(meshes={"primitives": "all"}), "not valid at meshes"),

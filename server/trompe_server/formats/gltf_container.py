@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from trompe_server.formats.gltf_schema import READ_EXTENSIONS, Document, Draco, Material, Primitive
+from trompe_server.formats.gltf_schema import INSTANCING, READ_EXTENSIONS, Document, Draco, Material, Primitive
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
 from trompe_shared.faults import faults_of
@@ -199,7 +199,8 @@ def _document(text: bytes) -> Document:
         raise ObjectError(f"The glTF is not valid at {first.place or 'the JSON'}: {first.message}.") from error
     if not document.asset.version.startswith("2."):
         raise ObjectError(f"The glTF has version {document.asset.version[:20]!r}; export it as glTF 2.0.")
-    unread = [name for name in document.extensions_required if not name.startswith(READ_EXTENSIONS)]
+    needed = [*document.extensions_required, *({INSTANCING} & {*document.extensions_used})]
+    unread = dict.fromkeys(name for name in needed if not name.startswith(READ_EXTENSIONS))
     if unread:
         raise ObjectError(
             f"The glTF requires {', '.join(unread)[:200]}, which is not supported; export it uncompressed, with PNG, "

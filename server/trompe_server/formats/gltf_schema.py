@@ -20,6 +20,9 @@ READ_EXTENSIONS: Final = (
 )
 """Prefixes of extensions a file may require: supported, or about light and finish without effect here."""
 
+INSTANCING: Final = "EXT_mesh_gpu_instancing"
+"""Refused even where it is optional: without it one of many instances is left."""
+
 MAX_NODES: Final = 100_000
 MAX_JOINTS: Final = 65_536
 
@@ -224,6 +227,7 @@ class Material(_Part):
 class Document(_Part):
     asset: Asset
     extensions_required: tuple[str, ...] = ()
+    extensions_used: tuple[str, ...] = ()
     scene: Index | None = None
     scenes: tuple[Scene, ...] = ()
     nodes: Annotated[tuple[Node, ...], Field(max_length=MAX_NODES)] = ()

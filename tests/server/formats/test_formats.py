@@ -173,19 +173,20 @@ def test_a_byte_order_mark_costs_no_first_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "moved"),
+    ("options", "wrong"),
     [
-        pytest.param("-s 1.000 1.0 1 -o 0.0 0 0 -bm 2", False, id="the defaults"),
-        pytest.param("-s 1..2 1", False, id="no number"),
-        pytest.param("-s 2 2 1", True, id="scaled"),
-        pytest.param("-clamp on -o 0.25 0 0", True, id="moved"),
+        pytest.param("-s 1.000 1.0 1 -o 0.0 0 0 -mm 0 1.0 -bm 2", "", id="the defaults"),
+        pytest.param("-s 1..2 1", "", id="no number"),
+        pytest.param("-s 2 2 1", "scales or moves", id="scaled"),
+        pytest.param("-clamp on -o 0.25 0 0", "scales or moves", id="moved"),
+        pytest.param("-mm 0.2 0.5", "changes the levels of", id="dimmed"),
     ],
 )
-def test_a_texture_that_the_mtl_scales_or_moves_is_refused(options: str, moved: bool) -> None:
+def test_a_texture_that_the_mtl_changes_is_refused(options: str, wrong: str) -> None:
     mtl = f"newmtl red\nmap_Kd {options} red.png\n".encode()
     data = pack_zip({"t.obj": OBJ.encode(), "t.mtl": mtl, "red.png": encode_png(PICTURE)})
-    if moved:
-        assert f"scales or moves the texture 'red.png' ({options} red.png)" in refusal(data, "t.zip")
+    if wrong:
+        assert f"{wrong} the texture 'red.png' ({options} red.png)" in refusal(data, "t.zip")
     else:
         assert (next(iter(read_object(data, name="t.zip").obj.textures.values())) == PICTURE).all()
 
