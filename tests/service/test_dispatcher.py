@@ -222,11 +222,12 @@ def test_a_process_that_dies_before_it_is_ready_is_a_fault_and_is_tried_again(tm
 def test_a_process_that_finds_no_file_descriptor_is_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    executor = LocalExecutor(Setup(Settings(data=tmp_path), RendererAddresses()))
+    others = set(workers_of(os.getpid()))
+    executor = LocalExecutor(Setup(Settings(data=tmp_path, workers=1), RendererAddresses()))
     with closing(executor), monkeypatch.context() as patched:
         wait_until(lambda: executor.ended(0.1) == [] and executor.place(Needs()) is not None)
         patched.setattr("multiprocessing.Pipe", Mock(side_effect=OSError(errno.EMFILE, "Too many open files")))
-        (worker,) = workers_of(os.getpid())
+        (worker,) = set(workers_of(os.getpid())) - others
         os.kill(worker, signal.SIGKILL)
         wait_until(lambda: executor.ended(0.1) == [] and "Too many open files" in str(executor.workers()[0].fault))
         patched.undo()
