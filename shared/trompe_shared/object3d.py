@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from trompe_shared.errors import ObjectError
-from trompe_shared.local_files import base_name, files_of, libraries, named, pack_zip, text_of
+from trompe_shared.local_files import MODEL_SUFFIXES, base_name, files_of, libraries, named, pack_zip, text_of
 from trompe_shared.wavefront import Part, beyond_edges, dissolve, parse_mtl, parse_obj
 
 MAX_ARCHIVE_BYTES: Final = 512 * 2**20
@@ -241,6 +241,10 @@ def load_object(source: bytes | str | Path) -> Object3D:
         raise ObjectError(f"There is no file or folder {str(path)!r}.")
     if path.suffix.lower() == ".obj":
         return object_from_files(_with_files(path))
+    if path.suffix.lower() in MODEL_SUFFIXES:
+        raise ObjectError(
+            f"{str(path)!r} is no zip or OBJ; take trompe_server.formats.read_object(data, name={path.name!r}).obj."
+        )
     return object_from_files(unzip(path.read_bytes()))
 
 
@@ -330,6 +334,11 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 
 def object_from_files(files: Mapping[str, bytes]) -> Object3D:
     """Read an object from the files of its archive. Raises ``ObjectError``."""
+    if len(files) > MAX_MEMBERS:
+        raise ObjectError(
+            f"The object has {len(files)} files, most of them a picture for each material; at most {MAX_MEMBERS} are "
+            "read. Merge materials, or their pictures into one (an atlas)."
+        )
     mesh = _mesh_name(files)
     name = mesh[: -len(".obj")]
     parts = parse_obj(text_of(files[mesh]), mesh)

@@ -438,6 +438,7 @@ REFUSED: dict[str, tuple[Source, list[str]]] = {
     "an obj": (MESH.encode(), ["not a zip", "Zip the folder"]),
     "scrambled": (scrambled(), ["damaged or encrypted", "Zip the folder"]),
     "two folders": (zipped(FILES | {"more/x.png": b""}), ["flat", "one folder"]),
+    "more files than an archive may have": (FILES | {f"{k}.png": b"" for k in range(256)}, ["260 files", "Merge"]),
     "no such file": (Path("nowhere.zip"), ["nowhere.zip"]),
     "a folder without a mesh": (Path(__file__).parent, ["exactly one .obj"]),
 }
@@ -447,6 +448,11 @@ REFUSED: dict[str, tuple[Source, list[str]]] = {
 def test_an_inconsistent_object_is_refused_with_place_and_remedy(source: Source, words: list[str]) -> None:
     message = refusal(source)
     assert [word for word in words if word not in message] == []
+
+
+def test_a_file_of_another_format_is_refused_with_the_function_that_reads_it(tmp_path: Path) -> None:
+    (tmp_path / "chair.glb").write_bytes(b"glTF")
+    assert "read_object(data, name='chair.glb')" in refusal(tmp_path / "chair.glb")
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"], ids=repr)
