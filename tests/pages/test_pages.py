@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
+import onnx.parser
 import pytest
 from PIL import Image
 from playwright.sync_api import Browser, BrowserContext, Page, Response, expect
@@ -21,6 +23,16 @@ from trompe_shared.api import OPTIONS, JobRequest
 from trompe_shared.shipped import shipped_objects
 
 pytestmark = pytest.mark.timeout(1200)
+
+
+MEANS = """
+    <ir_version: 10, opset_import: ["": 18]>
+    means (float[n, 3, 32, 32] image) => (float[n, 3] logits) {
+        pooled = GlobalAveragePool(image)
+        logits = Flatten(pooled)
+    }
+"""
+"""A network: the means of the image's channels."""
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +95,24 @@ def test_a_wrong_file_and_a_wrong_class_are_told_in_the_servers_words(
         page.get_by_role("button", name="Submit").click()
         expect(page.locator(".error:visible").last).to_contain_text(re.compile(f"^{told}|'{told}'"))
     faults.clear()  # browsers report answers of 422 on the console
+
+
+@pytest.mark.parametrize(("form", "place"), [("jobs", "#classifier-file"), ("judgements", "[data-for=networks]")])
+def test_a_network_is_uploaded_with_the_names_of_its_classes(
+    service: Service, page: Page, tmp_path: Path, form: str, place: str
+) -> None:
+    net, names = tmp_path / "means.onnx", tmp_path / "names.json"
+    onnx.save(onnx.parser.parse_model(MEANS), net)
+    names.write_text(json.dumps(["red", "green", "blue"]))
+    page.goto(f"{service.url}/{form}/new")
+
+    page.set_input_files(place, names)
+    expect(page.locator(".error:visible")).to_contain_text("network's file together")
+    page.set_input_files(place, [names, net])
+    expect(page.locator("option:checked", has_text=net.stem)).to_have_count(1)
+    expect(page.locator(".error:visible")).to_have_count(0)
+    with service.client() as client:
+        assert next(each for each in client.classifiers() if each.name == net.stem).classes == ["red", "green", "blue"]
 
 
 def test_without_scripts_a_page_says_what_it_lacks(service: Service, browser: Browser) -> None:

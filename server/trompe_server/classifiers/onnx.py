@@ -97,7 +97,8 @@ def _session(path: Path, device: str) -> Any:
                 f"{path.name!r} keeps its weights in another file, which is not here. Write one file: "
                 "torch.onnx.export(..., external_data=False), or onnx.save(onnx.load(FILE), NEW) beside the weights."
             ) from error
-        raise broken(path.name, f"onnxruntime cannot read it ({str(error)[:300]})") from error
+        said = str(error).replace(str(path), path.name)[:300]
+        raise broken(path.name, f"onnxruntime cannot read it ({said})") from error
 
 
 def _input(session: Any, file: str) -> tuple[int | None, tuple[int, int]]:

@@ -1,5 +1,5 @@
 // Shared by the forms: uploads at once, faults beside their fields, one job for one request.
-import { answered, ask, words } from "./common.js";
+import { Refused, answered, ask, words } from "./common.js";
 
 const form = document.getElementById("new");
 const button = form.querySelector("button.button");
@@ -33,9 +33,10 @@ export function complain(error, own = "") {
 
 // Upload a file and choose it; nothing can be submitted until then. Returns what is stored, null if it is refused, and
 // undefined if another file was picked meanwhile.
-export async function upload(path, picked, select, place, onShare = () => {}) {
+export async function upload(path, picked, select, place, { onShare = () => {}, fields = {} } = {}) {
   const body = new FormData();
   body.append("file", picked);
+  for (const [name, text] of Object.entries(fields)) body.append(name, text);
   uploads.get(select)?.abort();
   const request = new XMLHttpRequest();
   uploads.set(select, request);
@@ -55,6 +56,14 @@ export async function upload(path, picked, select, place, onShare = () => {}) {
     if (uploads.get(select) === request) uploads.delete(select);
     button.disabled = uploads.size > 0;
   }
+}
+
+// Upload a network and choose it. A .json file picked with it holds the names of its classes.
+export async function uploadNetwork({ files }, select) {
+  const [names, file] = [true, false].map((isJson) => [...files].find(({ name }) => /\.json$/i.test(name) === isJson));
+  if (file) return upload("/v1/classifiers", file, select, select.name, { fields: names ? { classes: await names.text() } : {} });
+  if (names) complain(new Refused({ detail: "Pick the network's file together with its class names." }), select.name);
+  return null;
 }
 
 // Post with `onShare` told the share that is sent, which `fetch` does not tell.

@@ -1,6 +1,6 @@
 // The form of a new job: uploads at once, and shows the API's faults before anything is queued.
 import { Refused, ask } from "./common.js";
-import { complain, send, submits, upload } from "./form.js";
+import { complain, send, submits, upload, uploadNetwork } from "./form.js";
 import { Turntable } from "./turntable.js";
 
 const form = document.getElementById("new");
@@ -13,8 +13,10 @@ const says = document.getElementById("file-says");
 
 async function take(picked) {
   if (!picked) return;
-  const stored = await upload("/v1/objects", picked, object, "object", (share) => {
-    says.textContent = share < 1 ? `${picked.name}: ${Math.round(100 * share)} % uploaded` : `${picked.name}: the server reads it`;
+  const stored = await upload("/v1/objects", picked, object, "object", {
+    onShare: (share) => {
+      says.textContent = share < 1 ? `${picked.name}: ${Math.round(100 * share)} % uploaded` : `${picked.name}: the server reads it`;
+    },
   });
   if (stored === undefined) return;
   says.textContent = stored
@@ -82,9 +84,8 @@ drop.addEventListener("drop", ({ dataTransfer: { files, items } }) => {
   if (many) complain(new Refused({ detail: "Drop one file; pack a folder, or a model with its textures, as a zip." }), "object");
   else take(files[0]);
 });
-document.getElementById("classifier-file").onchange = async (event) => {
-  const [picked] = event.target.files;
-  if (picked && (await upload("/v1/classifiers", picked, classifier, classifier.name))) await classes();
+document.getElementById("classifier-file").onchange = async ({ target }) => {
+  if (await uploadNetwork(target, classifier)) await classes();
 };
 object.onchange = chosen;
 option("views.background").onchange = chosen;

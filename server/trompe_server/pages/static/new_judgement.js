@@ -1,13 +1,14 @@
 // The form of a new judgement.
-import { submits, upload } from "./form.js";
+import { submits, upload, uploadNetwork } from "./form.js";
 import { Turntable } from "./turntable.js";
 
 const form = document.getElementById("new"), { elements } = form;
 
 for (const input of document.querySelectorAll("input[data-for]")) {
-  const name = input.dataset.for, path = name === "networks" ? "/v1/classifiers" : "/v1/objects";
+  const name = input.dataset.for, select = elements[name];
   input.onchange = async () => {
-    if (input.files[0] && (await upload(path, input.files[0], elements[name], name))) elements[name].onchange?.();
+    if (name === "networks") await uploadNetwork(input, select);
+    else if (input.files[0] && (await upload("/v1/objects", input.files[0], select, name))) select.onchange();
   };
 }
 
