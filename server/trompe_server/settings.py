@@ -42,7 +42,8 @@ class Settings(BaseSettings):
     stall_timeout: Annotated[float, Field(gt=0)] = 1800.0
     """Seconds without progress after which an attempt counts as lost."""
     silence: Annotated[float, Field(ge=1.0, le=86_400.0)] = 30.0
-    """Seconds without a heartbeat after which an attempt, or the dispatcher, counts as dead and is replaced."""
+    """Seconds without a heartbeat or answer after which an attempt, the dispatcher or a renderer of ``trompe serve``
+    counts as dead and is replaced."""
     retention_days: Annotated[float, Field(ge=0)] = 0.0
     """Days after which ended jobs, their artifacts and unused calibrations are deleted; 0 keeps them."""
     device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")] = "cpu"
@@ -58,7 +59,7 @@ class Settings(BaseSettings):
     networks: Texts = ()
     """Networks by name that jobs may use, as patterns (``timm:*``, ``hf:google/vit-base-patch16-224``); in the
     environment a JSON list."""
-    renderer_patience: Annotated[float, Field(ge=0)] = 10.0
+    renderer_patience: Annotated[float, Field(ge=0)] = 60.0
     """Seconds a job waits for a renderer."""
     pipeline: str = "trompe_server.job.texture_attack:open_job"
     """``module:function`` that opens a job, with the signature of the default; replaced by tests."""

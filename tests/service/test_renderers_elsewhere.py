@@ -58,6 +58,18 @@ def test_a_renderer_is_restarted_and_stopped_whatever_its_engine_prints_and_leav
         wait_until(lambda: not service.missing() and not {worker, *helpers} & process_table().keys())
 
 
+def test_a_renderer_that_hangs_is_told_and_replaced() -> None:
+    service = Supervisor(Settings(silence=3), RendererAddresses())
+    with closing(service):
+        service.start()
+        (worker,) = (pid for pid in children(os.getpid()) if "render" in command_line(pid))
+        os.kill(worker, signal.SIGSTOP)
+        wait_until(lambda: service.missing() == ["a renderer worker does not answer"])
+        assert not any(info.alive for info in service.renderer_infos())
+        wait_until(lambda: not service.missing() and worker not in process_table())
+        wait_until(lambda: [info.alive for info in service.renderer_infos()] == [True])
+
+
 def children(process: int) -> list[int]:
     return [pid for pid, parent in process_table().items() if parent == process]
 

@@ -38,19 +38,23 @@ GIVE_UP: Final = 3
 PROBE_PATIENCE: Final = 1.0
 """Seconds a probed renderer has to answer."""
 
-
 LISTENING: Final = re.compile(r"trompe renderer listening on \S+:(\d+)\b")
 """Said by a renderer worker once it is ready, maybe after words of its engine; its other lines are logged."""
 
 
 class _Renderer:
-    """One supervised renderer worker, with an engine by ``flags``. ``port``: its own once it was ready, first 0."""
+    """One supervised renderer worker, with an engine by ``flags``. ``port``: its own once it was ready, first 0.
 
-    def __init__(self, flags: Sequence[str]) -> None:
-        self._flags, self.port, self._failures = flags, 0, 0
+    silence: seconds without an answer after which it counts as hung and is replaced.
+    """
+
+    def __init__(self, flags: Sequence[str], *, silence: float) -> None:
+        self._flags, self._silence, self.port, self._failures = flags, silence, 0, 0
         self._process: subprocess.Popen[str] | None = None
         self._stopping = threading.Event()
         self._up = threading.Event()
+        self.silent = False
+        """Whether the last probe got no answer."""
         self._thread = threading.Thread(target=self._supervise, name="supervise-renderer", daemon=True)
 
     @property
@@ -110,14 +114,28 @@ class _Renderer:
             process.terminate()
         reader = threading.Thread(target=self._read, args=(process.stdout,), daemon=True)
         reader.start()
-        status = process.wait()
+        status = self._ended(process)
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         reader.join(LAST_WORDS)  # a process in a group of its own may still hold the output
         self._up.clear()
+        self.silent = False
         assert process.stdin is not None
         process.stdin.close()
         return status
+
+    def _ended(self, process: "subprocess.Popen[str]") -> int:
+        """The exit status of the process; once ready it is asked now and then, and killed if it is silent for long."""
+        heard, interval = time.monotonic(), self._silence / 6
+        while True:
+            with suppress(subprocess.TimeoutExpired):
+                return process.wait(interval)
+            self.silent = self.up and engine_at("127.0.0.1", self.port, timeout=interval) is None
+            if not self.silent:
+                heard = time.monotonic()
+            elif time.monotonic() - heard > self._silence and process.poll() is None:
+                logger.error("the renderer worker has not answered for %.0f s and is killed", time.monotonic() - heard)
+                process.kill()
 
     def _read(self, output: IO[str]) -> None:
         with output:
@@ -137,7 +155,8 @@ class Supervisor:
 
     def __init__(self, settings: Settings, elsewhere: RendererAddresses) -> None:
         self._elsewhere = elsewhere
-        self._renderers = [_Renderer(settings.engine_flags) for _ in range(settings.renderers)]
+        flags, silence = settings.engine_flags, settings.silence
+        self._renderers = [_Renderer(flags, silence=silence) for _ in range(settings.renderers)]
 
     def start(self, *, timeout: float = 90.0) -> None:
         """Start all children and wait until they are ready. Raises ``ServiceError`` after ``timeout`` seconds."""
@@ -154,7 +173,7 @@ class Supervisor:
     def missing(self) -> list[str]:
         """Faults of the renderers right now, in words; empty if they are ready."""
         words = ["the renderer worker is not running" for renderer in self._renderers if not renderer.up]
-        if not words and not all(_accepts(*address) for address in self._here()):
+        if not words and any(renderer.silent for renderer in self._renderers):
             words.append("a renderer worker does not answer")
         elsewhere = not self._renderers and self._elsewhere != RendererAddresses()
         if elsewhere and not any(info.alive for info in self.renderer_infos()):
@@ -162,12 +181,13 @@ class Supervisor:
         return words
 
     def renderer_infos(self) -> list[RendererInfo]:
-        """The renderer workers with their engines, ``alive`` if they accept connections."""
+        """The renderer workers with their engines, ``alive`` if they accept connections and are not hung."""
         addresses = self._here()
+        hung = {("127.0.0.1", renderer.port) for renderer in self._renderers if renderer.silent}
         with suppress(RendererError):  # none of the names resolves
             addresses += self._elsewhere.addresses()
         with ThreadPoolExecutor(MAX_PROBES) as pool:
-            return list(pool.map(_info, addresses))
+            return list(pool.map(lambda address: _info(address, hung=address in hung), addresses))
 
     def _here(self) -> list[Address]:
         return [("127.0.0.1", renderer.port) for renderer in self._renderers]
@@ -178,10 +198,10 @@ class Supervisor:
         return RendererAddresses((*self._here(), *self._elsewhere.listed), self._elsewhere.dns)
 
 
-def _info(address: Address) -> RendererInfo:
+def _info(address: Address, *, hung: bool) -> RendererInfo:
     host, port = address
     engine = engine_at(host, port, timeout=PROBE_PATIENCE)
-    alive = engine is not None or _accepts(host, port)
+    alive = engine is not None or (not hung and _accepts(host, port))
     told = {"engine": engine.name, "version": engine.version, "settings": engine.settings} if engine else {}
     return RendererInfo(address=f"{host}:{port}", alive=alive, **told)
 
