@@ -4,6 +4,7 @@ The target stays a black box. It renders the object painted in greys and in rand
 its prediction of the change that the noise makes in the target's images.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
@@ -12,6 +13,7 @@ from typing import Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from trompe_server.surrogate.fidelity import Fidelity, measure_fidelity
 from trompe_server.surrogate.rasterize import Visibility
@@ -40,6 +42,10 @@ CURVE_GREYS: Final = (0, 64, 128, 191, 255)
 
 NOISE_AMPLITUDE: Final = 0.1
 
+NOISE_FINENESS: Final = 3.0
+"""Fewest squares of a random repaint along a pixel once they hold several texels: a pixel averages them, and of six it
+shows two levels, from which rounding takes a part."""
+
 TRIAL_VIEWS: Final = 4
 """Number of views for trying hypotheses and colour models."""
 
@@ -67,15 +73,31 @@ def painted_grey(obj: Object3D, grey: int) -> Object3D:
     )
 
 
-def painted_noise(obj: Object3D, generator: np.random.Generator) -> Object3D:
-    """``obj`` with random +-0.1 (sRGB) added to every channel of every texel."""
-    reach = round(NOISE_AMPLITUDE * 255)
+def painted_noise(
+    obj: Object3D, generator: np.random.Generator, *, footprint: Mapping[str, float] | None = None
+) -> Object3D:
+    """``obj`` with random +-0.1 (sRGB) added to every channel of every texel.
+
+    footprint: texels that a pixel reads of each texture. Squares of texels change together where these are many.
+    """
+    reach, reads = round(NOISE_AMPLITUDE * 255), footprint or {}
+
+    def noise(size: tuple[int, ...], side: int) -> NDArray[np.int64]:
+        height, width = size
+        squares = generator.choice([-reach, reach], (-(-height // side), -(-width // side), 3))
+        return squares.repeat(side, axis=0)[:height].repeat(side, axis=1)[:, :width]
+
     return obj.with_textures(
         {
-            name: np.clip(image + generator.choice([-reach, reach], image.shape), 0, 255).astype(np.uint8)
+            name: np.clip(image + noise(image.shape[:2], _side(reads.get(name, 1.0))), 0, 255).astype(np.uint8)
             for name, image in obj.textures.items()
         }
     )
+
+
+def _side(footprint: float) -> int:
+    """Side of the squares: a power of two."""
+    return int(2 ** max(0, math.log2(math.sqrt(footprint) / NOISE_FINENESS) // 1))
 
 
 Score = Callable[[SamplingModel], float]
@@ -400,13 +422,14 @@ class _Trial:
         self.obj, self.ask, self.backdrops, self.device = obj, ask, backdrops, device
         self.index = _from_all_sides([view.camera for view in views])
         self.views, self.clean = tuple(views[k] for k in self.index), clean[self.index]
-        repainted = painted_noise(obj, generator)
-        self.images = ask(repainted, self.views)
-        self.again = None if deterministic else ask(obj, [replace(view, noise=view.noise + 1) for view in self.views])
-        self.painted = Painted(obj, device), Painted(repainted, device)
         self.probes: dict[int, Image8] = {}
         self.geometries: dict[SamplingModel, Geometry] = {}
         self.visible = lru_cache(maxsize=KEPT_RASTERS)(_nothing_yet)
+        footprint = diffuse_surrogate(self._geometry(SamplingModel()), self.views, backdrops=backdrops).footprint
+        repainted = painted_noise(obj, generator, footprint=footprint)
+        self.images = ask(repainted, self.views)
+        self.again = None if deterministic else ask(obj, [replace(view, noise=view.noise + 1) for view in self.views])
+        self.painted = Painted(obj, device), Painted(repainted, device)
 
     @cached_property
     def tone(self) -> ToneMap:

@@ -16,7 +16,7 @@ from trompe_shared.engine import EngineInfo
 from trompe_shared.geometry import View
 from trompe_shared.object3d import Object3D
 
-VERSION = 7
+VERSION = 8
 """To be raised whenever calibration can give another result from the same images."""
 
 

@@ -232,6 +232,14 @@ def test_what_changes_where_the_surrogate_sees_no_object_counts_against_it(mug: 
     assert fooled.error == honest.error
 
 
+def test_a_texture_far_finer_than_pixels_is_calibrated_as_well_and_as_cheaply(mug: Object3D, usual: Usual) -> None:
+    """Noise of single texels would hardly show in 8 bits."""
+    finer = {name: image.repeat(4, axis=0).repeat(4, axis=1) for name, image in mug.textures.items()}
+    fine, coarse = found(mug.with_textures(finer), USUAL, "auto"), usual("auto")
+    assert (fine.sampling, fine.renders, fine.model) == (coarse.sampling, coarse.renders, coarse.model)
+    assert fine.fidelity.mean()["explained"] > 0.97
+
+
 @pytest.mark.parametrize("wanted", ["auto", "diffuse", "curve"])
 def test_of_views_that_all_see_nothing_nothing_good_is_said(wanted: SurrogateModel) -> None:
     obj = object_of(quad(np.full((8, 8, 3), 128, np.uint8)))
