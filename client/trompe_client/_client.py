@@ -138,7 +138,7 @@ class AsyncClient(_Connected["AsyncPort"]):
 
     async def upload_object(self, source: str | Path, *, name: str | None = None) -> ObjectInfo:
         """Store an object: a zip, a model file, or a folder with one."""
-        return await stored(self.port, partial(object_upload, Path(source), name=name), ObjectInfo)
+        return await stored(self.port, partial(object_upload, source, name=name), ObjectInfo)
 
     async def upload_classifier(
         self, source: str | Path, *, classes: list[str] | None = None, name: str | None = None

@@ -20,6 +20,8 @@ SILENCE: Final = 30.0
 """Seconds without an event or comment before a stream is opened again."""
 PAUSE: Final = 0.5
 """Seconds between two connections."""
+LAST_LOOK: Final = 5.0
+"""Seconds of silence after which the state of a job at the end of a wait stays unknown."""
 AWAY: Final = (ServerUnreachable, ServerFault, TooMany)
 """Temporary errors of a server."""
 
@@ -52,15 +54,32 @@ class Followed:
 
 async def wait(port: Port, job: Followed, *, timeout: float | None, show: Callable[[Event], None]) -> None:
     """Follow a job to its end. Raises ``JobFailed``, ``JobCancelled``, ``WaitTimeout``, ``ServerUnreachable``."""
-    deadline = None if timeout is None else time.monotonic() + timeout
+    try:
+        await _wait(port, job, None if timeout is None else time.monotonic() + timeout, show)
+    except WaitTimeout:
+        await _look_once_more(port, job)
+    error = failure(job.status)
+    if error is not None:
+        raise error
+
+
+async def _wait(port: Port, job: Followed, deadline: float | None, show: Callable[[Event], None]) -> None:
     async with aclosing(follow(port, job, deadline)) as events:
         async for event in events:
             show(event)
     while not (await refresh_patiently(port, job, deadline)).state.final:
         await port.sleep(PAUSE)
-    error = failure(job.status)
-    if error is not None:
-        raise error
+
+
+async def _look_once_more(port: Port, job: Followed) -> None:
+    """The state of a job whose wait is over. Raises ``WaitTimeout`` unless it has ended."""
+    try:
+        job.status = await send_once(port, _core.job(job.id), silence=LAST_LOOK)
+    except AWAY as error:
+        last = f"Job {job.id} was {job.state.value} when it was last seen, and continues, but now: {error}"
+        raise WaitTimeout(last, job=job.status) from error
+    if not job.state.final:
+        raise WaitTimeout(f"Job {job.id} is still {job.state.value}; it continues.", job=job.status)
 
 
 async def follow(port: Port, job: Followed, deadline: float | None = None) -> AsyncGenerator[Event, None]:

@@ -40,9 +40,9 @@ async def send(port: Port, request: Request[T]) -> T:
         attempt += 1
 
 
-async def send_once(port: Port, request: Request[T]) -> T:
-    """Send a request and parse its answer. Raises ``ClientError``."""
-    async with port.open(request) as answer:
+async def send_once(port: Port, request: Request[T], *, silence: float | None = None) -> T:
+    """Send a request and parse its answer. ``silence`` as in ``Port.open``. Raises ``ClientError``."""
+    async with port.open(request, silence=silence) as answer:
         await check(answer, request)
         return request.read(await answer.body())
 

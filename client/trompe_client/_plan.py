@@ -21,7 +21,7 @@ from trompe_shared.api import (
     ObjectInfo,
     in_parts,
 )
-from trompe_shared.errors import ClassifierError, SpecError
+from trompe_shared.errors import ClassifierError, ObjectError, SpecError
 from trompe_shared.faults import Fault, faults_of
 from trompe_shared.local_files import (
     CLASSIFIER_SUFFIXES,
@@ -128,11 +128,13 @@ def source_of(kind: str, source: Source) -> Upload | str:
     return read[kind](source)
 
 
-def plan_attack(object: Source, *, read: Read = source_of, **options: Any) -> AttackPlan:
+def plan_attack(object: Source | None = None, *, read: Read = source_of, **options: Any) -> AttackPlan:
     """Read the files and check the options (``OPTIONS``, and the queue's).
 
-    Raises ``ObjectError``, ``ClassifierError`` or ``SpecError``.
+    Raises ``ObjectError``, ``ClassifierError`` or ``SpecError``, also without an object.
     """
+    if not isinstance(object, str | Path):
+        raise SpecError(f"`object`: expected a file, a folder or the name of a stored object; got {object!r}.")
     planned: dict[str, Any] = {"object": read("object", object)}
     for keyword, value in options.items():
         option = OPTIONS.get(keyword)
@@ -162,18 +164,25 @@ def object_source(source: Source) -> Upload | str:
 
     Raises ``ObjectError`` for a path without such a file.
     """
-    path = Path(source)
+    path = _named(source)
     is_path = isinstance(source, Path) or path.is_file() or path.suffix.lower() in {".zip", *MODEL_SUFFIXES}
     is_folder = path.is_dir() and (len(path.parts) > 1 or bool(models_in(path)))
     return object_upload(path) if is_path or is_folder else str(source)
 
 
-def object_upload(path: Path, *, name: str | None = None) -> Upload:
+def _named(source: Source) -> Path:
+    """The path of an object. Raises ``ObjectError`` for no word at all, which would mean the current folder."""
+    if source == "":
+        raise ObjectError("The object's name is empty. Give a file, a folder, or a stored object's name.")
+    return Path(source)
+
+
+def object_upload(source: Source, *, name: str | None = None) -> Upload:
     """A zip, a model file (an .obj or .gltf with the files it names), or a folder with one.
 
     name: to store it under; default: the file's. Raises ``ObjectError``.
     """
-    return Upload(*model_file(path), form={"name": name} if name else {})
+    return Upload(*model_file(_named(source)), form={"name": name} if name else {})
 
 
 def classifier_source(source: Source) -> Upload | str:

@@ -43,14 +43,18 @@ def test_errors_are_values(client: Client, server: FakeServer) -> None:
         {"object": "muggg", "label": 0},
         {"object": "mug", "label": 0, "epsilon": 7.0},
         {"object": "nowhere.zip", "label": 0},
+        {"label": 0},
+        {"object": ["mug"], "label": 0},
         JobSpec.of("mug", label=0),
     ]
     found: dict[int, Any] = {outcome.index: outcome for outcome in client.map(wrong)}
-    assert [found[index].error.code for index in (0, 1, 2)] == ["not-found", "invalid-spec", "invalid-object"]
-    assert [found[index].job for index in (0, 1, 2)] == [None] * 3
-    assert found[3].result.label == 3
+    codes = ["not-found", "invalid-spec", "invalid-object", "invalid-spec", "invalid-spec"]
+    assert [found[index].error.code for index in range(5)] == codes
+    assert [found[index].job for index in range(5)] == [None] * 5
+    assert "got ['mug']" in str(found[4].error)
+    assert found[5].result.label == 3
     server.ending = JobState.failed
-    (failed,) = client.map(wrong[3:])
+    (failed,) = client.map(wrong[5:])
     assert isinstance(failed.error, JobFailed)
     assert failed.job is not None
     assert failed.error.job_id == failed.job.id

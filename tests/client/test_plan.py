@@ -16,6 +16,7 @@ from trompe_client._plan import (
     classifier_source,
     classifier_upload,
     object_source,
+    object_upload,
     plan_attack,
 )
 from trompe_shared.api import BackgroundInfo, ClassifierInfo
@@ -72,6 +73,7 @@ def test_a_word_is_the_name_of_a_stored_object_even_where_a_folder_of_that_name_
         ("missing/mug.obj", "There is no file"),
         (Path("wrong.zip"), "not a zip archive"),
         (Path(), r"holds no \.obj"),
+        ("", "name is empty"),
     ],
 )
 def test_what_is_no_object_is_not_sent(
@@ -79,8 +81,9 @@ def test_what_is_no_object_is_not_sent(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("wrong.zip").write_text("<html>")
-    with pytest.raises(ObjectError, match=why):
-        object_source(source)
+    for read in (object_source, object_upload):
+        with pytest.raises(ObjectError, match=why):
+            read(source)
 
 
 def test_the_class_names_nearest_to_the_classifier_win(tmp_path: Path) -> None:

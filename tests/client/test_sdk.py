@@ -117,6 +117,19 @@ def test_waiting_ends_when_the_time_is_up_and_the_job_goes_on(client: Client, se
     assert client.job(job.id).state is JobState.queued
 
 
+@pytest.mark.parametrize("timeout", [0, 0.1])
+def test_the_end_of_a_wait_tells_the_state_of_then(client: Client, server: FakeServer, timeout: float) -> None:
+    server.stalls = True
+    job = client.submit(SPEC)
+    states = {event.state: event for event in server.history[job.id]}
+    server.reach(job.id, states[JobState.running])
+    with pytest.raises(WaitTimeout, match="still running; it continues") as late:
+        job.wait(timeout=timeout)
+    assert late.value.job.state is JobState.running
+    server.reach(job.id, states[JobState.succeeded])
+    assert job.wait(timeout=0).state is JobState.succeeded
+
+
 def test_waiting_gives_up_when_the_server_stays_away(server: FakeServer) -> None:
     job = server.add_job(JobRequest.of("mug", label="mug"))
     with Client("http://127.0.0.1:9") as nobody, pytest.raises(ServerUnreachable, match="trompe serve"):
