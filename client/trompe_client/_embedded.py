@@ -15,7 +15,7 @@ from typing import Final
 
 from trompe_client._errors import EmbeddedServerError, ServerUnreachable, Unauthorized
 
-SERVE: Final = (sys.executable, "-m", "trompe_client.cli", "serve", "--port", "0", "--data")
+SERVE: Final = (sys.executable, "-m", "trompe_client.cli.child", "serve", "--port", "0", "--data")
 READY: Final = re.compile(r"^trompe serving on (http://\S+)", re.MULTILINE)
 HAS_TOKENS: Final = (
     "The embedded service uses data with tokens (TROMPE_DATA, TROMPE_DATABASE); `trompe token create NAME` makes "
@@ -50,12 +50,15 @@ def embedded_server(*, command: Sequence[str] = SERVE, start_seconds: float = 18
 
 
 def _start(command: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
-    """Start the service in its own session, so that Ctrl-C does not reach it and the job can be cancelled first."""
+    """Start the service in its own session, so that Ctrl-C does not reach it and the job can be cancelled first.
+
+    It ends with this process, by its standard input.
+    """
     environment = {"TROMPE_NETWORKS": ALL_NETWORKS} | os.environ | {"PYTHONUNBUFFERED": "1"}
     with log.open("wb") as output:
         return subprocess.Popen(
             command,
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,
             stdout=output,
             stderr=subprocess.STDOUT,
             env=environment,
@@ -85,6 +88,8 @@ def _stop(process: "subprocess.Popen[bytes]") -> None:
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
+    assert process.stdin is not None
+    process.stdin.close()
 
 
 def _tail(log: Path) -> str:

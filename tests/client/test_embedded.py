@@ -2,12 +2,14 @@
 
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from trompe_client import EmbeddedServerError, ServerUnreachable, Unauthorized
+from tests.served import wait_until
+from trompe_client import Client, EmbeddedServerError, ServerUnreachable, Unauthorized
 from trompe_client._embedded import embedded_server
 from trompe_shared.api import Problem
 
@@ -71,3 +73,23 @@ def test_a_terminated_command_takes_its_service_along(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="143"), embedded_server(command=script(NOTE_AND_WAIT, note)):
         os.kill(os.getpid(), signal.SIGTERM)
     assert note.read_text() == "stopped"
+
+
+def test_a_killed_command_takes_its_service_along(tmp_path: Path) -> None:
+    code = f"import {embedded_server.__module__} as e\nwith e.embedded_server() as url: print(url, flush=True); {SLEEP}"
+    environment = os.environ | {"TROMPE_DATA": str(tmp_path / "data"), "TROMPE_WORKERS": "0", "TROMPE_RENDERERS": "0"}
+    command = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment)
+    assert command.stdout is not None
+    url = command.stdout.readline().strip()
+    with Client(url) as client:
+        assert client.objects()
+        command.kill()
+        command.communicate()
+        wait_until(lambda: not _answers(client))
+
+
+def _answers(client: Client) -> bool:
+    try:
+        return bool(client.objects())
+    except ServerUnreachable:
+        return False

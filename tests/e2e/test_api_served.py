@@ -134,10 +134,16 @@ def test_an_idle_connection_outlives_the_time_that_clients_keep_theirs(serve: Se
 def test_a_revoked_token_is_worthless_within_moments(serve: Serve) -> None:
     with serve.client_of(serve.tokens.create("guest", Right.read)) as guest:
         time.sleep(FRESH + 0.1)
-        assert guest.get("/v1/jobs").status_code == 200
-        serve.tokens.revoke("guest")
-        time.sleep(FRESH + 0.1)
+        job = serve.submit("gate")
+        with guest.stream("GET", f"/v1/jobs/{job}/events") as stream:
+            lines = stream.iter_lines()
+            assert next(lines)
+            serve.tokens.revoke("guest")
+            assert not any("succeeded" in line for line in lines)  # it ends before the job
         assert guest.get("/v1/jobs").status_code == 401
+    serve.open_gate(job)
+    with serve.reader.stream("GET", f"/v1/jobs/{job}/events") as stream:
+        assert any("succeeded" in line for line in stream.iter_lines())
 
 
 def test_a_large_upload_does_not_fill_the_memory_of_the_server(serve: Serve) -> None:

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -94,6 +95,16 @@ def test_nothing_is_left_running_when_serve_ends_and_its_job_outlives_it(serve: 
     serve.open_gate(job)
     wait_until(lambda: serve.state(job).state == "succeeded")
     assert serve.get("/v1/jobs?state=succeeded")["jobs"][0]["id"] == job
+
+
+def test_told_twice_to_end_it_ends_in_order(tmp_path: Path) -> None:
+    with closing(Child(tmp_path / "serve.log", {})) as serve:
+        options = ("--workers", "0", "--renderers", "0", "--port", "0", "--data", str(tmp_path / "data"))
+        assert "trompe serving" in serve.launch("serve", *options)
+        serve.process.send_signal(signal.SIGINT)
+        time.sleep(0.05)
+        assert serve.end(signal.SIGINT) == 0
+        assert "Traceback" not in serve.words()
 
 
 def test_serve_says_so_where_no_renderer_comes_up(tmp_path: Path) -> None:

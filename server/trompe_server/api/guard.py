@@ -10,15 +10,17 @@ import ipaddress
 import math
 import time
 from collections.abc import Mapping
+from functools import partial
 from typing import Final
 from urllib.parse import SplitResult, urlsplit
 
 from fastapi import Request
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from trompe_server.api.middleware import HttpMiddleware
 from trompe_server.api.problems import RefusedError
 from trompe_server.api.rate import RateLimit
+from trompe_server.storage.database import DatabaseDownError
 from trompe_server.storage.tokens import Right, Token, Tokens, hash_secret
 
 OPEN_PATHS: Final = frozenset({"/docs", "/openapi.json", "/healthz", "/readyz", "/login", "/logout"})
@@ -37,7 +39,7 @@ _CREATE: Final = "`trompe token create NAME --right read|write` makes one."
 
 
 class Guard(HttpMiddleware):
-    """Admits requests by token and rate; without tokens, by origin."""
+    """Admits requests by token and rate; without tokens, by origin. An open stream ends with its token."""
 
     def __init__(self, app: ASGIApp, *, tokens: Tokens, rate: float) -> None:
         super().__init__(app)
@@ -47,11 +49,41 @@ class Guard(HttpMiddleware):
         self._lock = asyncio.Lock()
 
     async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
-        await self._admit(Request(scope))
-        await self._app(scope, receive, send)
+        token = await self._admit(Request(scope))
+        if token is None:
+            await self._app(scope, receive, send)
+            return
+        complete = False
 
-    async def _admit(self, request: Request) -> None:
-        """Raise ``RefusedError`` for a request to refuse."""
+        async def send_on(message: Message) -> None:
+            nonlocal complete
+            await send(message)
+            complete = message["type"] == "http.response.body" and not message.get("more_body", False)
+
+        await self._app(scope, partial(self._receive, receive, token), send_on)
+        if not complete and await self._is_revoked(token):
+            await send({"type": "http.response.body"})
+
+    async def _receive(self, receive: Receive, token: Token) -> Message:
+        """The next message of a request; its end once the token is revoked."""
+        message = asyncio.ensure_future(receive())
+        try:
+            while not (await asyncio.wait({message}, timeout=FRESH))[0]:
+                if await self._is_revoked(token):
+                    return {"type": "http.disconnect"}
+            return message.result()
+        finally:
+            message.cancel()
+
+    async def _is_revoked(self, token: Token) -> bool:
+        try:
+            known = await self._fresh_tokens()
+        except DatabaseDownError:
+            return False
+        return any(each.name == token.name and each.revoked is not None for each in known.values())
+
+    async def _admit(self, request: Request) -> Token | None:
+        """The token of a request, if it needs one. Raises ``RefusedError`` for a request to refuse."""
         path = request.scope["path"]  # not request.url.path: a forged Host header can change it
         address = request.client.host if request.client else "unknown"
         try:
@@ -65,6 +97,7 @@ class Guard(HttpMiddleware):
             self._check_rate(address if token is None else f"token {token.name}")
         if token is not None:
             await self._check_right(token, request)
+        return token
 
     async def _identify(self, request: Request) -> Token | None:
         """The token of a request; ``None`` if the service has none."""

@@ -114,7 +114,11 @@ def _avoid_checkpoints(connection: Any, _record: Any) -> None:
 
 
 class _Server(uvicorn.Server):
-    """A server that announces its start."""
+    """A server that announces its start, and ends in order however often it is told."""
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        if not self.should_exit:
+            super().handle_exit(sig, frame)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
