@@ -82,8 +82,6 @@ def _conclude(rows: Sequence["ResultRow"], folder: Path) -> None:
 
     console().print(results_table(rows))
     failed = failures(rows)
-    for line in failed:
-        click.echo(f"failed: {line}", err=True)
     click.echo(f"written: {folder}/results.csv, predictions.csv. Next: trompe experiment report {folder}")
     if failed:
         raise click.ClickException(f"{len(failed)} rows failed; fix the cause and run again with --retry-failed.")

@@ -91,7 +91,7 @@ def run_experiment(plan: Plan, service: Service, folder: Path, *, show: Show, re
 
 def _run(plan: Plan, service: Service, folder: Path, show: Show, *, retry_failed: bool) -> Rows:
     jobs, collected = plan.jobs(), folder / "jobs"
-    tables = _from_tables(jobs, folder)
+    tables = _from_tables(plan.experiment.name, jobs, folder)
     known = {key: found for key in jobs if (found := _kept(collected / key) or tables.get(key)) is not None}
     missing = [row for key, row in jobs.items() if key not in known or (retry_failed and known[key].failed)]
     show.begin(total=len(jobs), done=len(jobs) - len(missing))
@@ -183,12 +183,16 @@ def _keep(folder: Path, finished: Finished, files: Files) -> None:
     partial.replace(folder / "job.json")
 
 
-def _from_tables(wanted: Collection[str], folder: Path) -> dict[str, Finished]:
-    """Jobs of an earlier run without a folder, from the tables in ``folder``, if any.
+def _from_tables(name: str, wanted: Collection[str], folder: Path) -> dict[str, Finished]:
+    """Jobs of an earlier run of the experiment ``name`` without a folder, from the tables in ``folder``, if any.
 
-    Raises ``SpecError`` for unreadable tables, and for rows that the new ones would lose: of jobs not ``wanted``.
+    Raises ``SpecError`` for unreadable tables, for those of another experiment, and for rows that the new ones would
+    lose: of jobs not ``wanted``.
     """
     table = {row.key: row for row in read_table(folder / RESULTS, ResultRow, optional=True)}
+    others = {row.experiment for row in table.values()} - {name}
+    if others:
+        raise SpecError(f"{str(folder)!r} has the results of {min(others)!r}: choose another --out for {name!r}.")
     rows = {key: row for key, row in table.items() if not (folder / "jobs" / key).exists()}
     lost = [row for key, row in rows.items() if key not in wanted]
     if lost:

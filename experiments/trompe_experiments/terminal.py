@@ -11,6 +11,7 @@ from rich.text import Text
 from trompe_client._report import empty_table
 from trompe_experiments.markdown import figure_words
 from trompe_experiments.table import ResultRow, read_results
+from trompe_shared.api import JobState
 from trompe_shared.comparison import average, grouped
 from trompe_shared.errors import SpecError
 
@@ -28,13 +29,13 @@ def results_table(rows: Sequence[ResultRow]) -> RenderableType:
     table = empty_table(*SETTING, "seeds", "surrogate", "target", "A_drop", "held-out A_drop", "N%", "s", right=7)
     for group in grouped(rows, lambda row: (row.series, *_setting(row))).values():
         first = group[0]
-        cells = [_pair(group, "surrogate"), _pair(group, "target"), _spread(group, "target_a_drop")]
+        cells = [_first_pair(group), _pair(group, "target"), _spread(group, "target_a_drop")]
         cells += [_spread(group, "held_out_a_drop"), _mean(group, "texels_altered"), _mean(group, "seconds", ".0f")]
         table.add_row(first.object, first.classifier, first.configuration, str(len(group)), *cells)
     drop, held_out = _mean(rows, "target_a_drop"), _mean(rows, "held_out_a_drop")
-    return Group(
-        table, Text(f"mean of {len(rows)} rows, without n.a.: target A_drop {drop}, held-out A_drop {held_out}")
-    )
+    told = sum(row.target_a_drop is not None for row in rows)
+    means = f"mean of the {told} of {len(rows)} rows with figures: target A_drop {drop}, held-out A_drop {held_out}"
+    return Group(table, *map(Text, (*failures(rows), means)))
 
 
 def failures(rows: Iterable[ResultRow]) -> list[str]:
@@ -97,6 +98,12 @@ def _mean(rows: Sequence[ResultRow], figure: str, form: str = ".2f") -> str:
 
 def _pair(rows: Sequence[ResultRow], views: str) -> str:
     return f"{_mean(rows, f'{views}_a_before')} > {_mean(rows, f'{views}_a_after')}"
+
+
+def _first_pair(rows: Sequence[ResultRow]) -> str:
+    """The surrogate's figures, or the states of rows that all have none."""
+    ended = any(row.state in {JobState.succeeded, JobState.not_applicable} for row in rows)
+    return _pair(rows, "surrogate") if ended else ", ".join(dict.fromkeys(row.state for row in rows))
 
 
 def _spread(rows: Sequence[ResultRow], figure: str) -> str:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shlex
 import shutil
 from collections.abc import Iterator, Sequence
@@ -449,6 +450,8 @@ def test_rows_that_are_all_that_is_left_of_a_job_are_never_overwritten(service: 
     table = (tmp_path / RESULTS).read_bytes()
     with pytest.raises(SpecError, match=r"rows of 2 jobs .* mug, epsilon 0.05, .* choose another --out"):
         ran(narrower, service, tmp_path)
+    with pytest.raises(SpecError, match=r"has the results of 'small': choose another --out for 'other'"):
+        ran(plan_of(name="other"), service, tmp_path)
     assert (tmp_path / RESULTS).read_bytes() == table
 
 
@@ -484,7 +487,10 @@ def test_jobs_are_found_on_a_server(service: FakeService, tmp_path: Path, monkey
     judgement = Job(id="j", state=JobState.succeeded, spec=spec, created=datetime.now(UTC), worker=None)
     monkeypatch.setattr(service, "jobs", lambda name: [judgement, *attacks(name)])
     monkeypatch.setattr(cli, "Service", lambda client: service)
-    assert "mean of 4 rows, without n.a.: target A_drop 0.35" in invoked("show", "small")
+    shown = invoked("show", "small")
+    assert "mean of the 2 of 4 rows with figures: target A_drop 0.35" in shown
+    assert re.search(r"chair .* failed .* n\.a\.", shown)
+    assert "chair  epsilon 0.05  seed 0: failed: the renderer said no" in shown
     assert "no job of an experiment 'other'" in invoked("show", "other", status=1)
 
 
