@@ -396,6 +396,7 @@ FAULTS: dict[str, tuple[str, Fault]] = {
     "GBR": ("channel order", seen(lambda picture, _: picture[..., [1, 2, 0]])),
     "encoded twice": ("gamma twice", seen(on_object(lambda picture: encoded(picture / 255)))),
     "not encoded": ("gamma missing", seen(on_object(lambda picture: 255 * linear(picture)))),
+    "8 times as bright in sRGB": ("overexposed", seen(on_object(lambda picture: 8 * picture))),
     "8 times as bright": ("overexposed", seen(on_object(lambda picture: encoded(np.clip(8 * linear(picture), 0, 1))))),
     "texture not decoded": ("texture not decoded", painted(lambda texture: np.round(encoded(texture / 255)))),
     "decoded twice": ("texture decoded twice", painted(lambda texture: np.round(255 * linear(texture.astype(float))))),

@@ -151,6 +151,9 @@ def channels(look: _Look, _: EngineInfo) -> Findings:
         yield fault("invisible", "The picture of a ball near the origin shows nothing.")
         return
     colour = median(picture, there.mask)
+    if colour.min() > 250:
+        yield fault("overexposed", "An orange ball in moderate light is white.")
+        return
     if not _colourful(colour):
         yield fault("untextured", f"An orange ball appears grey: {colour.round()}.")
         return

@@ -28,7 +28,8 @@ class NamedNetwork(NamedTuple):
 class NetworkClassifier:
     """A network (N, 3, H, W) in [0, 1] -> logits (N, n_classes) on ``device``; freezes its parameters.
 
-    Raises ``ClassifierError`` for a network in training, where an image's logits hang on chance or on its batch.
+    Raises ``ClassifierError`` for another number of class names, for what is no network, and for one in training, where
+    an image's logits hang on chance or on its batch.
     """
 
     name: str
@@ -39,6 +40,10 @@ class NetworkClassifier:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
+        if self.classes is not None and len(self.classes) != self.n_classes:
+            raise ClassifierError(f"{self.name!r} has {self.n_classes} classes, but {len(self.classes)} class names.")
+        if not isinstance(self.network, nn.Module):
+            raise ClassifierError(f"The network {self.name!r} is a {type(self.network).__name__}, not a torch module.")
         self.network.requires_grad_(False)
         if any(each.training for each in self.network.modules() if isinstance(each, _IN_TRAINING)):
             raise ClassifierError(f"The network {self.name!r} is in training: call eval() on it first.")
@@ -52,12 +57,30 @@ class NetworkClassifier:
         given = images.to(self.device)
         if given.is_cuda and 0 < len(given) < AT_ONCE:
             given = torch.cat([given, given.new_zeros(AT_ONCE - len(given), *given.shape[1:])])
-        logits: Tensor = self.network(given)[: len(images)]
+        logits = self._output(given)[: len(images)]
         if logits.shape[1:] != (self.n_classes,):
             raise ClassifierError(
                 f"The network {self.name!r} gives {tuple(logits.shape[1:])} scores an image, not {self.n_classes}."
             )
         return logits.to(images.device, torch.float32)
+
+    def _output(self, images: Tensor) -> Tensor:
+        try:
+            output = self.network(images)
+        except torch.OutOfMemoryError:
+            raise
+        except (RuntimeError, TypeError) as error:
+            raise ClassifierError(
+                f"The network {self.name!r} fails on float32 images {tuple(images.shape)} ({str(error)[:200]})."
+            ) from error
+        if not isinstance(output, Tensor):
+            raise ClassifierError(
+                f"The network {self.name!r} gives a {type(output).__name__}; expected a tensor of logits: put it "
+                "into a module that returns these alone."
+            )
+        if torch.is_grad_enabled() and images.requires_grad and not output.requires_grad:
+            raise ClassifierError(f"The network {self.name!r} has no gradient: its logits are detached from its input.")
+        return output
 
     @torch.no_grad()
     def scores(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:

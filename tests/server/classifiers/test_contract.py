@@ -458,6 +458,28 @@ def test_a_network_in_training_or_of_other_classes_is_refused() -> None:
         NetworkClassifier("mine", Net().train(), SIZE, 7)
     with pytest.raises(ClassifierError, match=r"gives \(7,\) scores an image, not 10"):
         NetworkClassifier("mine", Net().eval(), SIZE, 10).predict(noise(2))
+    with pytest.raises(ClassifierError, match="has 7 classes, but 2 class names"):
+        NetworkClassifier("mine", Net().eval(), SIZE, 7, classes=("a", "b"))
+    with pytest.raises(ClassifierError, match="is a function, not a torch module"):
+        NetworkClassifier("mine", lambda images: images, SIZE, 7)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [
+        (Around(lambda net, image: (net(image), image)), "gives a tuple; expected a tensor of logits"),
+        (Around(lambda net, image: {"logits": net(image)}), "gives a dict; expected a tensor of logits"),
+        (Around(lambda net, image: net(image).detach()), "has no gradient: its logits are detached"),
+        (Net().half(), r"fails on float32 images \(2, 3, \d+, \d+\) \(.*type"),
+        (TwoInputs(), r"fails on float32 images .*'scale'"),
+    ],
+)
+def test_a_module_of_ones_own_that_breaks_the_contract_is_refused_at_its_first_images(
+    network: nn.Module, message: str
+) -> None:
+    classifier = NetworkClassifier("mine", network.eval(), SIZE, 7)
+    with pytest.raises(ClassifierError, match=message):
+        classifier.logits(torch.rand(2, 3, *SIZE, requires_grad=True))
 
 
 def test_a_network_with_two_inputs_is_refused(tmp_path: Path) -> None:
