@@ -168,6 +168,9 @@ def _objects(experiment: Experiment, files: "_Files") -> Iterator[tuple[str, dic
             others = dict(options)
             path = others.pop("file", None)
             own = shipped_objects().get(name)
+            if own is None and "label" not in {**experiment.base, **others}:
+                known = ", ".join(shipped_objects())
+                raise SpecError(f"`objects`: {name!r} needs a `label`, as it is none of the shipped objects ({known}).")
             label = {"label": own.label} if own is not None else {}
             yield name, {"object": files.path(path) if path else name} | label | others
 

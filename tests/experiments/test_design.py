@@ -322,7 +322,7 @@ def test_what_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(ClassifierError, match="There is no classifier file"):
         planned(base={"classifier": "nowhere.pt2"})
     monkeypatch.delenv("TROMPE_ASSETS", raising=False)
-    with pytest.raises(SpecError, match="Job stored, base: Invalid options: `label`: Field required"):
+    with pytest.raises(SpecError, match="'stored' needs a `label`, as it is none of the shipped objects"):
         planned(objects={"stored": None})
     with pytest.raises(SpecError, match="needs the environment variable TROMPE_ASSETS"):
         planned(objects={"assets": "$TROMPE_ASSETS"})
