@@ -77,8 +77,13 @@ def test_a_terminated_command_takes_its_service_along(tmp_path: Path) -> None:
 
 def test_a_killed_command_takes_its_service_along(tmp_path: Path) -> None:
     code = f"import {embedded_server.__module__} as e\nwith e.embedded_server() as url: print(url, flush=True); {SLEEP}"
-    environment = os.environ | {"TROMPE_DATA": str(tmp_path / "data"), "TROMPE_WORKERS": "0", "TROMPE_RENDERERS": "0"}
-    command = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment)
+    own = {
+        "TROMPE_DATA": str(tmp_path / "data"),
+        "TMPDIR": str(tmp_path),
+        "TROMPE_WORKERS": "0",
+        "TROMPE_RENDERERS": "0",
+    }
+    command = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=os.environ | own)
     assert command.stdout is not None
     url = command.stdout.readline().strip()
     with Client(url) as client:

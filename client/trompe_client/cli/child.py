@@ -3,5 +3,6 @@
 from trompe_client.cli.group import main
 from trompe_shared.parent import end_with_parent
 
-end_with_parent()
-main(prog_name="trompe")
+if __name__ == "__main__":  # attack workers import it again
+    end_with_parent()
+    main(prog_name="trompe")
