@@ -18,7 +18,7 @@ from trompe_server.queue.store import JobStore
 from trompe_server.settings import Settings
 from trompe_shared.api import Job, JobRequest
 
-CHILD: Final = [sys.executable, "-m", "trompe_server.system.child"]
+CHILD: Final = [sys.executable, "-m", "trompe_shared.child"]
 FAKE: Final = {
     "TROMPE_PIPELINE": "tests.fake_job:open_job",
     "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]),

@@ -15,7 +15,7 @@ from typing import Final
 
 from trompe_client._errors import EmbeddedServerError, ServerUnreachable, Unauthorized
 
-SERVE: Final = (sys.executable, "-m", "trompe_client.cli.child", "serve", "--port", "0", "--data")
+SERVE: Final = (sys.executable, "-m", "trompe_shared.child", "serve", "--port", "0", "--data")
 READY: Final = re.compile(r"^trompe serving on (http://\S+)", re.MULTILINE)
 HAS_TOKENS: Final = (
     "The embedded service uses data with tokens (TROMPE_DATA, TROMPE_DATABASE); `trompe token create NAME` makes "

@@ -71,7 +71,7 @@ class DisturbedEngine:
 def disturbed_renderer(**options: float) -> AbstractContextManager[SailenvTarget]:
     """A worker with a ``DisturbedEngine`` during a ``with``; ``options`` are fields of ``Disturbance``."""
     settings = [word for name, value in options.items() for word in ("--set", f"{name}={value}")]
-    command = (sys.executable, "-m", "trompe_server.system.child", "render", "--port", "0", "--engine", NAME)
+    command = (sys.executable, "-m", "trompe_shared.child", "render", "--port", "0", "--engine", NAME)
     return local_renderer((*command, *settings))
 
 

@@ -13,7 +13,7 @@ from typing import IO, Final
 from trompe_shared.errors import RendererError
 from trompe_shared.sailenv_client import SailenvTarget
 
-COMMAND: Final = (sys.executable, "-m", "trompe_server.system.child", "render", "--port", "0")
+COMMAND: Final = (sys.executable, "-m", "trompe_shared.child", "render", "--port", "0")
 INTERVAL: Final = 0.05
 """Seconds between two looks for the address of a worker that starts."""
 

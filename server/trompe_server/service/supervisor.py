@@ -105,7 +105,7 @@ class _Renderer:
         It has its own process group: Ctrl-C reaches only us, and we end it in order, with the processes of its engine.
         """
         place = ["--host", "127.0.0.1", "--port", str(self.port)]
-        command = [sys.executable, "-m", "trompe_server.system.child", "render", *place, *self._flags]
+        command = [sys.executable, "-m", "trompe_shared.child", "render", *place, *self._flags]
         pipe = subprocess.PIPE
         process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, errors="replace", process_group=0)
         self._process = process
