@@ -24,6 +24,8 @@ logger = logging.getLogger(__name__)
 
 LONGEST_WAIT: Final = 30.0
 """Seconds between two starts of a process that dies before it is ready."""
+BURIAL: Final = 10.0
+"""Longest wait for the end of a killed process, seconds."""
 
 
 class LocalExecutor:
@@ -114,7 +116,7 @@ class _Slot:
         self._starting.join(patience)
         if self._process is not None:
             self._process.kill()
-            self._process.join()
+            self._process.join(BURIAL)  # the fork server tells its end, unless that hangs
         self.connection.close()
 
     @property
