@@ -82,9 +82,9 @@ def painted_noise(
     """
     reach, reads = round(NOISE_AMPLITUDE * 255), footprint or {}
 
-    def noise(size: tuple[int, ...], side: int) -> NDArray[np.int64]:
+    def noise(size: tuple[int, ...], side: int) -> NDArray[np.int16]:
         height, width = size
-        squares = generator.choice([-reach, reach], (-(-height // side), -(-width // side), 3))
+        squares = generator.choice([-reach, reach], (-(-height // side), -(-width // side), 3)).astype(np.int16)
         return squares.repeat(side, axis=0)[:height].repeat(side, axis=1)[:, :width]
 
     return obj.with_textures(
