@@ -56,7 +56,7 @@ async def wait(port: Port, job: Followed, *, timeout: float | None, show: Callab
     """Follow a job to its end. Raises ``JobFailed``, ``JobCancelled``, ``WaitTimeout``, ``ServerUnreachable``."""
     try:
         await _wait(port, job, None if timeout is None else time.monotonic() + timeout, show)
-    except WaitTimeout:
+    except _OverdueError:
         await _look_once_more(port, job)
     error = failure(job.status)
     if error is not None:
@@ -108,7 +108,7 @@ async def _stream(port: Port, job: Followed, after: int | None, deadline: float 
         await check(answer, request)
         async with aclosing(answer.lines()) as lines:
             async for line in lines:
-                _check_time(job, deadline)
+                _check_time(deadline)
                 if line.startswith("data:"):
                     data.append(line[5:].removeprefix(" "))
                 elif data and not line:
@@ -120,7 +120,7 @@ async def refresh_patiently(port: Port, job: Followed, deadline: float | None = 
     """The job's status, from a server that may be restarting."""
     give_up, attempt = time.monotonic() + PATIENCE, 0
     while True:
-        _check_time(job, deadline)
+        _check_time(deadline)
         try:
             job.status = await send_once(port, _core.job(job.id))
             return job.status
@@ -132,9 +132,13 @@ async def refresh_patiently(port: Port, job: Followed, deadline: float | None = 
         attempt += 1
 
 
-def _check_time(job: Followed, deadline: float | None) -> None:
+class _OverdueError(Exception):
+    """The time of a wait is over."""
+
+
+def _check_time(deadline: float | None) -> None:
     if deadline is not None and time.monotonic() > deadline:
-        raise WaitTimeout(f"Job {job.id} is still {job.state.value}; it continues.", job=job.status)
+        raise _OverdueError
 
 
 def failure(job: Job) -> JobFailed | JobCancelled | None:

@@ -134,6 +134,7 @@ def test_an_idle_connection_outlives_the_time_that_clients_keep_theirs(serve: Se
 def test_a_revoked_token_is_worthless_within_moments(serve: Serve) -> None:
     with serve.client_of(serve.tokens.create("guest", Right.read)) as guest:
         time.sleep(FRESH + 0.1)
+        assert guest.get("/v1/jobs").status_code == 200
         job = serve.submit("gate")
         with guest.stream("GET", f"/v1/jobs/{job}/events") as stream:
             lines = stream.iter_lines()

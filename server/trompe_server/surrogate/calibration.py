@@ -97,7 +97,7 @@ def painted_noise(
 
 def _side(footprint: float) -> int:
     """Side of the squares: a power of two."""
-    return int(2 ** max(0, math.log2(math.sqrt(footprint) / NOISE_FINENESS) // 1))
+    return 1 << max(0, math.floor(math.log2(math.sqrt(footprint) / NOISE_FINENESS)))
 
 
 Score = Callable[[SamplingModel], float]
