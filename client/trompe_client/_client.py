@@ -237,7 +237,8 @@ class Client(_Connected["BlockingPort"]):
         Nothing is submitted before the first outcome is requested.
 
         Args:
-            attacks: arguments of ``attack`` as mappings, or jobs for ``submit``. Each file is read and uploaded once.
+            attacks: arguments of ``attack``, but ``key``, as mappings; or jobs for ``submit``. Each file is read and
+                uploaded once.
             batch: name of the call; the jobs carry it as their label ``batch``. The same attacks under the same name
                 find the existing jobs, so an interrupted script continues. Default: a new name.
             concurrency: number of simultaneous requests, not of jobs.

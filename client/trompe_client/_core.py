@@ -27,6 +27,7 @@ from trompe_shared.api import (
     Result,
     WorkerInfo,
 )
+from trompe_shared.errors import SpecError
 from trompe_shared.faults import faults_of
 
 T = TypeVar("T")
@@ -89,8 +90,8 @@ def submit(spec: JobSpec | JudgementSpec, *, key: str) -> Request[Job]:
 
 
 def _keyed(key: str) -> dict[str, str]:
-    """The header of an idempotency key. Headers are ASCII: other keys are percent-encoded."""
-    return {"Idempotency-Key": key if key.isascii() else quote(key)}
+    """The header of an idempotency key. Headers are printable ASCII: other keys are percent-encoded."""
+    return {"Idempotency-Key": key if key.isascii() and key.isprintable() else quote(key)}
 
 
 def jobs(wanted: list[tuple[str, str]], *, limit: int, cursor: str | None = None) -> Request[JobList]:
@@ -182,6 +183,8 @@ def _retry_after(header: str | None) -> float | None:
 
 
 def _job_path(job_id: str) -> str:
+    if not (isinstance(job_id, str) and job_id):
+        raise SpecError(f"Expected a job's id, got {job_id!r}.")
     return f"/v1/jobs/{quote(job_id, safe='')}"
 
 

@@ -39,9 +39,11 @@ def embedded_server(*, command: Sequence[str] = SERVE, start_seconds: float = 18
         data = os.environ.get("TROMPE_DATA") or str(Path(scratch, "data"))
         process = _start([*command, data], log)
         try:
-            yield _wait_for_url(process, log, start_seconds)
+            url = _wait_for_url(process, log, start_seconds)
+            with _told_of_the_end(process, log):
+                yield url
         except ServerUnreachable as error:
-            raise EmbeddedServerError(f"The embedded service has ended. {error}\n{_tail(log)}") from error
+            raise EmbeddedServerError(f"The embedded service does not answer.\n{_tail(log)}") from error
         except Unauthorized as error:
             detail = f"{error.problem.detail or ''} {HAS_TOKENS}".strip()
             raise Unauthorized(error.problem.model_copy(update={"detail": detail})) from error
@@ -69,15 +71,36 @@ def _start(command: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
 def _wait_for_url(process: "subprocess.Popen[bytes]", log: Path, seconds: float) -> str:
     deadline = time.monotonic() + seconds
     while True:
-        status = process.poll()  # before the log is read, which is then complete
+        ended = process.poll() is not None  # before the log is read, which is then complete
         match = READY.search(log.read_text("utf-8", "replace"))
-        if status is not None:
-            raise EmbeddedServerError(f"The embedded service failed to start (exit code {status}).\n{_tail(log)}")
+        if ended:
+            raise EmbeddedServerError(f"The embedded service failed to start ({_code(process)}).\n{_tail(log)}")
         if match:
             return match[1]
         if time.monotonic() > deadline:
             raise EmbeddedServerError(f"The embedded service did not start within {seconds:.0f} s.\n{_tail(log)}")
         time.sleep(0.1)
+
+
+@contextmanager
+def _told_of_the_end(process: "subprocess.Popen[bytes]", log: Path) -> Iterator[None]:
+    """Raise ``EmbeddedServerError`` in the block as soon as the service ends, whatever it waits for."""
+
+    def look(*_: object) -> None:
+        if process.poll() is not None:
+            raise EmbeddedServerError(f"The embedded service has ended ({_code(process)}).\n{_tail(log)}")
+
+    before = signal.signal(signal.SIGCHLD, look)
+    try:
+        look()
+        yield
+    finally:
+        signal.signal(signal.SIGCHLD, before)
+
+
+def _code(process: "subprocess.Popen[bytes]") -> str:
+    status = process.returncode
+    return f"exit code {status}" if status >= 0 else f"by {signal.Signals(-status).name}"
 
 
 def _stop(process: "subprocess.Popen[bytes]") -> None:

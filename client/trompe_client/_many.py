@@ -17,7 +17,7 @@ from trompe_client._operations import pages, send, uploaded
 from trompe_client._plan import Read, Upload, plan_attack, source_of
 from trompe_client._port import Port
 from trompe_shared.api import Job, JobRequest, JobSpec, Result
-from trompe_shared.errors import TrompeError
+from trompe_shared.errors import SpecError, TrompeError
 
 BATCH: Final = "batch"
 """Label of all jobs of one call."""
@@ -55,6 +55,8 @@ async def run_all(
     port: Port, attacks: Sequence[Attack], *, batch: str | None, concurrency: int
 ) -> AsyncGenerator[Outcome[Job], None]:
     """Submit all, then yield each as it ends. The same ``batch`` and attacks again find the existing jobs."""
+    if concurrency < 1:
+        raise SpecError(f"`concurrency` must be 1 or more, got {concurrency}.")
     name = batch or _core.new_key()[:12]
     started = await _submit_all(port, attacks, name, concurrency)
     for outcome in started:

@@ -1,5 +1,6 @@
 """Address and token of the server: arguments, else the environment."""
 
+import math
 import os
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -22,11 +23,13 @@ class Connection:
 
     @classmethod
     def find(cls, url: str | None, *, token: str | None, timeout: float, transport: Any) -> "Connection":
-        """Defaults are TROMPE_SERVER and TROMPE_TOKEN. Raises ``SpecError`` for a wrong address or token."""
+        """Defaults are TROMPE_SERVER and TROMPE_TOKEN. Raises ``SpecError`` for a wrong address, token or timeout."""
         address = url or os.environ.get("TROMPE_SERVER") or DEFAULT_SERVER
-        if not _is_url(address):
+        if not (isinstance(timeout, int | float) and 0 < timeout < math.inf):
+            raise SpecError(f"`timeout` must be a positive number of seconds, got {timeout!r}.")
+        if not (isinstance(address, str) and _is_url(address)):
             raise SpecError(f"The server's URL must be http://HOST:PORT or https://HOST, got {address!r}.")
-        secret = (token or os.environ.get("TROMPE_TOKEN") or "").strip()  # a file's last line has an end
+        secret = str(token or os.environ.get("TROMPE_TOKEN") or "").strip()  # a file's last line has an end
         if not (secret.isascii() and secret.isprintable()):
             raise SpecError("The access token has characters that no token has; copy it again, or see TROMPE_TOKEN.")
         return cls(address.rstrip("/"), secret or None, timeout, transport)

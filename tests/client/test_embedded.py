@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,7 @@ def test_it_gives_the_address_it_is_told_and_stops_the_service_at_the_end(
     assert note.read_text() == "stopped"
 
 
+WARM = "import time; print('warming up'); print('trompe serving on http://127.0.0.1:1'); time.sleep(60)"
 SLEEP = "import time; time.sleep(60)"
 SERVE = f"print('trompe serving on http://127.0.0.1:1'); {SLEEP}"
 REFUSED = Unauthorized(Problem(title="Unauthorized", status=401, detail="This needs a token."))
@@ -55,8 +57,8 @@ NO_TOKEN = r"needs a token\. The embedded service .*\(TROMPE_DATA, .*TROMPE_TOKE
         pytest.param(SLEEP, 0.1, None, EmbeddedServerError, "within 0 s", id="never comes up"),
         pytest.param(
             f"print('out of memory'); {SERVE}",
-            *(180, ServerUnreachable("nobody there"), EmbeddedServerError, r"(?s)has ended.*out of memory"),
-            id="dies, unlike a server elsewhere",
+            *(180, ServerUnreachable("nobody there"), EmbeddedServerError, r"(?s)does not answer.*out of memory"),
+            id="is silent, unlike a server elsewhere",
         ),
         pytest.param(SERVE, 180, REFUSED, Unauthorized, NO_TOKEN, id="has data with tokens"),
     ],
@@ -66,6 +68,21 @@ def test_what_goes_wrong_with_the_service_is_told(
 ) -> None:
     with pytest.raises(error, match=words), embedded_server(command=script(code), start_seconds=seconds):
         raise raised or AssertionError("it came up")
+
+
+def test_the_end_of_the_service_ends_the_command_whatever_it_waits_for(tmp_path: Path) -> None:
+    note = tmp_path / "note"
+    service = script(f"import os; open({str(note)!r}, 'w').write(str(os.getpid()))\n{WARM}")
+    began = time.monotonic()
+    ended = pytest.raises(EmbeddedServerError, match=r"(?s)has ended \(by SIGKILL\).*warming up")
+    with ended, embedded_server(command=service):
+        _kill_and_wait(int(note.read_text()))
+    assert time.monotonic() - began < 60
+
+
+def _kill_and_wait(process: int) -> None:
+    os.kill(process, signal.SIGKILL)
+    time.sleep(60)
 
 
 def test_a_terminated_command_takes_its_service_along(tmp_path: Path) -> None:

@@ -77,7 +77,16 @@ def test_what_is_wrong_is_found_before_anything_is_sent() -> None:
     for address in ("localhost:8000", "http://", "http://host:port", "http://[::1"):
         with pytest.raises(SpecError, match="http://HOST:PORT"):
             Client(address)
+    with pytest.raises(SpecError, match="http://HOST:PORT"):
+        Client(8000)  # type: ignore[arg-type]
+    for timeout in (None, "60", 0, -1, float("nan"), float("inf")):
+        with pytest.raises(SpecError, match="`timeout` must be a positive number"):
+            Client(timeout=timeout)  # type: ignore[arg-type]
     with Client("http://127.0.0.1:9") as client:
+        with pytest.raises(SpecError, match="a job's id, got ''"):
+            client.job("")
+        with pytest.raises(SpecError, match="concurrency"):
+            list(client.map([{"object": "mug", "label": 0}], concurrency=0))
         with pytest.raises(SpecError, match="epsilon"):
             client.attack("mug", label=0, epsilon=3.0)
         with pytest.raises(ObjectError, match="There is no file"):

@@ -14,7 +14,7 @@ from trompe_server.judgement.suites import Suite
 from trompe_server.judging.judge import Judge
 from trompe_server.judging.metrics import camera_and_light, drop_warning, margins
 from trompe_server.judging.objects import ObjectPair, texture_changes
-from trompe_server.judging.visibility import faint_warnings, visibility_of
+from trompe_server.judging.visibility import paint_warnings, visibility_of
 from trompe_server.surrogate import behind
 from trompe_server.system.versions import versions
 from trompe_shared.api import (
@@ -175,7 +175,7 @@ def findings_of(manifest: Manifest, pair: ObjectPair) -> Iterator[Finding]:
                 f"({levels_within(epsilon)} levels of 255): {change.texels_beyond_epsilon} of "
                 f"{change.size[0] * change.size[1]} texels change by more, one by {change.max_levels} levels.",
             )
-    for warning in faint_warnings(pair.before):
+    for warning in paint_warnings(pair.before):
         yield Finding(kind="material", text=warning)
     for network in manifest.networks:
         if network.image_size not in (None, manifest.image_size):

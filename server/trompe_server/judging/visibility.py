@@ -17,9 +17,13 @@ from trompe_server.system.threads import in_threads
 from trompe_shared.api import Visibility
 from trompe_shared.object3d import Object3D
 from trompe_shared.opacity import strongest
+from trompe_shared.wavefront import Part
 
 FAINT: Final = 0.25
 """Opacity below which the paint on a material is hardly seen: a quarter of its change reaches the image."""
+
+FEW_TEXELS: Final = 32
+"""Texels under all triangles below which paint is a handful of colours, as of models that share a palette."""
 
 Textures = Mapping[str, UInt8[np.ndarray, "H W 3"]]
 Images = UInt8[np.ndarray, "views H W 3"]
@@ -61,11 +65,23 @@ def visibility_of(
     )
 
 
-def faint_warnings(obj: Object3D) -> Iterator[str]:
-    """A warning for each material that is nearly transparent wherever it is strongest."""
+def paint_warnings(obj: Object3D) -> Iterator[str]:
+    """Warnings of too few texels to paint, and of materials that are nearly transparent wherever they are strongest."""
+    texels = sum(_texels_under(part, obj.textures[obj.albedo_of(part)].shape) for part in obj.parts)
+    if texels < FEW_TEXELS:
+        yield (
+            f"The triangles cover {texels:.1f} texels of the textures, so paint is a few flat colours. Unwrap the "
+            "object in a modelling program; one without texture coordinates is unwrapped here."
+        )
     for name, opacity in strongest(obj).items():
         if opacity < FAINT:
             yield f"The material {name!r} is nearly transparent (opacity {opacity:.2f}): paint on it changes little."
+
+
+def _texels_under(part: Part, shape: tuple[int, ...]) -> float:
+    """Area of a part's triangles on its texture of ``shape`` (H, W, 3), in texels."""
+    a, b, c = np.moveaxis(part.uvs[part.faces].astype(np.float64), 1, 0)
+    return float(np.abs(np.linalg.det(np.stack([b - a, c - a], 1))).sum() / 2 * shape[0] * shape[1])
 
 
 def perceived_change(before: Images, after: Images, pixels: Pixels) -> dict[str, float]:

@@ -58,6 +58,7 @@ def test_an_awkward_object_is_recognised_and_attacked(
     assert result.target.a_before >= 0.75
     assert result.target.a_drop is not None
     assert result.texels_altered
+    assert any("paint is a few flat colours" in each for each in result.warnings) == (made.get("side") == 1)
     assert result.fidelity["explained"] > 0.9
     largest = max(abs(each.before_true_confidence - (each.after_true_confidence or 0)) for each in result.views)
     assert largest > 0.001

@@ -6,7 +6,7 @@ from typing import Final
 from trompe_server.job.report.data import ReportData
 from trompe_server.job.setup import JobSetup
 from trompe_server.judging.metrics import drop_warning, reach_warning, texels_altered, transfer_gap
-from trompe_server.judging.visibility import faint_warnings
+from trompe_server.judging.visibility import paint_warnings
 from trompe_server.surrogate.fidelity import MAX_ERROR, MIN_EXPLAINED
 from trompe_shared.api import MOST_VIEWS, Accuracy, FooledAs, JobSpec
 
@@ -43,7 +43,7 @@ def warnings_of(data: ReportData, seen: Sequence[ReportData]) -> Iterator[str]:
 
     if target.a_before > 0 and (warning := drop_warning(target)):
         yield warning
-    yield from faint_warnings(data.setup.obj)
+    yield from paint_warnings(data.setup.obj)
     yield from in_each(_fidelity)
     if data.painted is not None and texels_altered(data.setup.obj.textures, data.painted.textures) == 0:
         yield f"No texel was altered: {_why_unaltered(data.spec)}"
@@ -159,7 +159,7 @@ def _why_unaltered(spec: JobSpec) -> str:
     if spec.victim.queries is not None:
         return "the classifier's scores do not change with its images. Try more `queries`."
     remedy = "Export it without its softmax" if spec.goal.loss == "margin" else "Try `loss: margin`"
-    return f"the classifier's gradient is zero on every view, as behind a saturated softmax. {remedy}."
+    return f"the classifier's gradient is zero on every view, as behind a saturated softmax, or not finite. {remedy}."
 
 
 def _poor_views(data: ReportData) -> Iterator[str]:
