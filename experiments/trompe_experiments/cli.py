@@ -48,7 +48,14 @@ def run(
 ) -> None:
     """Run the experiment of FILE: a .yaml, or the name of a shipped one.
 
-    Run it again to continue a stopped run: only missing jobs are submitted.
+    Run it again to continue a stopped run: only missing jobs are submitted. A file, with the keywords of the SDK:
+
+    \b
+        name: mine
+        objects: shipped
+        base: {classifier: tiny, steps: 20}
+        grid: {epsilon: [0.02, 0.05], tau: [null, 0.05]}
+        seeds: [0, 1, 2]
     """
     from trompe_experiments.judged import judge_all
     from trompe_experiments.progress import Tracked, experiment_display

@@ -599,7 +599,15 @@ def test_with_tokens_it_asks_for_one_and_goes_on_as_wanted(guarded: Service, pag
 
     page.get_by_role("button", name="Sign out").click()
     expect(page).to_have_url(re.compile("/login"))
-    page.goto(f"{guarded.url}/jobs")
+    page.goto(f"{guarded.url}/jobs?state=queued")
     assert "/login" in page.url
+
+    guarded.store.create(JobRequest.of("mug", label="mug"))
+    page.fill("[name=token]", guarded.token or "")
+    page.get_by_role("button", name="Sign in").click()
+    expect(page).to_have_url(f"{guarded.url}/jobs?state=queued")
+    command = [sys.executable, "-m", "trompe_client.cli", "token", "revoke", "me", "--data", str(guarded.data)]
+    subprocess.run(command, capture_output=True, check=True)
+    expect(page).to_have_url(re.compile("/login"), timeout=30_000)
     # The console tells, some time later, the 401 of the wrong token and the 403 of the job and of the check before it.
     faults[:] = [fault for fault in faults if "401" not in fault and "403" not in fault]

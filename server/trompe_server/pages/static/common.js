@@ -39,7 +39,9 @@ export function follow(path, name, onMessage) {
     source.onerror = () => {
       lost = true;
       tell("The connection to the server is lost; reconnecting.");
-      if (source.readyState === EventSource.CLOSED) timer = setTimeout(open, 2000);
+      if (source.readyState !== EventSource.CLOSED) return;
+      timer = setTimeout(open, 2000);
+      fetch(location.href).then(answered).catch(() => {}); // the token may be revoked
     };
   };
   const stop = () => {
