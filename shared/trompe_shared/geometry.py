@@ -7,11 +7,15 @@ of a right-handed renderer's picture.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from trompe_shared.errors import SpecError
 
 FIELD_OF_VIEW: Final = 60.0
 """Vertical field of view of every camera, degrees."""
@@ -76,7 +80,7 @@ class Light:
 
     intensity: at 1.0 a white matt surface that faces the light reflects white, without ambient light.
     ambient: light from all sides as a share of white, in [0, 1].
-    colour: of the directional light, linear, 0 to 255 as in SAILenv.
+    colour: of the directional light, linear, 0 to 255 as in SAILenv; another one raises ``SpecError``.
     """
 
     azimuth: float = 0.0
@@ -85,12 +89,15 @@ class Light:
     ambient: float = 0.5
     colour: tuple[int, int, int] = (255, 255, 255)
 
+    def __post_init__(self) -> None:
+        _check_colour("The colour of a light", self.colour)
+
 
 @dataclass(frozen=True)
 class View:
     """One camera with one light.
 
-    background: sRGB colour, 0 to 255.
+    background: sRGB colour, 0 to 255; another one raises ``SpecError``.
     backdrop: name of a picture that replaces the background colour.
     noise: number of the noise in the picture of a renderer that is not deterministic; others ignore it.
     """
@@ -100,6 +107,14 @@ class View:
     background: tuple[int, int, int] = (255, 255, 255)
     backdrop: str | None = None
     noise: int = 0
+
+    def __post_init__(self) -> None:
+        _check_colour("The background of a view", self.background)
+
+
+def _check_colour(name: str, colour: Sequence[object]) -> None:
+    if not (len(colour) == 3 and all(isinstance(level, Integral) and level in range(256) for level in colour)):
+        raise SpecError(f"{name} must be three whole numbers from 0 to 255, got {tuple(colour)}.")
 
 
 def sailenv_pose(camera: Camera) -> tuple[Matrix, Matrix]:

@@ -1,13 +1,18 @@
 """Cameras and lights: Trompe's angles, Unity's Euler angles and matrices say the same."""
 
+from functools import partial
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from trompe_shared.errors import SpecError
 from trompe_shared.geometry import (
     Camera,
     Light,
+    View,
     euler_to_matrix,
     light_travel_direction,
     look_rotation,
@@ -92,3 +97,11 @@ def test_any_euler_angles_give_a_right_handed_camera(euler: tuple[float, float, 
 def test_light_travels_from_its_angles_to_the_origin(azimuth: float, elevation: float) -> None:
     origin_of_light = Camera(1.0, azimuth, elevation).position()
     assert np.allclose(light_travel_direction(Light(azimuth=azimuth, elevation=elevation)), -origin_of_light)
+
+
+@pytest.mark.parametrize("colour", [(1.0, 1.0, 1.0), (0, 0), (0, 0, 256), (-1, 0, 0), "red"])
+def test_a_colour_is_three_levels(colour: Any) -> None:
+    for make in (partial(View, Camera(1, 0, 0), background=colour), partial(Light, colour=colour)):
+        with pytest.raises(SpecError, match="must be three whole numbers from 0 to 255"):
+            make()
+    assert View(Camera(1, 0, 0), background=tuple(np.array([1, 2, 3]))).background == (1, 2, 3)
