@@ -1,6 +1,7 @@
 """The object turned in the browser: what is drawn, and what the network says of it. WebGL is drawn in software."""
 
 import io
+import json
 import re
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Browser, BrowserContext, Page, expect
+from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 
 from tests.pages.conftest import Service, drop, inaccessible, width
 from trompe_server.formats import write_glb
@@ -27,10 +28,11 @@ pytestmark = pytest.mark.timeout(1200)
 
 @pytest.fixture(scope="module")
 def painted(service: Service, browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A job submitted by dropping a GLB on the form and watched to its end."""
+    """A small job submitted by dropping a GLB on the form and watched to its end."""
     file = tmp_path_factory.mktemp("orbit") / "my_mug.glb"
     file.write_bytes(write_glb(load_object(shipped_objects()["mug"].read())))
     page = browser.new_page()
+    page.route("**/v1/jobs", _made_smaller)
     page.goto(f"{service.url}/jobs/new")
     drop(page, file)
     expect(page.locator("#file-says")).to_contain_text("triangles")
@@ -46,6 +48,13 @@ def painted(service: Service, browser: Browser, tmp_path_factory: pytest.TempPat
     assert "my_mug" in page.inner_text("h1")
     yield page.url.rpartition("/")[2]
     page.close()
+
+
+def _made_smaller(route: Route) -> None:
+    """Submit a job of fewer views and steps than any preset."""
+    asked: dict[str, Any] = route.request.post_data_json or {}
+    smaller = {"views": asked["views"] | {"pool": 20}, "search": asked["search"] | {"steps": 6}}
+    route.continue_(post_data=json.dumps(asked | smaller))
 
 
 def opened(page: Page, address: str) -> Page:

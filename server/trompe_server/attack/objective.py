@@ -19,7 +19,7 @@ from trompe_server.classifiers.protocol import AT_ONCE
 from trompe_server.image_pipelines import Drawn
 from trompe_server.surrogate import AnyCanvas, AnySurrogate
 from trompe_server.system.threads import in_parts
-from trompe_shared.errors import SpecError
+from trompe_shared.errors import ClassifierError, SpecError
 
 Textures = Mapping[str, Float[Tensor, "H W 3"]]
 Flat = Float[Tensor, "texels 3"]
@@ -224,7 +224,9 @@ class Objective:
         """Gradient of the summed loss of one classifier, and its logits."""
         images.requires_grad_()
         logits = member.logits(images)
-        (gradient,) = torch.autograd.grad(self.goal.losses(logits).sum(), images)
+        (gradient,) = torch.autograd.grad(self.goal.losses(logits).sum(), images, allow_unused=True)
+        if gradient is None:
+            raise ClassifierError(f"{member.name!r} has no gradient: its logits do not depend on its images.")
         return gradient, logits.detach()
 
     @torch.no_grad()

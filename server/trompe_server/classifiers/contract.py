@@ -55,7 +55,8 @@ def check_contract(network: nn.Module, sample: Float[Tensor, "2 3 H W"], file: s
     try:
         logits = network(images)
     except Exception as error:  # of a network, which may raise anything
-        raise broken(file, f"it does not run on two images ({str(error)[:300]})") from error
+        remedy = "; compute x = x - mean in place of x -= mean" if "in-place" in str(error) else ""
+        raise broken(file, f"it does not run on two images ({str(error)[:300]}){remedy}") from error
     if not isinstance(logits, Tensor) or logits.ndim != 2 or len(logits) != 2 or not logits.is_floating_point():
         raise broken(file, f"its output for two images is {describe_value(logits)}")
     if logits.shape[1] < 2:
@@ -67,7 +68,8 @@ def check_contract(network: nn.Module, sample: Float[Tensor, "2 3 H W"], file: s
     if difference > SAME * logits.abs().max():
         raise broken(file, "its logits of an image depend on chance or on its batch: call eval() on the network first")
     protocol.refuse_probabilities(logits.detach().cpu().float().numpy(), file)
-    gradient = torch.autograd.grad(logits.max(), images, allow_unused=True)[0] if logits.requires_grad else None
+    weighted = logits @ torch.linspace(1, 2, logits.shape[1]).to(logits)  # a class may be constant, and so may the sum
+    gradient = torch.autograd.grad(weighted.sum(), images, allow_unused=True)[0] if logits.requires_grad else None
     if gradient is None or not gradient.any():
         raise broken(file, "its output has no gradient in the image")
     return logits.shape[1]

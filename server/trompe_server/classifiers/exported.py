@@ -36,6 +36,10 @@ def _image_size(program: ExportedProgram, file: str, *, at_once: int) -> tuple[i
     inputs = program.graph_signature.user_inputs
     if len(inputs) != 1:
         raise broken(file, f"it takes {len(inputs)} inputs")
+    if program.call_spec.in_spec.unflatten(inputs)[1]:
+        raise broken(
+            file, f"it takes its image as the keyword {inputs[0]!r}: export it with (images,) as its arguments"
+        )
     (node,) = (n for n in program.graph.nodes if n.op == "placeholder" and n.name == inputs[0])
     value: Any = node.meta["val"]
     if not isinstance(value, Tensor) or value.ndim != 4 or value.shape[1] != 3 or value.dtype != torch.float32:

@@ -83,6 +83,8 @@ def _fused(network: fx.GraphModule) -> fx.GraphModule:
         if len(node.users) > 1 or following.target not in NAMES:
             continue
         images, weight, bias, *shape = _arguments(node)
+        if not (_is_constant(weight) and _is_constant(bias)):
+            continue
         named = NAMES[following.target], following.args[1:]
         with network.graph.inserting_before(node):
             fused = network.graph.call_function(convolved, (images, weight, bias, tuple(shape), *named))
@@ -142,8 +144,12 @@ def _foldable(norm: fx.Node) -> bool:
     if not isinstance(source, fx.Node) or source.target is not CONVOLUTION or len(source.users) != 1:
         return False
     training = norm.args[5]
-    parameters = [*source.args[1:3], *norm.args[1:5]]
-    return not training and all(p is None or (isinstance(p, fx.Node) and p.op == "get_attr") for p in parameters)
+    return not training and all(map(_is_constant, [*source.args[1:3], *norm.args[1:5]]))
+
+
+def _is_constant(arg: Any) -> bool:
+    """Whether an argument is a parameter of the network, or none at all."""
+    return arg is None or (isinstance(arg, fx.Node) and arg.op == "get_attr")
 
 
 def _fold(network: fx.GraphModule, norm: fx.Node) -> None:

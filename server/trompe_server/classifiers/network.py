@@ -2,18 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.modules.batchnorm import _BatchNorm
-from torch.nn.modules.dropout import _DropoutNd
 
 from trompe_server.classifiers.protocol import AT_ONCE, BATCH, Images, Logits, predicted
 from trompe_shared.errors import ClassifierError
-
-_IN_TRAINING: Final = (_BatchNorm, _DropoutNd)
 
 
 class NamedNetwork(NamedTuple):
@@ -28,8 +24,8 @@ class NamedNetwork(NamedTuple):
 class NetworkClassifier:
     """A network (N, 3, H, W) in [0, 1] -> logits (N, n_classes) on ``device``; freezes its parameters.
 
-    Raises ``ClassifierError`` for another number of class names, for what is no network, and for one in training, where
-    an image's logits hang on chance or on its batch.
+    Raises ``ClassifierError`` for another number of class names, for what is no network, for an ``image_size`` that is
+    not (H, W), and for a network in training, where an image's logits hang on chance or on its batch.
     """
 
     name: str
@@ -44,8 +40,11 @@ class NetworkClassifier:
             raise ClassifierError(f"{self.name!r} has {self.n_classes} classes, but {len(self.classes)} class names.")
         if not isinstance(self.network, nn.Module):
             raise ClassifierError(f"The network {self.name!r} is a {type(self.network).__name__}, not a torch module.")
-        self.network.requires_grad_(False)
-        if any(each.training for each in self.network.modules() if isinstance(each, _IN_TRAINING)):
+        if not (isinstance(self.image_size, Sequence) and [type(side) for side in self.image_size] == [int, int]):
+            raise ClassifierError(f"`image_size` of {self.name!r} must be (height, width), got {self.image_size!r}.")
+        for parameter in self.network.parameters():
+            parameter.requires_grad_(False)
+        if any(each.training and _heeds_training(each) for each in self.network.modules()):
             raise ClassifierError(f"The network {self.name!r} is in training: call eval() on it first.")
 
     def logits(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n classes"]:
@@ -96,3 +95,9 @@ class NetworkClassifier:
             device=self.device,
             split=cpu,
         )
+
+
+def _heeds_training(module: nn.Module) -> bool:
+    """Whether a module computes something else in training, such as a batch norm or a dropout."""
+    code = getattr(type(module).forward, "__code__", None)
+    return code is not None and "training" in code.co_names

@@ -97,7 +97,7 @@ def _session(path: Path, device: str) -> Any:
                 f"{path.name!r} keeps its weights in another file, which is not here. Write one file: "
                 "torch.onnx.export(..., external_data=False), or onnx.save(onnx.load(FILE), NEW) beside the weights."
             ) from error
-        said = str(error).replace(str(path), path.name)[:300]
+        said = str(error).replace(str(path), path.name)[-300:]  # its end tells the reason
         raise broken(path.name, f"onnxruntime cannot read it ({said})") from error
 
 

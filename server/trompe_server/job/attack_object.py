@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from trompe_server.attack import Budget, Goal, ViewDistribution, attack, start
-from trompe_server.classifiers import WhiteBoxClassifier, load_classifier
+from trompe_server.classifiers import Classifier, WhiteBoxClassifier, load_classifier
 from trompe_server.image_pipelines import PIPELINES
 from trompe_server.job.setup import (
     HELD_OUT_STREAM,
@@ -85,6 +85,8 @@ def attack_object(
         raise SpecError("There are no `views` to attack: give at least one, or leave `views` out for random ones.")
     obj = obj if isinstance(obj, Object3D) else _load(obj)
     network = load_classifier(classifier) if isinstance(classifier, str | Path) else classifier
+    if not isinstance(network, Classifier):
+        raise ClassifierError(f"A {type(network).__name__} is no classifier; wrap a torch module in NetworkClassifier.")
     if not isinstance(network, WhiteBoxClassifier):
         raise ClassifierError(f"{network.name!r} gives scores but no gradients (.onnx); use a .pt2 file.")
     labels = resolve_labels(label, network.classes, network.n_classes, network.name)

@@ -161,6 +161,12 @@ class Library:
             payload = folder / f"data{suffix}"
             identity = _copy(file, payload)
             before = self.classifiers.stored(identity)
+            names = self.classifiers.folder.within(identity).names() if before is not None else []
+            if payload.name not in names and (known := [name for name in names if name.startswith("data")]):
+                ending = Path(known[0]).suffix
+                raise ClassifierError(
+                    f"{filename!r} is stored already, as a {ending} file; let its name end in {ending}."
+                )
             try:
                 found = self._inspect(str(payload)) if before is None else before.model_dump()
             except ClassifierError as error:

@@ -77,6 +77,13 @@ class Around(nn.Module):
         return self.function(self.net, image)
 
 
+def filtered_by_itself(image: Tensor) -> Tensor:
+    weight = image.mean((2, 3)).reshape(-1, 1, 1, 1) * torch.ones(3, 3)
+    together = image.reshape(1, -1, *image.shape[2:])
+    found: Tensor = nn.functional.conv2d(together, weight, groups=together.shape[1]).reshape(*image.shape[:2], -1)
+    return found[..., None]
+
+
 class TwoInputs(nn.Module):
     def forward(self, image: Tensor, scale: Tensor) -> Tensor:
         return (image * scale).mean(dim=(2, 3))
@@ -412,6 +419,7 @@ def test_without_onednn_the_shipped_network_gives_equal_logits_and_gradients(mon
     [
         pytest.param(lambda net, x: ((y := net.body[0](x)).relu() + y).mean((2, 3)), id="another reader"),
         pytest.param(lambda net, x: net.body[0](x).sigmoid().mean((2, 3)), id="another activation"),
+        pytest.param(lambda net, x: filtered_by_itself(x).relu().mean((2, 3)), id="weights from the image"),
         pytest.param(
             lambda net, x: net.body[0](nn.functional.pad(x, (1, 1, 1, 1), value=0.5)).mean((2, 3)), id="padding by grey"
         ),
@@ -422,8 +430,10 @@ def test_other_convolutions_stay(function: Callable[[Any, Tensor], Tensor], tmp_
     program = read_program(tmp_path / "net.pt2").module(check_guards=False)
     assert isinstance(network.network, Formatted)
     assert convolved not in [node.target for node in network.network.network.graph.nodes]
-    images = fit_images(noise(3), SIZE)
-    torch.testing.assert_close(network.scores(images), program(images))
+    images = fit_images(noise(3), SIZE).requires_grad_()
+    expected, found = program(images), network.logits(images)
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(*(torch.autograd.grad(x[:, 0].sum(), images)[0] for x in (found, expected)))
 
 
 BREAKING: dict[str, tuple[nn.Module, dict[str, Any], str]] = {
@@ -451,6 +461,51 @@ def test_an_exported_network_that_breaks_the_contract_is_refused(
 ) -> None:
     with pytest.raises(ClassifierError, match=message):
         load_classifier(export(network, tmp_path / "net.pt2", **options))
+
+
+@pytest.mark.parametrize("bias", [-100, 100])
+def test_a_class_may_be_constant(bias: float, tmp_path: Path) -> None:
+    binary = Around(lambda net, x: torch.cat([torch.zeros_like(y := net(x)[:, :1]), y + bias], 1))
+    assert load_classifier(export(binary, tmp_path / "net.pt2")).n_classes == 2
+
+
+def test_an_image_by_keyword_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    batch = {"image": {0: torch.export.Dim.DYNAMIC}}
+    program = torch.export.export(trained(Net()), (), {"image": torch.rand(2, 3, *SIZE)}, dynamic_shapes=batch)
+    torch.export.save(program, tmp_path / "net.pt2")
+    with pytest.raises(ClassifierError, match=r"takes its image as the keyword 'image': export it with \(images,\)"):
+        load_classifier(tmp_path / "net.pt2")
+
+
+class Stochastic(nn.Module):
+    def forward(self, image: Tensor) -> Tensor:
+        return image * torch.rand(()) if self.training else image
+
+
+@pytest.mark.parametrize(
+    "layer",
+    [Stochastic(), nn.RReLU(), nn.LSTM(3, 3, 2, dropout=0.3), nn.MultiheadAttention(3, 1, dropout=0.3)],
+    ids=str,
+)
+def test_whatever_depends_on_training_is_refused_in_it_and_else_taken(layer: nn.Module) -> None:
+    layer.train()
+    with pytest.raises(ClassifierError, match=r"in training: call eval\(\)"):
+        NetworkClassifier("mine", nn.Sequential(Net().eval(), layer), SIZE, 7)
+    NetworkClassifier("mine", nn.Sequential(Net().eval(), layer.eval()), SIZE, 7)
+    NetworkClassifier("mine", nn.Conv2d(3, 7, 3), SIZE, 7)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_scripted_network_is_the_network() -> None:
+    network = Net().eval()
+    plain, scripted = (NetworkClassifier("mine", each, SIZE, 7) for each in (network, torch.jit.script(network)))
+    np.testing.assert_allclose(scripted.predict(noise(2)), plain.predict(noise(2)), rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", [64, (3, 64, 64), (64.0, 64.0), None])
+def test_a_size_that_is_not_height_and_width_is_refused(size: Any) -> None:
+    with pytest.raises(ClassifierError, match=r"`image_size` of 'mine' must be \(height, width\)"):
+        NetworkClassifier("mine", Net().eval(), size, 7)
 
 
 def test_a_network_in_training_or_of_other_classes_is_refused() -> None:

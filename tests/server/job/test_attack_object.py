@@ -6,13 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tests.job_runs import CHAIR, Recorder
 from trompe_server import attack_object
 from trompe_server.attack import ViewDistribution
+from trompe_server.classifiers import NetworkClassifier
 from trompe_server.renderers import SailenvTarget
 from trompe_shared.engine import EngineInfo
-from trompe_shared.errors import RendererError, SpecError
+from trompe_shared.errors import ClassifierError, RendererError, SpecError
 
 VIEWS = ViewDistribution(1.5, (0, 40)).sample(7, generator=np.random.default_rng(0))
 OPTIONS: dict[str, Any] = {"label": "chair", "views": VIEWS[:5], "held_out": VIEWS[5:], "steps": 1}
@@ -94,3 +96,23 @@ def test_options_that_do_not_fit_are_refused_at_once(options: dict[str, Any], er
     with pytest.raises(SpecError, match=error):
         attack_object(CHAIR, "tiny", target=target, **OPTIONS | options)
     assert target.asked == []
+
+
+def test_what_is_no_classifier_is_refused_at_once() -> None:
+    target = Recorder()
+    with pytest.raises(ClassifierError, match="A Conv2d is no classifier; wrap a torch module in NetworkClassifier"):
+        attack_object(CHAIR, torch.nn.Conv2d(3, 8, 3), target=target, **OPTIONS)  # type: ignore[arg-type]
+    assert target.asked == []
+
+
+class Apart(torch.nn.Module):
+    """Logits with a gradient, but in something else than the images, as of quantized layers."""
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(len(images), 8, requires_grad=True) + images.detach().mean()
+
+
+def test_a_network_without_a_gradient_in_its_images_is_told() -> None:
+    classifier = NetworkClassifier("int8", Apart().eval(), (64, 64), 8)
+    with pytest.raises(ClassifierError, match="'int8' has no gradient: its logits do not depend on its images"):
+        attack_object(CHAIR, classifier, target=Recorder(), **OPTIONS | {"label": 0})

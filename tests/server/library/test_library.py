@@ -126,6 +126,9 @@ def test_a_classifier_file_is_described_by_a_process_of_its_own_once(tmp_path: P
     again = library.add_classifier(io.BytesIO(data), "net.pt2")
     assert again == info.model_copy(update={"name": "net"})
     assert inspect.call_count == 1
+    with pytest.raises(ClassifierError, match=r"'net.onnx' is stored already, as a \.pt2 file"):
+        library.add_classifier(io.BytesIO(data), "net.onnx")
+    assert library.classifier_path("net") == library.classifier_path(info.id)
     with pytest.raises(ClassifierError, match=r"2 class names for .* of 3.*net.classes.json"):
         library.add_classifier(io.BytesIO(data), "net.pt2", classes=["r", "g"])
 
