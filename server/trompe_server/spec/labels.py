@@ -1,6 +1,7 @@
 """Class labels: from a name, a synonym or an index to the index of the class."""
 
 import operator
+import unicodedata
 from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Final, SupportsIndex
@@ -47,8 +48,8 @@ def resolve_label(label: str | SupportsIndex, classes: Sequence[str] | None, n_c
             f"{classifier!r} has no class names to find {label!r} in; give an index in 0..{n_classes - 1}, or "
             "class names with it."
         )
-    wanted = label.strip().casefold()
-    whole = [index for index, name in enumerate(classes) if name.casefold() == wanted]
+    wanted = _folded(label)
+    whole = [index for index, name in enumerate(classes) if _folded(name) == wanted]
     exact = [index for index in whole if classes[index] == label]
     fits = exact or whole or [index for index, name in enumerate(classes) if wanted in _synonyms(name)]
     if len(fits) != 1:
@@ -56,14 +57,21 @@ def resolve_label(label: str | SupportsIndex, classes: Sequence[str] | None, n_c
     return fits[0]
 
 
-def _synonyms(name: str) -> list[str]:
-    return [part.strip().casefold() for part in name.split(",")]
+def _folded(text: str) -> str:
+    """Text for comparison: systems compose accents differently."""
+    return unicodedata.normalize("NFC", text).strip().casefold()
+
+
+def _synonyms(name: str) -> dict[str, str]:
+    """The synonyms of a name, by their folded form."""
+    return {_folded(part): part.strip() for part in name.split(",")}
 
 
 def _unclear(label: str, fits: Sequence[int], classes: Sequence[str], classifier: str) -> LabelError:
     if fits:
         candidates = "; ".join(f"{index} ({classes[index]})" for index in fits)
         return LabelError(f"{label!r} fits several classes of {classifier!r}: {candidates}. Give the index.")
-    close = get_close_matches(label.strip().casefold(), [s for name in classes for s in _synonyms(name)], n=3)
-    hint = f"did you mean {', '.join(map(repr, close))}?" if close else f"an example of a class is {classes[0]!r}."
+    known = {folded: part for name in classes for folded, part in _synonyms(name).items()}
+    close = get_close_matches(_folded(label), list(known), n=3)
+    hint = f"did you mean {', '.join(repr(known[each]) for each in close)}?" if close else f"an example of a class is {classes[0]!r}."
     return LabelError(f"{classifier!r} has no class {label!r}; {hint} Give a class, its index, or another network.")

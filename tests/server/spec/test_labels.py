@@ -46,6 +46,13 @@ def test_a_label_that_fits_nothing_is_refused_with_help(label: str | int, words:
         resolve_label(label, CLASSES, len(CLASSES), classifier="net")
 
 
+def test_accents_may_be_composed_in_either_way_and_a_hint_keeps_the_spelling() -> None:
+    classes = ["T\u00e4\u00dfle", "mug"]
+    assert resolve_label("Ta\u0308\u00dfle", classes, 2, classifier="net") == 0
+    with pytest.raises(LabelError, match="did you mean 'T\u00e4\u00dfle'"):
+        resolve_label("T\u00e4\u00dfl", classes, 2, classifier="net")
+
+
 def test_a_label_that_fits_two_classes_is_refused_with_both() -> None:
     with pytest.raises(LabelError, match=r"0 \(jug, cup\); 1 \(mug, cup\)"):
         resolve_label("cup", ["jug, cup", "mug, cup"], 2, classifier="net")
