@@ -73,5 +73,9 @@ def _unclear(label: str, fits: Sequence[int], classes: Sequence[str], classifier
         return LabelError(f"{label!r} fits several classes of {classifier!r}: {candidates}. Give the index.")
     known = {folded: part for name in classes for folded, part in _synonyms(name).items()}
     close = get_close_matches(_folded(label), list(known), n=3)
-    hint = f"did you mean {', '.join(repr(known[each]) for each in close)}?" if close else f"an example of a class is {classes[0]!r}."
+    hint = (
+        f"did you mean {', '.join(repr(known[each]) for each in close)}?"
+        if close
+        else f"an example of a class is {classes[0]!r}."
+    )
     return LabelError(f"{classifier!r} has no class {label!r}; {hint} Give a class, its index, or another network.")
