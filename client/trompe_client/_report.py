@@ -26,6 +26,8 @@ from trompe_shared.api import (
 )
 
 PERCENT: Final = "{:.1%}"
+NARROWEST: Final = 8
+"""Width of a column of words."""
 LEVELS: Final = "{:.4f} ({levels:.1f}/255)"
 
 
@@ -165,11 +167,12 @@ _RECORDS: Final[Mapping[type, tuple[Sequence[str], Callable[[Any], Sequence[str]
 
 
 def empty_table(*columns: str, right: int = 0) -> Table:
-    """A table with numbers in the last ``right`` columns: aligned right and never wrapped."""
+    """A table with numbers in the last ``right`` columns: aligned right and never wrapped, nor is a job's id. Other
+    columns keep ``NARROWEST``, even if the table then is wider than the terminal."""
     table = Table()
     for index, name in enumerate(columns):
         if index < len(columns) - right:
-            table.add_column(name, overflow="fold")
+            table.add_column(name, overflow="fold", min_width=NARROWEST, no_wrap=name == "job")
         else:
             table.add_column(name, justify="right", no_wrap=True)
     return table

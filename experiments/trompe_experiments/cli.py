@@ -66,11 +66,17 @@ def run(
     click.echo(_announcement(plan, folder))
     if dry_run:
         return
-    with service(server, token) as client, experiment_display(console(stderr=True)) as display:
-        show = display if track is None else Tracked(display, TRACKERS[track])
-        rows = run_experiment(plan, Service(client), folder, show=show, retry_failed=retry_failed)
-        if plan.experiment.judgement is not None:
-            judge_all(plan, Service(client), folder, seconds={row.key: row.seconds for row in rows}, show=click.echo)
+    try:
+        with service(server, token) as client, experiment_display(console(stderr=True)) as display:
+            show = display if track is None else Tracked(display, TRACKERS[track])
+            rows = run_experiment(plan, Service(client), folder, show=show, retry_failed=retry_failed)
+            if plan.experiment.judgement is not None:
+                seconds = {row.key: row.seconds for row in rows}
+                judge_all(plan, Service(client), folder, seconds=seconds, show=click.echo)
+    except KeyboardInterrupt:
+        running = f" Submitted jobs continue on {server}." if server else ""
+        click.echo(f"\n{folder} keeps what is done; the same command goes on with it.{running}", err=True)
+        raise
     command = f"trompe experiment run {file}" + (f" --out {out}" if out else "")
     write_about(folder, command, seconds=monotonic() - started, source=experiment_file(file))
     _conclude(rows, folder)
@@ -87,7 +93,7 @@ def _conclude(rows: Sequence["ResultRow"], folder: Path) -> None:
     """Print the results; fail if jobs did."""
     from trompe_experiments.terminal import failures, results_table
 
-    console().print(results_table(rows))
+    console().print(results_table(rows), crop=False)
     failed = failures(rows)
     click.echo(f"written: {folder}/results.csv, predictions.csv. Next: trompe experiment report {folder}")
     if failed:
@@ -147,7 +153,7 @@ def compare(first: Path, second: Path) -> None:
     """Compare two experiments: folders, or results.csv files."""
     from trompe_experiments.terminal import compared, comparison_table
 
-    console().print(comparison_table(compared(first, second)))
+    console().print(comparison_table(compared(first, second)), crop=False)
 
 
 @experiment.command("list")
@@ -175,7 +181,7 @@ def fill(document: Path, check: bool) -> None:
 
     changed = documents.outdated(document) if check else documents.fill(document)
     for line in changed:
-        click.echo(line)
+        click.echo(line if check else line.replace("is not made", "was not made") + "; now it is")
     if check and changed:
         click.echo(f"Run: trompe experiment fill {document}", err=True)
         sys.exit(1)
@@ -217,7 +223,10 @@ def stability(out: Path, objects: tuple[str, ...], seeds: int, only: str, retry_
 @server_option(None)
 @token_option
 def export_variants(out: Path, server: str | None, token: str | None, **asked: Any) -> None:
-    """Write adversarial variants of shipped objects: archives, and labelled pictures in train and test folders."""
+    """Write adversarial variants of shipped objects: archives, and labelled pictures in train and test folders.
+
+    Variants of an earlier export into the folder are deleted.
+    """
     from trompe_experiments.progress import experiment_display
     from trompe_experiments.variants import export_variants as export
     from trompe_server.renderers import local_renderer

@@ -91,6 +91,8 @@ def _grid(options: Options) -> Options:
     for name, values in options.items():
         if not isinstance(values, list) or not values:
             raise ValueError(f"{name!r} must be a list of values; got {values!r}")
+        if any(value in values[:number] for number, value in enumerate(values)):
+            raise ValueError(f"{name!r} gives a value twice: {values!r}")
     for preset in options.get("preset", []):
         with_preset({"preset": preset})
     return known | {name: options[name] for name in options if name == "preset"}
@@ -127,6 +129,12 @@ def _objects(given: Any) -> Any:
     return {name: {} if options is None else options for name, options in given.items()}
 
 
+def _distinct(seeds: list[int]) -> list[int]:
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"{seeds} gives a seed twice, which is one job and counts once")
+    return seeds
+
+
 class _Schema(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -157,7 +165,9 @@ class Experiment(_Schema):
         Field(default=[{}])
     )
     cases: dict[str, Annotated[Options, AfterValidator(_case)]] = Field(default_factory=dict)
-    seeds: Annotated[list[int], BeforeValidator(_seeds), Field(min_length=1)] = Field(default_factory=lambda: [0])
+    seeds: Annotated[list[int], BeforeValidator(_seeds), AfterValidator(_distinct), Field(min_length=1)] = Field(
+        default_factory=lambda: [0]
+    )
     judgement: Annotated[Options, AfterValidator(_judgement)] | None = Field(
         default=None, description="judge the painted objects, the unpainted one and noise, with these options"
     )

@@ -25,7 +25,7 @@ from rich.console import Console
 
 from tests.client.conftest import NOW, SPEC, FakeServer, stored_id, trompe, zipped
 from trompe_client import BadRequest, Client, JobHandle
-from trompe_client._report import result_report, spent
+from trompe_client._report import jobs_table, result_report, spent
 from trompe_client.cli import connection
 from trompe_client.cli.attack import attack
 from trompe_client.cli.options import flag_of
@@ -242,6 +242,37 @@ def test_a_report_of_100_columns_keeps_every_number_whole(client: Client) -> Non
     assert len(rows) == 5
 
 
+def test_a_narrow_terminal_shows_which_row_is_which(client: Client) -> None:
+    console = Console(width=60, file=(printed := io.StringIO()))
+    job = client.submit(JobSpec.of("mug", label=0))
+    console.print(jobs_table([job.status]), crop=False)
+    console.print(result_report(job.wait(timeout=20).result()), crop=False)
+    assert job.id in printed.getvalue()
+    assert "target" in printed.getvalue()
+
+
+def test_files_of_others_stay_and_an_older_result_is_named(
+    server: FakeServer, mug_folder: Path, tmp_path: Path
+) -> None:
+    theirs = tmp_path / "out/mug-adversarial/notes.txt"
+    theirs.parent.mkdir(parents=True)
+    theirs.write_text("mine")
+    (tmp_path / "out/result.json").write_text("{}")
+    (tmp_path / "out/bottle-adversarial.glb").write_text("older")
+    attack = "attack", mug_folder, "--label", 0, "--server", server.url, "--out", tmp_path / "out"
+    assert "files of an earlier result, too: bottle-adversarial.glb" in trompe(*attack).stderr
+    assert theirs.read_text() == "mine"
+    assert "earlier" not in trompe(*attack).stderr
+
+
+def test_results_that_cannot_be_unpacked_stay_packed(server: FakeServer, mug_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "mug-adversarial").write_text("a file")
+    done = trompe("attack", mug_folder, "--label", 0, "--server", server.url, "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    assert "mug-adversarial.zip stays packed" in done.stderr
+    assert (tmp_path / "mug-adversarial.zip").is_file()
+
+
 def test_an_object_comes_back_in_the_form_it_was_given(server: FakeServer, mug_folder: Path, tmp_path: Path) -> None:
     archive = tmp_path / "cup.zip"
     archive.write_bytes(zipped(mug_folder))
@@ -285,6 +316,7 @@ def test_a_failed_job_exits_with_6_and_its_reason(attack_mug: Attack, server: Fa
         pytest.param(
             ["--elevation", "50", "0"], "Invalid options: --elevation: must be a range within", id="range upside down"
         ),
+        pytest.param(["--out", ""], "give a folder, or . for the current one", id="a folder without a name"),
         pytest.param(["--bogus"], "No such option '--bogus'", id="no such option"),
         pytest.param(["--mask", "mask.png"], "should be a texture and a picture of its size", id="mask of no texture"),
         pytest.param(["--mask", "a.png=missing.png"], "no mask picture 'missing.png'", id="mask without a file"),

@@ -271,6 +271,8 @@ def test_what_comes_with_trompe_can_be_planned(name: str, assets: Path) -> None:
         pytest.param({"judgement": {"renderers": ["three", "cycles"]}}, "one of `renderers`", id="renderers"),
         pytest.param({"objects": ["mug"]}, "objects: expected shipped, .* a table of objects", id="list of objects"),
         pytest.param({"seeds": 20261127}, r"number of seeds, at most 1000; .* write \[20261127\]", id="one seed"),
+        pytest.param({"seeds": [0, 1, 0]}, "gives a seed twice", id="a seed twice"),
+        pytest.param({"grid": {"epsilon": [0.1, 0.1]}}, "'epsilon' gives a value twice", id="a value twice"),
         pytest.param({"grd": {}}, "unknown key 'grd'; keys: name,", id="part"),
         pytest.param({"name": "no spaces"}, "name", id="name"),
     ],

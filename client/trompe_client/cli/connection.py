@@ -45,9 +45,18 @@ def with_client(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
+class _Folder(click.Path):
+    """A folder; the empty word, which would mean the current one, is a variable without a value."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value == "":
+            self.fail("it is empty; give a folder, or . for the current one.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 def out_option(*, required: bool, help: str) -> Callable[[F], F]:
     """--out: a folder."""
-    kind = click.Path(file_okay=False, path_type=Path)
+    kind = _Folder(file_okay=False, path_type=Path)
     return click.option("--out", required=required, type=kind, metavar="DIR", help=help)
 
 

@@ -1,12 +1,13 @@
 """Follow a job to its end and deliver its results."""
 
 import os
-import shutil
 import tempfile
 import time
 import zipfile
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Final
 
 import click
 
@@ -18,6 +19,8 @@ from trompe_shared.api import ADVERSARIAL, Event, JobState, JudgementSpec, in_fl
 from trompe_shared.errors import TrompeError
 from trompe_shared.json_option import as_json
 from trompe_shared.local_files import is_split
+
+RESULT: Final = "result.json"
 
 
 def follow(
@@ -65,6 +68,7 @@ def deliver(
 
     began: when the command began, on the monotonic clock; ``start_up``: its seconds until the job was submitted.
     """
+    earlier = (out / RESULT).read_bytes() if out and (out / RESULT).is_file() else None
     files = job.download(out) if out else []
     if isinstance(job.status.spec, JudgementSpec):
         from trompe_client._report import judgement_report
@@ -75,6 +79,8 @@ def deliver(
     if source is not None:
         files = [_in_the_form_of(source, file) for file in files]
     result = job.result()
+    if out and earlier is not None:
+        _tell_of_others(earlier, out, files)
     if as_json():
         print_json({"job": job.status, "result": result, "files": [str(file) for file in files]}, indent=2)
         return
@@ -83,7 +89,8 @@ def deliver(
     note = job.status.note if job.state is JobState.not_applicable else None
     screen = console()
     wall = None if began is None else time.monotonic() - began
-    screen.print(result_report(result, note=note, seconds=spent(result, job.status, start_up=start_up, wall=wall)))
+    seconds = spent(result, job.status, start_up=start_up, wall=wall)
+    screen.print(result_report(result, note=note, seconds=seconds), crop=False)
     if files:
         screen.print("written:", *(f"  {file}" for file in files), sep="\n")
 
@@ -97,18 +104,31 @@ def _in_the_form_of(source: str, file: Path) -> Path:
     if not (file.name.endswith(f"{ADVERSARIAL}.zip") and (given.is_dir() or is_split(given))):
         return file
     folder = file.with_suffix("")
-    _unpack(file, folder)
+    try:
+        _unpack(file, folder)
+    except OSError as error:
+        click.echo(f"{file} stays packed: {folder} cannot be written ({error.strerror or error}).", err=True)
+        return file
     file.unlink()
     return folder
 
 
 def _unpack(archive: Path, folder: Path) -> None:
-    """Unpack a zip, and replace ``folder`` by it once it is complete."""
+    """Unpack a zip into ``folder``, each file at once, in place of one of its name."""
     with tempfile.TemporaryDirectory(dir=archive.parent, prefix=".unpacking-") as scratch:
-        fresh = Path(scratch, "object")
         with zipfile.ZipFile(archive) as members:
             check_inside(folder, members.namelist())
-            members.extractall(fresh)
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.replace(fresh, folder)
+            members.extractall(scratch)
+        for file in filter(Path.is_file, Path(scratch).rglob("*")):
+            place = folder / file.relative_to(scratch)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(file, place)
+
+
+def _tell_of_others(earlier: bytes, out: Path, files: Sequence[Path]) -> None:
+    """Name what another result, ``earlier``, left beside the new ``files`` in ``out``."""
+    others = sorted(
+        {each.name for each in out.iterdir() if not each.name.startswith(".")} - {each.name for each in files}
+    )
+    if others and (out / RESULT).read_bytes() != earlier:
+        click.echo(f"{out} has files of an earlier result, too: {', '.join(others)}", err=True)

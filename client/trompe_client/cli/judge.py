@@ -29,6 +29,7 @@ from trompe_shared.api import (
     Progress,
 )
 from trompe_shared.errors import SpecError
+from trompe_shared.faults import faults_of
 from trompe_shared.json_option import as_json, json_option
 
 HERE: Final = "trompe.here"
@@ -109,7 +110,7 @@ def _verify(file: Path, trusted: Collection[str]) -> int:
     try:
         manifest = Manifest.model_validate_json(file.read_bytes())
     except ValidationError as error:
-        raise SpecError(f"{file} is not a manifest of trompe judge ({error.error_count()} faults).") from error
+        raise SpecError(f"{file} is not a manifest of trompe judge: {next(faults_of(error))}.") from error
     faults = []
     for fault in _here("verify")(manifest, file.parent, trusted):
         faults.append(fault)

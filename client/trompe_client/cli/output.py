@@ -17,7 +17,7 @@ def say(value: Any, words: Callable[[], "RenderableType"]) -> None:
     if as_json():
         print_json(value, indent=2)
     else:
-        console().print(words())
+        console().print(words(), crop=False)
 
 
 def print_json(value: Any, *, indent: int | None = None, err: bool = False) -> None:

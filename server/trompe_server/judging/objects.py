@@ -248,14 +248,15 @@ def texture_changes(before: Textures, after: Textures, *, epsilon: float | None)
 
 
 def _texture_change(name: str, before: Texture, after: Texture, epsilon: float | None) -> TextureChange:
-    change = difference(before, after).max(axis=2)
+    levels = difference(before, after)
+    change = levels.max(axis=2)
     altered = change > 0
     beyond = None if epsilon is None else int((change > levels_within(epsilon)).sum())
     return TextureChange(
         texture=name,
         size=(before.shape[0], before.shape[1]),
         texels_altered=float(altered.mean()),
-        mean_levels=float(change[altered].mean()) if altered.any() else 0.0,
+        mean_levels=float(levels[altered].mean()) if altered.any() else 0.0,
         max_levels=int(change.max()),
         texels_beyond_epsilon=beyond,
     )

@@ -41,7 +41,7 @@ class TextureChange(Schema):
     texture: str
     size: tuple[int, int] = Field(description="(height, width)")
     texels_altered: float = Field(description="share of its texels")
-    mean_levels: float = Field(description="over the altered texels")
+    mean_levels: float = Field(description="over the channels of the altered texels")
     max_levels: int
     texels_beyond_epsilon: int | None = Field(description="null if no epsilon is stated")
 
