@@ -51,7 +51,10 @@ def model_file(path: Path) -> tuple[str, bytes | Path]:
     if is_split(path):
         return f"{path.stem}.zip", _zip_files(path.parent, files_of(path))
     if path.suffix.lower() not in MODEL_SUFFIXES and not zipfile.is_zipfile(path):
-        raise ObjectError(f"{str(path)!r} is not a zip archive. Give a zip, a model file, or a folder with one.")
+        raise ObjectError(
+            f"{str(path)!r} is not a zip archive and no model that is read. Give a zip, one of "
+            f"{', '.join(sorted(MODEL_SUFFIXES))}, or a folder with one; other programs' files can be exported as glTF."
+        )
     return path.name, path
 
 

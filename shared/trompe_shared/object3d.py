@@ -393,12 +393,12 @@ def _mesh_name(files: Mapping[str, bytes]) -> str:
 
 def _member(files: Mapping[str, bytes], name: str) -> bytes:
     if name not in files:
-        remedy = "add the file"
+        remedy = "put it beside the model, or give the folder that holds both"
         if "<UDIM>" in name.upper():
             remedy = "UDIM tiles are not supported, so bake them to one picture"
         elif not name.isascii():
             remedy += ", or save the material file in UTF-8 if its name is spelled differently"
-        raise ObjectError(f"The texture {name!r} is named by a material but is not in the archive; {remedy}.")
+        raise ObjectError(f"The texture {name!r} is named by a material but did not come with it; {remedy}.")
     return files[name]
 
 

@@ -77,6 +77,10 @@ class Surface:
     colours: NDArray[np.float32] | None = None
 
 
+FLAT: Final = -2
+"""Index of the normal of a first flat polygon, instead of none (-1); each has its own."""
+
+
 class _Reader:
     def __init__(self, file: str) -> None:
         self.file = file
@@ -86,6 +90,8 @@ class _Reader:
         self.fans: dict[str, array[int]] = {}
         """The first triangle and the number of triangles of each larger polygon of a material."""
         self.material = NO_MATERIAL
+        self.flat = False
+        """Whether faces without normals are flat: smoothing is off."""
         self._triangles = 0
 
     def read(self, text: str) -> None:
@@ -115,6 +121,8 @@ class _Reader:
             words = line.split("#")[0].split() or ["#"]
         if words[0] == "f":
             ring = [self._corner(word) for word in words[1:]]
+            if self.flat:
+                ring = [(v, vt, FLAT - self._triangles if vn < 0 else vn) for v, vt, vn in ring]
             if len(ring) < 3:
                 raise ValueError("a face needs three corners or more")
             self._triangles += len(ring) - 2
@@ -135,6 +143,8 @@ class _Reader:
             self.numbers[words[0]].extend(values)
             if words[0] == "v" and len(words) >= 7:
                 self.colours.extend([float(word) for word in words[-3:]])
+        elif words[0] == "s":
+            self.flat = words[1:2] in (["off"], ["0"])
         elif words[0] == "usemtl":
             self.material = line.strip()[len("usemtl") :].strip() or NO_MATERIAL
 
@@ -224,6 +234,9 @@ def _surface(
     faces = inverse.reshape(-1, 3).astype(np.int32)
     vertex, texture, given = unique.T
     smooth = smooth_normals(arrays["v"], vertex, faces)
+    if (flat := given <= FLAT).any():
+        own = smooth_normals(arrays["v"][vertex], np.arange(len(vertex)), faces)  # each flat polygon has its vertices
+        smooth = np.where(flat[:, None], own, smooth)
     normals = smooth if given.min() < 0 else _normalised(arrays["vn"][given], fallback=smooth)
     uvs = arrays["vt"][texture] if texture.min() >= 0 else None
     colours = arrays["colour"][vertex] if "colour" in arrays else None

@@ -268,6 +268,17 @@ def test_given_normals_are_made_unit_and_missing_ones_computed() -> None:
     assert (only_part(MESH)[1] == [0, 0, 1]).all()
 
 
+@pytest.mark.parametrize("off", ["off", "0"])
+def test_computed_normals_are_flat_where_smoothing_is_off(off: str) -> None:
+    roof = "v 0 0 0\nv 0 0 1\nv 1 1 1\nv 1 1 0\nv -1 1 0\nvt 0 0\ns %s\nf 1/1 2/1 3/1 4/1\nf 2/1 1/1 5/1\n"
+    corners, flat = only_part(roof % off)
+    own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    own /= np.linalg.norm(own, axis=1, keepdims=True)
+    np.testing.assert_allclose(flat, np.repeat(own[:, None], 3, axis=1), atol=1e-6)
+    assert np.abs(only_part(roof % "1")[1] - flat).max() > 0.1
+    assert (only_part(roof.replace("s %s\n", ""))[1] == only_part(roof % "1")[1]).all()
+
+
 def test_computed_normals_are_smooth_across_a_shared_edge() -> None:
     roof = "v 0 0 0\nv 0 0 1\nv 1 1 0\nv -1 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 2/1 1/1 4/1\n"
     corners, normals = only_part(roof)
@@ -403,7 +414,7 @@ REFUSED: dict[str, tuple[Source, list[str]]] = {
     "two meshes": (with_files(other__obj=b""), ["exactly one .obj", "other.obj", "thing.obj"]),
     "an empty mesh": (with_files(thing__obj=b""), ["thing.obj", "no faces"]),
     "points without faces": (with_files(thing__obj=b"v 0 0 0\n"), ["thing.obj", "no faces"]),
-    "a missing texture": (with_files(paint__png=None), ["paint.png", "add the file"]),
+    "a missing texture": (with_files(paint__png=None), ["paint.png", "put it beside the model"]),
     "an empty texture": (with_files(paint__png=b""), ["paint.png", "PNG"]),
     "a texture that is text": (with_files(paint__png=b"hello"), ["paint.png", "PNG"]),
     "half a texture": (with_files(paint__png=FILES["paint.png"][:-30]), ["paint.png", "PNG"]),

@@ -10,7 +10,7 @@ import shutil
 import struct
 import subprocess
 import tempfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -25,7 +25,7 @@ from trompe_server.formats.wavefront import complete, dissolved
 from trompe_shared.errors import ObjectError
 from trompe_shared.local_files import base_name, named
 from trompe_shared.object3d import Object3D, decode_alpha, object_from_files, with_alpha_of
-from trompe_shared.wavefront import Part
+from trompe_shared.wavefront import Part, beyond_edges
 
 CENTIMETRE: Final = 0.01
 """Metres of FBX's default unit."""
@@ -74,6 +74,22 @@ def _refuse_placed_textures(data: bytes) -> None:
             )
 
 
+def _refuse_shape_keys(data: bytes) -> None:
+    shares = [struct.unpack("<d", found[1])[0] for found in re.finditer(rb"(?s)DeformPercentD(.{8})", data)]
+    shares += [float(found[1]) for found in re.finditer(rb"DeformPercent:\s*(%s)" % _NUMBER, data)]
+    if any(shares):
+        raise ObjectError("The FBX has shape keys in use (blend shapes); apply them to the mesh and export it again.")
+
+
+def _refuse_clamped_textures(data: bytes, parts: Sequence[Part]) -> None:
+    clamped = any(value == (1,) for name in (b"WrapModeU", b"WrapModeV") for value in _values(data, name))
+    if clamped and any(beyond_edges(part.uvs) for part in parts):
+        raise ObjectError(
+            "The FBX has a texture that does not repeat, and texture coordinates beyond its edges; let it repeat, or "
+            "move the coordinates into the texture."
+        )
+
+
 def unit(data: bytes) -> float:
     """The file's unit of length in metres. Raises ``ObjectError`` outside 1e-6 to 1e6 cm."""
     factor = _setting(data, b"UnitScaleFactor", 1.0)
@@ -105,11 +121,13 @@ def read(upload: Upload) -> Object3D:
     """Read an FBX and its textures; one inside counts more than a file beside it. Raises ``ObjectError``."""
     scale, (axes, signs), tree = unit(upload.data), _axes(upload.data), _tree(upload.data)
     _refuse_placed_textures(upload.data)
+    _refuse_shape_keys(upload.data)
     beside = {name: data for name, data in upload.flat().items() if not name.lower().endswith((".obj", ".mtl"))}
     inside = tree.pictures() if tree is not None else {}
     converted = _converted(_plain(upload.data, tree, inside))
     _refuse_equal_names(converted)
     obj = object_from_files(dissolved(complete({**beside, **inside, **converted})))
+    _refuse_clamped_textures(upload.data, obj.parts)
     mirrored = np.linalg.det(np.eye(3)[axes] * signs) < 0
     parts = [
         replace(

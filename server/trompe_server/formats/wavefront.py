@@ -1,7 +1,10 @@
 """OBJ with MTL or SAILenv's mat_def: kept if complete, otherwise completed with maps and UVs."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import posixpath
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +13,15 @@ from trompe_server.formats.assembly import DEFAULT_COLOUR, free_name, painted_fl
 from trompe_server.formats.pictures import shrink
 from trompe_server.formats.upload import Upload
 from trompe_shared.errors import ObjectError
-from trompe_shared.local_files import PICTURE_SUFFIXES, encoding_of, libraries, library_names, named, text_of
+from trompe_shared.local_files import (
+    PICTURE_SUFFIXES,
+    base_name,
+    encoding_of,
+    libraries,
+    library_names,
+    named,
+    text_of,
+)
 from trompe_shared.object3d import (
     Object3D,
     decode_alpha,
@@ -22,6 +33,9 @@ from trompe_shared.object3d import (
     with_alpha_of,
 )
 from trompe_shared.wavefront import NO_MATERIAL, Part, Surface, obj_text, parse_mtl, parse_surfaces, textured
+
+ROOTED: Final = re.compile(r"(?<=\s)(/|\\\\|[A-Za-z]:[/\\]).*", re.DOTALL)
+"""A path from the root of a machine, at the end of a line."""
 
 
 def read(upload: Upload) -> Object3D:
@@ -45,7 +59,27 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
     if not changed:
         return upload
     pngs = {name: with_alpha_of(rgb, decode_alpha(files[name], name)) for name, rgb in changed.items()}
-    return upload.with_flat({**files, **pngs})
+    return _found_again(upload.with_flat({**files, **pngs}), pngs)
+
+
+def _found_again(upload: Upload, pictures: Iterable[str]) -> Upload:
+    """``upload`` with each path from the root of a machine to one of its ``pictures``, in an MTL, replaced by the path
+    from the MTL: elsewhere the old picture would be shown."""
+    places = {base_name(path): path for path in upload.files if base_name(path) in pictures}
+    files = dict(upload.files)
+    for path, text in ((path, text_of(data)) for path, data in files.items() if path.lower().endswith(".mtl")):
+        lines = [_relative(line, places, posixpath.dirname(path)) for _, line in _lines(text)]
+        if (after := "".join(lines)) != text:
+            files[path] = _encoded(after, files[path])
+    return replace(upload, files=files)
+
+
+def _relative(line: str, places: Mapping[str, str], folder: str) -> str:
+    for picture in parse_mtl(f"newmtl m\n{line}")["m"].values():
+        if picture in places and (found := ROOTED.search(line)) is not None:
+            end = line[len(line.rstrip("\r\n")) :]
+            return f"{line[: found.start()]}{posixpath.relpath(places[picture], folder or '.')}{end}"
+    return line
 
 
 def shrunk(obj: Object3D, side: int | None) -> Object3D:
@@ -154,9 +188,14 @@ class _Completion:
         return {name: maps for text in reversed(self._libraries.values()) for name, maps in parse_mtl(text).items()}
 
     def _define_missing(self) -> None:
-        """Define the material of faces without one in a mesh that has materials; the mesh will name it."""
-        used = {surface.material for surface in self._surfaces}
-        if used > {NO_MATERIAL} and NO_MATERIAL not in self._maps():
+        """Define the material of faces without one, unless the mesh names none of those there are."""
+        used, known = {surface.material for surface in self._surfaces}, self._maps()
+        if used == {NO_MATERIAL} and known and NO_MATERIAL not in known:
+            raise ObjectError(
+                f"{self._mesh!r} names no material (usemtl), though the .mtl defines {sorted(known)[:4]}. Name one "
+                "before the faces, or leave the .mtl and its pictures away for a plain object."
+            )
+        if NO_MATERIAL in used and NO_MATERIAL not in known:
             first, text = next(iter(self._libraries.items()))
             self._libraries[first] = f"{text}\nnewmtl {NO_MATERIAL}\n"
             self._rewritten = True

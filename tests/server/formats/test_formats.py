@@ -122,7 +122,22 @@ def test_faces_without_a_material_are_grey_beside_others() -> None:
         assert b"usemtl default\n" in unpack(out)["t.obj"]
         assert b"newmtl default\n" in unpack(out)["t.mtl"]
     nameless = pack_zip(files | {"t.obj": OBJ.replace("usemtl red\n", "").encode()})
-    assert "undefined material 'default'" in refusal(nameless, "t.zip")
+    assert "names no material (usemtl), though the .mtl defines ['red']" in refusal(nameless, "t.zip")
+    plain = {"t.obj": OBJ.replace("usemtl red\n", "").encode(), "t.mtl": b"# no material\n"}
+    assert comes_back(pack_zip(plain), "t.zip")[0].textures["default_albedo.png"][0, 0].tolist() == [204] * 3
+
+
+@pytest.mark.parametrize("path", ["/home/me/src/red.png", "C:\\src\\red.png", "\\\\host\\red.png"])
+def test_paint_is_found_where_the_mtl_names_the_picture_of_another_machine(path: str) -> None:
+    picture = encode_png(PICTURE)
+    mtl = f"newmtl red\r\nKd 1 1 1\r\nmap_Kd {path}\r\nmap_Ks /home/me/other.png\r\n"
+    files = {"t.obj": OBJ.encode(), "t.mtl": mtl.encode(), "src/red.png": picture}
+    data = pack_zip(files)
+    obj = read_object(data, name="t.zip").obj
+    assert unpack(repaint_file(data, obj, name="t.zip").data) == files
+    out = unpack(repaint_file(data, obj.with_textures({"red.png": 255 - obj.textures["red.png"]}), name="t.zip").data)
+    assert out["src/red.png"] != picture
+    assert out["t.mtl"].decode() == mtl.replace(path, "src/red.png")
 
 
 def test_capitals_change_in_whole_names_alone_and_an_mtl_keeps_its_encoding() -> None:
@@ -403,6 +418,28 @@ def test_two_materials_of_one_name_in_an_fbx_are_refused(tmp_path: Path) -> None
 def test_a_texture_that_an_fbx_scales_or_moves_is_refused() -> None:
     text = b'; FBX 7.3.0\nP: "Translation", "Vector", "", "A",0,0,0\nP: "Scaling", "Vector", "", "A",2,1,1\n'
     assert "scales, turns or moves a texture (Scaling (2.0, 1.0, 1.0))" in refusal(text, "t.fbx")
+
+
+@pytest.mark.parametrize("kind", ["fbxa", "fbx"])
+def test_shape_keys_in_use_in_an_fbx_are_refused(kind: str) -> None:
+    def file(share: float) -> bytes:
+        if kind == "fbxa":
+            return b"; FBX 7.3.0\nDeformPercent: %d\n" % share
+        return Tree(7400, (Node(b"DeformPercent", 1, b"D" + struct.pack("<d", share), None),), b"").to_bytes()
+
+    assert "shape keys in use" not in refusal(file(0), "t.fbx")
+    assert "shape keys in use (blend shapes); apply them" in refusal(file(40), "t.fbx")
+
+
+@needs_assimp
+def test_a_texture_of_an_fbx_that_does_not_repeat_beyond_its_edges_is_refused(tmp_path: Path) -> None:
+    clamped = b'\n; P: "WrapModeU", "enum", "", "",1\n'
+    beyond = OBJ.replace("vt 1 1", "vt 3 1")
+    assert beyond != OBJ
+    inside, outside = (fbx_of("newmtl red\n", tmp_path, mesh=mesh) for mesh in (OBJ, beyond))
+    for sound in (inside, outside, inside + clamped):
+        assert read_object(sound, name="t.fbx").obj.parts
+    assert "does not repeat" in refusal(outside + clamped, "t.fbx")
 
 
 def test_two_pictures_of_one_name_inside_an_fbx_are_refused() -> None:
