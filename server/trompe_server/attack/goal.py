@@ -1,5 +1,6 @@
 """Goal of the attack: the loss to maximise, and the condition of success."""
 
+import math
 import operator
 from dataclasses import dataclass
 from typing import Final, SupportsIndex, get_args
@@ -16,6 +17,9 @@ from trompe_shared.errors import SpecError
 SAFE_MARGIN: Final = 1.0
 """Margin from which a view is safely won: the margin loss has no gradient there."""
 
+SLOPE: Final = 0.001
+"""Share of the gradient that a hopeless view keeps."""
+
 Logits = Float[Tensor, "views classes"]
 PerView = Float[Tensor, " views"]
 
@@ -26,7 +30,9 @@ class Goal:
 
     label: the true class, or several that all count as the object. top_k: no true class may be among the k best (1: the
     best). loss: maximised; ``margin`` (Carlini and Wagner 2017, clamped once a view is safely won) or
-    ``cross_entropy``. safe: margin from which a view is safely won. Raises ``SpecError`` for contradictory options.
+    ``cross_entropy``. safe: margin from which a view is safely won. reach: margin from which the loss of a lost view
+    flattens, so that hopeless views do not outvote those that can be won. Raises ``SpecError`` for contradictory
+    options.
     """
 
     label: SupportsIndex | tuple[int, ...]
@@ -34,6 +40,7 @@ class Goal:
     top_k: int = 1
     loss: Loss = "margin"
     safe: float = SAFE_MARGIN
+    reach: float = math.inf
 
     def __post_init__(self) -> None:
         if self.loss not in get_args(Loss):
@@ -85,14 +92,23 @@ class Goal:
     def losses(self, logits: Logits, *, clamped: bool = True) -> PerView:
         """The loss of each view; finite, with a finite gradient.
 
-        ``clamped=False`` omits the margin's clamp, so that safely won views have a gradient too.
+        ``clamped=False`` is the margin itself, so that all views have an equal gradient.
         """
         if self.loss == "margin":
             margins = self.margins(logits)
-            return margins.clamp(max=self.safe) if clamped else margins
+            if not clamped:
+                return margins
+            margins = margins.clamp(max=self.safe)
+            return torch.where(margins < 0, self._flattened(margins), margins)
         log_shares = finite(logits).log_softmax(1).index_select(1, self._subject(logits))
         losses = -log_shares.logsumexp(1)  # the probabilities of several classes add up
         return losses if self.target is None else -losses
+
+    def _flattened(self, margins: PerView) -> PerView:
+        """Margins below 0, flat beyond ``reach`` but for a slope that lets views be approached if all are hopeless."""
+        if math.isinf(self.reach):
+            return margins
+        return self.reach * torch.tanh(margins / self.reach) + SLOPE * margins
 
     def settled(self, logits: Logits) -> Bool[Tensor, " views"]:
         """Whether each view is safely won, so that its loss has no gradient."""

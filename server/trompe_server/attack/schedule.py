@@ -2,7 +2,7 @@
 
 Steps that all look at the same images tell what they gain. Their factor is 2, halves whenever ``PATIENCE`` steps gained
 nothing (as in Auto-PGD, Croce and Hein 2020), and the search ends instead of the fourth halving. Towards the last step
-it falls to 0.
+it falls to 0. Their loss is flat for hopeless views (``reach``), which would outvote those within reach.
 
 Steps that draw their views or what happens to them tell little. Their factor falls linearly from 2 to 0; a long run
 repeats this in rounds, each twice as long as the one before (Loshchilov and Hutter 2017, SGDR).
@@ -32,6 +32,12 @@ SHARE: Final = 0.025
 HALVINGS: Final = 3
 """Halvings of the factor before the end."""
 
+REACH: Final = 1.5
+"""Margin, a difference of logits, beyond which a lost view counts less and less."""
+
+SHORTER: Final = 0.7
+"""Factor of the reach after a halving."""
+
 BEST, WAITED, HALVED = "schedule.best", "schedule.waited", "schedule.halved"
 """Memory: highest share of fooled views, highest loss and least gain; steps since the last gain; halvings so far."""
 
@@ -50,6 +56,12 @@ def by_gain(memory: Memory, done: int, length: int) -> float:
     fall = min(1.0, (length - done - 0.5) / min(length, ROUND))
     halved = int(memory.get(HALVED, 0))
     return 2 * fall * 0.5**halved
+
+
+def reach(memory: Memory) -> float:
+    """Reach of the goal (``Goal.reach``) of a step of that kind: shorter after each halving, once the easy views are
+    won."""
+    return REACH * SHORTER ** int(memory.get(HALVED, 0))
 
 
 def after_step(memory: Memory, fooled: float, loss: float) -> Memory:

@@ -24,7 +24,7 @@ from trompe_server.attack.budget import Box
 from trompe_server.attack.goal import Goal
 from trompe_server.attack.objective import Evaluation, Flat, Objective
 from trompe_server.attack.optimiser import Iterate, gradient_at, moved
-from trompe_server.attack.schedule import Memory, after_step, anew, by_gain, in_rounds, stalled
+from trompe_server.attack.schedule import Memory, after_step, anew, by_gain, in_rounds, reach, stalled
 from trompe_server.attack.view_budget import ViewBudget
 from trompe_server.image_pipelines import Drawn, ImagePipeline
 from trompe_shared.api import OptimiserName
@@ -145,7 +145,8 @@ class Search:
 
     def _objective_at(self, point: Iterate, step: int) -> Objective:
         """The objective with the safe margin, the backgrounds and the image pipeline of a step."""
-        goal, surrogate = replace(self.objective.goal, safe=self._safe(point)), self.objective.surrogate
+        near = reach(point.memory) if self.steps_by_gain and self.objective.masks is None else math.inf
+        goal, surrogate = replace(self.objective.goal, safe=self._safe(point), reach=near), self.objective.surrogate
         if self.backgrounds is not None:
             surrogate = self.backgrounds.behind(surrogate, seed=self.seed, step=step)
         drawn = None if self.pipeline is None else Drawn(self.pipeline, self.seed, step)

@@ -119,6 +119,20 @@ def check_finite(goal: Goal, logits: Tensor) -> None:
     assert torch.isfinite(goal.margins(logits)).all()
 
 
+def test_the_loss_of_a_lost_view_flattens_beyond_the_reach_and_never_quite() -> None:
+    away = torch.tensor([0.5, -1e-4, -0.5, -2.0, -8.0, -80.0])
+    logits = torch.stack([torch.zeros(6), away], 1).requires_grad_()
+    (gradient,) = torch.autograd.grad(Goal(0, reach=2.0).losses(logits).sum(), logits)
+    weights = gradient[:, 1]
+    assert weights[:2].tolist() == pytest.approx([1, 1.001])
+    assert (weights[1:-1] > weights[2:]).all()
+    assert weights[3] < 0.5
+    assert 0.001 <= weights[-1] < 0.0011
+    far = Goal(0).losses(logits)
+    assert torch.autograd.grad(far.sum(), logits)[0][:, 1].tolist() == [1] * 6
+    torch.testing.assert_close(far, Goal(0).margins(logits))
+
+
 def test_only_a_margin_that_is_safe_settles_a_view_and_its_gradient_is_zero() -> None:
     logits = torch.tensor([[0.0, SAFE_MARGIN + 0.1, 0, 0, 0], [0.0, SAFE_MARGIN - 0.1, 0, 0, 0]])
     assert Goal(0).settled(logits).tolist() == [True, False]

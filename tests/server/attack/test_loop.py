@@ -41,7 +41,7 @@ from trompe_server.attack import (
     start,
 )
 from trompe_server.attack.goal import SAFE_MARGIN
-from trompe_server.attack.schedule import HALVINGS, PATIENCE, after_step
+from trompe_server.attack.schedule import HALVINGS, PATIENCE, REACH, after_step
 from trompe_server.attack.search import BEST, RISE, SAFE_ENOUGH, SCORED, finished, went_on
 from trompe_server.classifiers import NetworkClassifier, load_classifier, score_based
 from trompe_server.image_pipelines import PIPELINES
@@ -59,7 +59,7 @@ BATCHES = range(len(SURROGATE.batches))
 def test_a_step_reports_the_mean_over_all_views_before_it_moves() -> None:
     (step,) = steps_of(steps=1)
     logits = fake_classifier().logits(SURROGATE.render_all(SURROGATE.texels(textures_of(SQUARE))))
-    assert step.loss == pytest.approx(float(Goal(LABEL).losses(logits).mean()), abs=1e-4)
+    assert step.loss == pytest.approx(float(Goal(LABEL, reach=REACH).losses(logits).mean()), abs=1e-4)
     assert step.fooled == float(Goal(LABEL).reached(logits).float().mean())
 
 
@@ -67,7 +67,7 @@ def test_a_step_goes_along_the_sign_of_the_mean_gradient() -> None:
     leaf = textures_of(SQUARE)["m0.png"].requires_grad_()
     texels = SURROGATE.texels(textures_of(SQUARE) | {"m0.png": leaf})
     logits = fake_classifier().logits(SURROGATE.render_all(texels))
-    (gradient,) = torch.autograd.grad(Goal(LABEL).losses(logits).mean(), leaf)
+    (gradient,) = torch.autograd.grad(Goal(LABEL, reach=REACH).losses(logits).mean(), leaf)
     clear = gradient.abs() > 1e-6
     delta = run(steps=1).deltas["m0.png"]
     assert clear.float().mean() > 0.5
@@ -492,7 +492,8 @@ GIVEN_UP = 1 + PATIENCE * (HALVINGS + 1)
 
 
 def test_a_search_that_gains_nothing_more_ends() -> None:
-    assert stubborn_run() == stubborn_run(goal=Goal(LABEL, loss="cross_entropy")) == GIVEN_UP
+    assert stubborn_run(goal=Goal(LABEL, loss="cross_entropy")) == GIVEN_UP
+    assert stubborn_run() == GIVEN_UP + HALVINGS  # each tries a shorter reach
 
 
 @pytest.mark.parametrize("kind", ["pgd", "pool", "backgrounds", "pipeline", "queries", "the goal asks for all"])

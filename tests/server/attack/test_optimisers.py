@@ -8,8 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.attack_runs import EPS, SMALL, SQUARE, mean_loss, random_state, run, steps_of
-from trompe_server.attack import AttackState, Budget, save_state, start
+from tests.attack_runs import EPS, LABEL, SMALL, SQUARE, mean_loss, random_state, run, steps_of
+from trompe_server.attack import AttackState, Budget, Goal, save_state, start
+from trompe_server.attack.schedule import REACH
 from trompe_server.surrogate import textures_of
 from trompe_shared.api import OptimiserName
 
@@ -76,4 +77,4 @@ def test_nesterov_steps_along_the_sign_of_momentum_one_momentum_step_ahead() -> 
     (seen,) = steps_of(steps=1, total_steps=3, optimiser="nesterov", state=one)
     ahead = 0.9 * 0.02 * mean.sign()
     there = {**one.deltas, "m0.png": (delta + ahead).clamp(-0.06, 0.06)}
-    assert seen.loss == pytest.approx(mean_loss(AttackState(1, there)), abs=1e-5)
+    assert seen.loss == pytest.approx(mean_loss(AttackState(1, there), Goal(LABEL, reach=REACH)), abs=1e-5)
