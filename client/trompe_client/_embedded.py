@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -90,12 +90,9 @@ def _told_of_the_end(process: "subprocess.Popen[bytes]", log: Path) -> Iterator[
         if process.poll() is not None:
             raise EmbeddedServerError(f"The embedded service has ended ({_code(process)}).\n{_tail(log)}")
 
-    before = signal.signal(signal.SIGCHLD, look)
-    try:
+    with _handled({signal.SIGCHLD: look}):
         look()
         yield
-    finally:
-        signal.signal(signal.SIGCHLD, before)
 
 
 def _code(process: "subprocess.Popen[bytes]") -> str:
@@ -127,7 +124,14 @@ def _signals_unwind() -> Iterator[None]:
     def leave(number: int, _frame: FrameType | None) -> None:
         raise SystemExit(128 + number)
 
-    before = {number: signal.signal(number, leave) for number in (signal.SIGTERM, signal.SIGHUP)}
+    with _handled({signal.SIGTERM: leave, signal.SIGHUP: leave}):
+        yield
+
+
+@contextmanager
+def _handled(handlers: Mapping[signal.Signals, Callable[[int, FrameType | None], None]]) -> Iterator[None]:
+    """Handle signals so within the block."""
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
     finally:

@@ -75,6 +75,7 @@ def jobs_table(jobs: Sequence[Job]) -> Table:
     """One line per job, with a column of labels if there are any."""
     labels = ["labels"] if any(job.labels for job in jobs) else []
     table = empty_table("job", "state", "object", "label", "classifier", "epsilon", "done", "created", *labels)
+    table.columns[0].no_wrap = True  # ids are copied
     for job in jobs:
         what = _judged(job, job.spec) if isinstance(job.spec, JudgementSpec) else _attacked(job, job.spec)
         how = [f"{job.progress.fraction:.0%}", f"{job.created:%Y-%m-%d %H:%M}"]
@@ -167,12 +168,12 @@ _RECORDS: Final[Mapping[type, tuple[Sequence[str], Callable[[Any], Sequence[str]
 
 
 def empty_table(*columns: str, right: int = 0) -> Table:
-    """A table with numbers in the last ``right`` columns: aligned right and never wrapped, nor is a job's id. Other
-    columns keep ``NARROWEST``, even if the table then is wider than the terminal."""
+    """A table with numbers in the last ``right`` columns: aligned right and never wrapped. Others keep ``NARROWEST``,
+    even if the table then is wider than the terminal."""
     table = Table()
     for index, name in enumerate(columns):
         if index < len(columns) - right:
-            table.add_column(name, overflow="fold", min_width=NARROWEST, no_wrap=name == "job")
+            table.add_column(name, overflow="fold", min_width=NARROWEST)
         else:
             table.add_column(name, justify="right", no_wrap=True)
     return table

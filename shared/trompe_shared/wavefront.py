@@ -283,6 +283,12 @@ def _statements(parts: tuple[Part, ...], libraries: Iterable[str]) -> Iterator[s
         first += len(part.vertices)
 
 
+def area(uvs: NDArray[np.float32], faces: NDArray[np.int32]) -> float:
+    """Area of triangles (F, 3) of texture coordinates (V, 2); that of the texture is 1."""
+    a, b, c = np.moveaxis(uvs[faces].astype(np.float64), 1, 0)
+    return float(np.abs(np.linalg.det(np.stack([b - a, c - a], axis=1))).sum() / 2)
+
+
 def beyond_edges(uvs: NDArray[np.float32]) -> bool:
     """Whether texture coordinates (V, 2) leave [0, 1], so that it matters how a texture goes on there."""
     return bool(uvs.min() < -1e-3 or uvs.max() > 1 + 1e-3)

@@ -107,9 +107,9 @@ def _check_sample_inputs(data: bytes, file: str) -> None:
 
 def _unsafe(file: str, what: str) -> ClassifierError:
     return ClassifierError(
-        f"{file!r} is refused: it contains {what}; names of other than letters, digits and underscores, and operators "
-        "other than ATen's, could run code. Expected one tensor of logits, and a forward without no_grad, autocast or "
-        "cond; rename, and export again with torch.export."
+        f"{file!r} is refused: it contains {what}, which could run code. Expected names of ASCII letters, digits and "
+        "underscores, operators of ATen (no no_grad, autocast or cond in forward) and one tensor of logits; change "
+        "that and export again with torch.export."
     )
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from trompe_server.formats.pictures import Pixels, encode_srgb
 from trompe_shared.errors import ObjectError
+from trompe_shared.wavefront import area
 
 BAKED_SIDE: Final = 512
 """Approximate side, in texels, of a generated texture."""
@@ -37,10 +38,7 @@ class Unwrapped:
 
 def laid_out(uvs: NDArray[np.float32] | None, faces: NDArray[np.int32]) -> bool:
     """Whether any triangle (F, 3) has area in the texture; programs give plain surfaces one point for all corners."""
-    if uvs is None:
-        return False
-    a, b, c = np.moveaxis(uvs[faces].astype(np.float64), 1, 0)
-    return bool(np.linalg.det(np.stack([b - a, c - a], axis=1)).any())
+    return uvs is not None and area(uvs, faces) > 0
 
 
 def unwrap(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int32]]]) -> tuple[list[Unwrapped], tuple[int, int]]:

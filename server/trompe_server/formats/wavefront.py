@@ -2,7 +2,7 @@
 
 import posixpath
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -59,26 +59,18 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
     if not changed:
         return upload
     pngs = {name: with_alpha_of(rgb, decode_alpha(files[name], name)) for name, rgb in changed.items()}
-    return _found_again(upload.with_flat({**files, **pngs}), pngs)
+    places = {base_name(path): path for path in upload.files}
+    return upload.with_flat(_rewritten({**files, **pngs}, lambda mtl, line: _relative(line, mtl, pngs.keys(), places)))
 
 
-def _found_again(upload: Upload, pictures: Iterable[str]) -> Upload:
-    """``upload`` with each path from the root of a machine to one of its ``pictures``, in an MTL, replaced by the path
-    from the MTL: elsewhere the old picture would be shown."""
-    places = {base_name(path): path for path in upload.files if base_name(path) in pictures}
-    files = dict(upload.files)
-    for path, text in ((path, text_of(data)) for path, data in files.items() if path.lower().endswith(".mtl")):
-        lines = [_relative(line, places, posixpath.dirname(path)) for _, line in _lines(text)]
-        if (after := "".join(lines)) != text:
-            files[path] = _encoded(after, files[path])
-    return replace(upload, files=files)
-
-
-def _relative(line: str, places: Mapping[str, str], folder: str) -> str:
+def _relative(line: str, mtl: str, pictures: Collection[str], places: Mapping[str, str]) -> str:
+    """A line of ``mtl`` with a path from the root of a machine to one of ``pictures`` made relative: the machine may have
+    the old picture there. places: paths in the upload by name."""
     for picture in parse_mtl(f"newmtl m\n{line}")["m"].values():
-        if picture in places and (found := ROOTED.search(line)) is not None:
+        if picture in pictures and (found := ROOTED.search(line)) is not None:
             end = line[len(line.rstrip("\r\n")) :]
-            return f"{line[: found.start()]}{posixpath.relpath(places[picture], folder or '.')}{end}"
+            place = posixpath.relpath(places[picture], posixpath.dirname(places[mtl]) or ".")
+            return f"{line[: found.start()]}{place}{end}"
     return line
 
 
@@ -105,9 +97,13 @@ def complete(files: Mapping[str, bytes]) -> dict[str, bytes]:
 
 def _spelled(files: Mapping[str, bytes]) -> dict[str, bytes]:
     """``files`` with the capitals of pictures' names in MTLs as in the files' names; Windows takes either."""
+    return _rewritten(files, lambda _, line: _respelled(line, files))
+
+
+def _rewritten(files: Mapping[str, bytes], change: Callable[[str, str], str]) -> dict[str, bytes]:
+    """``files`` with a ``change`` of each line of the MTLs; its arguments are an MTL's name and the line."""
     texts = {
-        name: (text, "".join(_respelled(line, files) for _, line in _lines(text)))
-        for name, text in mtl_texts(files).items()
+        name: (text, "".join(change(name, line) for _, line in _lines(text))) for name, text in mtl_texts(files).items()
     }
     return dict(files) | {name: _encoded(after, files[name]) for name, (text, after) in texts.items() if after != text}
 

@@ -17,7 +17,7 @@ from trompe_server.system.threads import in_threads
 from trompe_shared.api import Visibility
 from trompe_shared.object3d import Object3D
 from trompe_shared.opacity import strongest
-from trompe_shared.wavefront import Part
+from trompe_shared.wavefront import area
 
 FAINT: Final = 0.25
 """Opacity below which the paint on a material is hardly seen: a quarter of its change reaches the image."""
@@ -67,7 +67,7 @@ def visibility_of(
 
 def paint_warnings(obj: Object3D) -> Iterator[str]:
     """Warnings of too few texels to paint, and of materials that are nearly transparent wherever they are strongest."""
-    texels = sum(_texels_under(part, obj.textures[obj.albedo_of(part)].shape) for part in obj.parts)
+    texels = sum(area(part.uvs, part.faces) * obj.textures[obj.albedo_of(part)][..., 0].size for part in obj.parts)
     if texels < FEW_TEXELS:
         yield (
             f"The triangles cover {texels:.1f} texels of the textures, so paint is a few flat colours. Unwrap the "
@@ -76,12 +76,6 @@ def paint_warnings(obj: Object3D) -> Iterator[str]:
     for name, opacity in strongest(obj).items():
         if opacity < FAINT:
             yield f"The material {name!r} is nearly transparent (opacity {opacity:.2f}): paint on it changes little."
-
-
-def _texels_under(part: Part, shape: tuple[int, ...]) -> float:
-    """Area of a part's triangles on its texture of ``shape`` (H, W, 3), in texels."""
-    a, b, c = np.moveaxis(part.uvs[part.faces].astype(np.float64), 1, 0)
-    return float(np.abs(np.linalg.det(np.stack([b - a, c - a], 1))).sum() / 2 * shape[0] * shape[1])
 
 
 def perceived_change(before: Images, after: Images, pixels: Pixels) -> dict[str, float]:
