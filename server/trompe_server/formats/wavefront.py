@@ -64,8 +64,8 @@ def repaint(upload: Upload, painted: Object3D) -> Upload:
 
 
 def _relative(line: str, mtl: str, pictures: Collection[str], places: Mapping[str, str]) -> str:
-    """A line of ``mtl`` with a path from the root of a machine to one of ``pictures`` made relative: the machine may have
-    the old picture there. places: paths in the upload by name."""
+    """A line of ``mtl`` with a path from the root of a machine to one of ``pictures`` made relative: the machine may
+    have the old picture there. places: paths in the upload by name."""
     for picture in parse_mtl(f"newmtl m\n{line}")["m"].values():
         if picture in pictures and (found := ROOTED.search(line)) is not None:
             end = line[len(line.rstrip("\r\n")) :]
